@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
+from localization.calibration.wheel_wiring import open_checked
 from localization.errors import EvaluationError
 from localization.estimators import check_estimator
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result, score
-from localization.logs import Log, TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides
 from localization.pipeline import ReplayConfig, Trial, replay
 from localization.trajectory import Trajectory
 from motion_models.errors import ModelError
@@ -38,10 +39,12 @@ COLUMNS = ("seconds", "x", "y", "theta", "var_x", "var_y", "var_theta", "vx", "v
 def open(path: str | Path, robot: str | Path | Robot, topics: TopicOverrides | None = None) -> RobotLog:
     """Open a ROS 1 bag, a ROS 2 folder or a bare .mcap of ``robot``: a shipped robot's name, the path of a robot file, or a `Robot`.
 
-    Raises `LogError` for a log that cannot be read, `RobotError` for a robot that does not exist.
+    Signs and units of wheels and gyro that the log's other sensors contradict are corrected (`log.warnings()`). Raises
+    `LogError` for a log that cannot be read, `RobotError` for a robot that does not exist.
     """
     described = robot if isinstance(robot, Robot) else load_robot(str(robot))
-    return RobotLog(open_log(path, described, topics or TopicOverrides()), described)
+    log, _ = open_checked(path, described, topics or TopicOverrides())
+    return RobotLog(log, log.robot)
 
 
 @dataclass(frozen=True, eq=False)

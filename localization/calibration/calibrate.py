@@ -12,11 +12,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
+from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig, cut
 from localization.errors import EvaluationError
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack
-from localization.logs import Log, TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides
 from localization.trajectory import BoolArray
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import HeldOut, LearnedNoise, cross_validate, learn_noise
@@ -119,7 +120,7 @@ def cut_log(
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
     """
     config = config or WindowConfig()
-    log = open_log(path, robot, topics.scored_against(reference))
+    log = open_wired(path, robot, topics.scored_against(reference))
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(
             f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"

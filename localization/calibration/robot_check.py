@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
 from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, draft_robot, finish_robot, survey_log
 from localization.calibration.wheel_signals import STEP_S, LidarMotion, WheelSignals, lidar_motion, read_signals
 from localization.calibration.wheel_units import expected_scaling
@@ -21,7 +21,6 @@ from localization.events import Event, ImuSample
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
 from localization.pipeline import Run, Trial, replay, warnings_of
-from motion_models import se2
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma
 from motion_models.registry import make_model
@@ -39,7 +38,7 @@ _SAME_SCALE = 0.15
 scan to scan errs by some percent."""
 _MIN_SCALE_INTERVALS, _MIN_LIKENESS = 12, 0.97
 """Intervals of 0.5 s, and cosine between the ways, from which on a scale is measured: of scans that slide along a corridor it is lower."""
-_MAX_YAW_RAD = math.radians(5.0)
+_MAX_YAW_DEG = 5.0
 """Of a LiDAR against the direction of travel; robots slide by a few degrees."""
 _MAX_TILT_RAD = math.radians(10.0)
 """Of gravity against the IMU's mount: floors and ramps."""
@@ -130,9 +129,9 @@ def check_robot(path: Path, robot: Robot | None, given: Given) -> RobotCheck:
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
     params = tuple(measured[name][0] if name in measured else float(v) for name, v in zip(model.param_names, model.nominal, strict=True))
     sigmas = {name: sigma for name, (_, sigma) in measured.items()}
-    corrected = _with_scaling(log.robot, params, sigmas) if not wiring.is_ambiguous else robot
+    checked = _with_scaling(log.robot, params, sigmas) if not wiring.is_ambiguous else robot
     topic = log.sources.lidar.topic if log.sources.lidar is not None and log.sources.lidar.kind == "scan" else ""
-    return RobotCheck(path.name, corrected, log.duration_s, tuple(rows), params, sigmas, topic)
+    return RobotCheck(path.name, checked, log.duration_s, tuple(rows), params, sigmas, topic)
 
 
 def _drafted(draft: Draft, given: Given, path: Path) -> Robot:
@@ -161,21 +160,6 @@ def _replayed(log: Log, mounts: Mapping[str, Mount], estimator: str, signals: Wh
         return replay(_first_minute(log, start_ns), [trial], log.robot, mounts, log.sources.lidar is not None)[0]
     except LogError:
         return None
-
-
-def _sparse_motion(log: Log, signals: WheelSignals) -> LidarMotion | None:
-    """Motion by KISS-ICP, whose map takes scans of few beams; good for directions, not for scales."""
-    run = _replayed(log, log.mounts, "lidar", signals)
-    if run is None or len(run.trajectory) < _MIN_TRAVEL_INTERVALS:
-        return None
-    t = (run.trajectory.stamps_ns - signals.first_ns) * 1e-9
-    edges = signals.start_s + STEP_S * np.arange(len(signals.rates) + 1)
-    poses = np.stack(
-        [np.interp(edges, t, column) for column in (*run.trajectory.poses.T[:2], np.unwrap(run.trajectory.poses[:, 2]))], axis=1
-    )
-    steps = np.array([se2.between(a, b) for a, b in itertools.pairwise(poses)]) / STEP_S
-    steps[(edges[:-1] < t[0]) | (edges[1:] > t[-1])] = np.nan
-    return LidarMotion(steps[:, 0], steps[:, 2], steps[:, 1])
 
 
 def _first_minute(log: Log, start_ns: int) -> Iterator[Event]:
@@ -287,20 +271,17 @@ def _lidar_rows(log: Log, signals: WheelSignals, motion: LidarMotion | None, mou
     value = f"{frame}: yaw {math.degrees(mount.yaw):.0f} deg"
     forward = _forward(log, signals)
     direction = None if motion is None else _direction(motion, forward)
-    if direction is None and (motion := _sparse_motion(log, signals)) is not None:
-        direction = _direction(motion, forward)
-    if direction is None:
+    yaw = check_lidar_yaw(log)
+    if direction is None and yaw is None:
         return [CheckRow(name, value, "", "cannot be seen", "drive straight on for 10 s where walls are in reach.")]
-    degrees = math.degrees(direction)
-    second = (
-        f"travel is {abs(degrees):.0f} deg to the {'left' if degrees > 0 else 'right'} of it" if abs(degrees) >= 1.0 else "travel agrees"
-    )
-    if abs(direction) <= _MAX_YAW_RAD:
-        return [CheckRow(name, value, second, "ok")]
-    yaw = math.remainder(mount.yaw - direction, math.tau)
-    mounts[frame] = replace(mount, yaw=yaw)
-    advice = f"turn its yaw by {-degrees:+.0f} deg: {yaw:.4f} rad in /tf_static, or in [mounts.{frame}] where the log has none."
-    return [CheckRow(name, value, second, "contradiction", advice)]
+    degrees = 0.0 if direction is None else math.degrees(direction)
+    side = "left" if degrees > 0.0 else "right"
+    second = f"travel is {abs(degrees):.0f} deg to the {side} of it" if abs(degrees) >= 1.0 else "travel agrees"
+    if yaw is not None:
+        mounts.update(corrected(log.mounts, yaw))
+        return [CheckRow(name, value, second, "contradiction", yaw.text)]
+    advice = "" if abs(degrees) <= _MAX_YAW_DEG else f"if the robot did not slide, turn its yaw by {-degrees:+.0f} deg."
+    return [CheckRow(name, value, second, "contradiction" if advice else "ok", advice)]
 
 
 def _forward(log: Log, signals: WheelSignals) -> FloatArray:

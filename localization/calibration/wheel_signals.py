@@ -29,6 +29,8 @@ STEP_S = 0.5
 """Of an interval: latencies of drivers (up to 0.1 s) are small against it."""
 _MAX_MOVING_S, _MAX_READ_S = 120.0, 900.0
 """Time after the wheels' first motion, and in all, that is read [s]."""
+_MIN_SCAN_INTERVALS = 12
+"""With a motion from scan to scan; fewer are of scans that do not match."""
 _MOVED = 0.02
 """Of an angle or rate, in any unit that practice has: above the noise of rates at standstill."""
 _MAX_LIDAR_S = 60.0
@@ -242,16 +244,16 @@ def lidar_motion(log: Log, signals: WheelSignals) -> LidarMotion | None:
     if log.sources.lidar is None:
         return None
     n = len(signals.rates)
-    edges = signals.start_s + STEP_S * np.arange(n + 1)
+    edges = np.asarray(signals.start_s + STEP_S * np.arange(n + 1), dtype=float)
     rows = [row for row in _scan_steps(log, signals.first_ns, signals.start_s) if np.isfinite(row).all()]
-    if len(rows) < 3:
-        return None
-    table = np.array(rows)
+    table = np.array(rows).reshape(-1, 5)
     place = np.searchsorted(edges, 0.5 * (table[:, 0] + table[:, 1])) - 1
     rates = np.full((n, 3), np.nan)
     for i in np.unique(place[(place >= 0) & (place < n)]):
         inside = table[place == i]
         rates[i] = inside[:, 2:].sum(axis=0) / (inside[:, 1] - inside[:, 0]).sum()
+    if np.isfinite(rates[:, 0]).sum() < _MIN_SCAN_INTERVALS:
+        return None
     return LidarMotion(rates[:, 0], rates[:, 1], rates[:, 2])
 
 

@@ -13,6 +13,8 @@ from motion_models.prior import skid_prior
 from motion_models.robot import DIFF_DRIVE, Joints, Robot
 from motion_models.se2 import FloatArray
 
+CORRECTED = "Corrected in this run; write to the robot file:"
+"""Of sentences about what is certain, before keys of the robot file."""
 MAX_RATIO = 2.5
 """Factor by which wheels may be off without a wrong unit: slip, a wrong radius or track, as in the sensor checks."""
 _DEG = math.pi / 180.0
@@ -155,7 +157,7 @@ def _name_unit(report: UnitReport, signals: WheelSignals, what: str, unit: _Unit
         robot = replace(robot, wheel_noise=noise)
     exact = float(f"{exact:.6g}")
     joints = replace(robot.joints, rate_unit_rad_s=exact) if what == "velocities" else replace(robot.joints, angle_unit_rad=exact)
-    text += f". Corrected in this run; write to the robot file: joints.{key} = {exact:g}."
+    text += f". {CORRECTED} joints.{key} = {exact:g}."
     keys = {**report.keys, f"joints.{key}": f"{exact:g}"}
     return replace(report, robot=replace(robot, joints=joints), findings=(*report.findings, text), keys=keys)
 
@@ -173,8 +175,8 @@ def _is_plausible(signals: WheelSignals, robot: Robot) -> bool:
 def _gyro_in_degrees(report: UnitReport, ratio: float) -> UnitReport:
     unit = float(f"{_DEG * report.robot.imu.rate_unit_rad_s:.6g}")
     text = (
-        f"the gyro's rates are {ratio:.3g} times what the wheels' turns allow: it publishes deg/s (57.3). Corrected in this run; write to"
-        f" the robot file: imu.rate_unit_rad_s = {unit:g}, or let its driver publish rad/s."
+        f"the gyro's rates are {ratio:.3g} times what the wheels' turns allow: it publishes deg/s (57.3). {CORRECTED}"
+        f" imu.rate_unit_rad_s = {unit:g}, or let its driver publish rad/s."
     )
     robot = replace(report.robot, imu=replace(report.robot.imu, rate_unit_rad_s=unit))
     return replace(report, robot=robot, findings=(*report.findings, text), keys={**report.keys, "imu.rate_unit_rad_s": f"{unit:g}"})
@@ -193,9 +195,6 @@ def _name_range(report: UnitReport, signals: WheelSignals) -> UnitReport:
     value = float(f"{size if counter is None else counter:.6g}")
     what = f"a counter of {math.log2(counter):.0f} bits" if counter is not None else "a counter that wraps"
     times = f"{len(sizes)} time{'s' * (len(sizes) > 1)}"
-    text = (
-        f"positions of the wheels jump by {value:g} ({times}): {what}. Corrected in this run; write to the robot file: joints.angle_range ="
-        f" {value:.0f}."
-    )
+    text = f"positions of the wheels jump by {value:g} ({times}): {what}. {CORRECTED} joints.angle_range = {value:.0f}."
     robot = replace(report.robot, joints=replace(joints, angle_range=value))
     return replace(report, robot=robot, findings=(*report.findings, text), keys={**report.keys, "joints.angle_range": f"{value:.10g}"})

@@ -17,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.calibration.wheel_signals import WheelSignals, lidar_motion, read_signals
-from localization.calibration.wheel_units import check_units, expected_scaling
+from localization.calibration.wheel_units import CORRECTED, check_units, expected_scaling
 from localization.logs import Log, TopicOverrides, open_log
+from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -82,13 +83,24 @@ class WiringReport:
 
 
 def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> tuple[Log, WiringReport]:  # noqa: B008
-    """The log at ``path`` as `open_log` opens it, with signs and units of wheels and gyro that are certain corrected. Raises what that
-    does."""
+    """The log at ``path`` as `open_log` opens it, with signs and units of wheels and gyro that are certain corrected (`Log.robot`), and
+    each contradiction in `Log.warnings`. Raises what that does."""
     log = open_log(path, robot, topics)
     found = check_wiring(log)
-    if found.is_ambiguous:
-        topics = replace(topics, imu="")
-    return (open_log(path, found.robot, topics) if found.findings else log), found
+    if found.findings:
+        log = open_log(path, found.robot, replace(topics, imu="") if found.is_ambiguous else topics)
+        log.add_notes(found.findings)
+    return log, found
+
+
+def open_wired(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008
+    """The log at ``path``, for what is written to a robot file. Raises what `open_log` does, and `CalibrationError` where the log's wheels
+    or gyro contradict the robot file: a calibration of wrong signs or units fits nothing."""
+    log, found = open_checked(path, robot, topics)
+    if found.findings:
+        texts = " ".join(found.findings).replace(CORRECTED, "Write:")
+        raise CalibrationError(f"{texts} Correct the robot file first; `skidloc check` writes it.")
+    return log
 
 
 def check_wiring(log: Log) -> WiringReport:
@@ -158,10 +170,7 @@ def _check_odometry(log: Log, signals: WheelSignals) -> WiringReport:
         text = f"{topic} turns opposite to gyro and LiDAR ({_numbers(measured)}): left and right are swapped in its driver."
         return WiringReport(log.robot, (text,), correlations=measured)
     unit = -log.robot.imu.rate_unit_rad_s
-    text = (
-        f"the gyro's sign is reversed (correlation of {_numbers(measured)}). Corrected in this run; write to the robot file:"
-        f" imu.rate_unit_rad_s = {unit:g}."
-    )
+    text = f"the gyro's sign is reversed (correlation of {_numbers(measured)}). {CORRECTED} imu.rate_unit_rad_s = {unit:g}."
     robot = replace(log.robot, imu=replace(log.robot.imu, rate_unit_rad_s=unit))
     return WiringReport(robot, (text,), {"imu.rate_unit_rad_s": f"{unit:g}"}, correlations=measured)
 
@@ -178,7 +187,7 @@ def _check_multiplier(log: Log, ratio: float, measured: Mapping[str, float]) -> 
     topic = "" if log.sources.wheels is None else log.sources.wheels.topic
     text = (
         f"{topic} turns as the gyro does (ratio {ratio:.2f}): its driver corrects for skidding, but the robot file's multiplier is 1."
-        f" Corrected in this run; write to the robot file: driver.wheel_separation_multiplier = {value:g}, or its driver's own."
+        f" {CORRECTED} driver.wheel_separation_multiplier = {value:g}, or its driver's own."
     )
     robot = replace(robot, driver=replace(robot.driver, wheel_separation_multiplier=value))
     return WiringReport(robot, (text,), {"driver.wheel_separation_multiplier": f"{value:g}"}, correlations=measured, ratios=ratios)
@@ -308,10 +317,18 @@ def _numbers(measured: Mapping[str, float]) -> str:
 
 def _ambiguous(log: Log, ways: Sequence[str], measured: Mapping[str, float]) -> WiringReport:
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
+    used = {
+        "a gyro": log.sources.imu is not None,
+        "a LiDAR": log.sources.lidar is not None,
+        "the driver's odometry": any("speed by /" in name for name in measured),
+    }
+    others = " or ".join(name for name, is_there in used.items() if not is_there)
+    record = f"record {others} as well, or " if others else ""
+    sensors = " and the gyro's" if used["a gyro"] else ""
     text = (
         f"{wheels} contradicts the other sensors (correlation of the wheels with the {_numbers(measured)}): {', '.join(ways[:-1])},"
-        f" or {ways[-1]}. Nothing in the log decides, and nothing is corrected: record a LiDAR or the driver's odometry as well, or"
-        " watch one turn to the left: the right wheels' rates and the gyro's must be positive."
+        f" or {ways[-1]}. Nothing in the log decides, and nothing is corrected: {record}watch one turn to the left: the right wheels' rates"
+        f"{sensors} must be positive."
     )
     return WiringReport(_with_unknown_signs(log.robot), (text,), is_ambiguous=True, correlations=measured)
 
@@ -339,7 +356,7 @@ def _certain(log: Log, signals: WheelSignals, wiring: Wiring, measured: Mapping[
     entries = "; ".join(f"{key} = {value}" for key, value in keys.items())
     text = (
         f"{wheels}: {wiring.text}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
-        f" so. Corrected in this run; write to the robot file: {entries}."
+        f" so. {CORRECTED} {entries}."
     )
     return WiringReport(robot, (text,), keys, correlations=measured)
 

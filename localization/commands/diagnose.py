@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
+from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import in_radians, new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
@@ -33,7 +34,7 @@ from localization.diagnosis.findings import (
 )
 from localization.diagnosis.linearization import default_model
 from localization.diagnosis.prediction import with_sizes
-from localization.logs import TopicOverrides, open_log
+from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
 from motion_models.calibration.maneuvers import read_windows, table_columns
@@ -126,7 +127,7 @@ class Diagnose:
         return drive_of_table(name, robot, read_windows(self.source), "windows")
 
     def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
-        log = open_log(path, robot, self.topic.scored_against(self.reference))
+        log = open_wired(path, robot, self.topic.scored_against(self.reference))
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas)
 

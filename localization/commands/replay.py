@@ -144,7 +144,6 @@ class Replay:
                     [
                         *prior_notes(robot, [m.name for m in models]),
                         *held_out,
-                        *wiring.findings,
                         *([] if yaw is None else [yaw.text]),
                         *log.warnings(),
                         *warnings_of(found),

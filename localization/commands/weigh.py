@@ -12,11 +12,12 @@ from rich.console import Console
 from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
+from localization.calibration.wheel_wiring import open_wired
 from localization.commands.common import in_radians, write_json
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import DrivenWeighing, corrected_hypothesis, weigh
-from localization.logs import TopicOverrides, open_log
+from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.errors import CalibrationError
 from motion_models.robot import load_robot
@@ -55,7 +56,7 @@ class Weigh:
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         robot = load_robot(self.robot)
         with console.status("reading"):
-            log = open_log(self.log, robot, self.topic.scored_against(self.reference))
+            log = open_wired(self.log, robot, self.topic.scored_against(self.reference))
             drive = drive_of_log(log, self.motion_reference, self.reference, reference_sigmas=in_radians(self.reference_sigma))
         with console.status("weighing"):
             found, predictor = weigh(drive)

@@ -19,12 +19,13 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from localization.calibration.wheel_wiring import open_checked
 from localization.errors import EvaluationError, TransportError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, check_estimator
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import score
-from localization.logs import Log, TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides
 from localization.output import fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial, replay
 from motion_models.errors import SkidlocError
@@ -111,7 +112,7 @@ def failed_rows(job: Job, reason: str) -> list[Row]:
 
 
 def _run(job: Job) -> list[Row]:
-    log = open_log(job.folder / job.log, job.robot, job.topics.scored_against(job.reference))
+    log, _ = open_checked(job.folder / job.log, job.robot, job.topics.scored_against(job.reference))
     has_lidar = log.sources.lidar is not None
     rows, able = [], []
     for trial in job.trials:
@@ -123,8 +124,8 @@ def _run(job: Job) -> list[Row]:
     if not able:
         return rows
     reference = _reference(log, job)
-    named = [Trial(make_model(trial.model, job.robot), trial.estimator, trial.corrections) for trial in able]
-    runs = replay(log.events(), named, job.robot, log.mounts, has_lidar, job.config)
+    named = [Trial(make_model(trial.model, log.robot), trial.estimator, trial.corrections) for trial in able]
+    runs = replay(log.events(), named, log.robot, log.mounts, has_lidar, job.config)
     problems = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
     for trial, result in zip(able, score(runs, reference), strict=True):
         scores = _scores(result.metrics(log.duration_s, with_timing=False))

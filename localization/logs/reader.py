@@ -6,7 +6,7 @@ import math
 import re
 import tempfile
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cached_property, partial
 from itertools import chain, islice
 from pathlib import Path, PurePath
@@ -179,6 +179,10 @@ class Log:
         for stats in self._stats_by_topic.values():
             found += stats.describe()
         return list(dict.fromkeys(found))
+
+    def add_notes(self, notes: Iterable[str]) -> None:
+        """Add sentences to `warnings`, before those about topics."""
+        self._choice_notes = [*notes, *self._choice_notes]
 
     def _events(self, stats: MessageStats) -> Iterator[Event]:
         decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats, self.period_s)

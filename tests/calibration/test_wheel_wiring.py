@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import skidloc
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
 from localization.cli import main
-from localization.logs import open_log
+from localization.logs import TopicOverrides, open_log
 from motion_models.robot import load_robot
 from motion_models.robot_file import robot_toml
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, Change, drive
@@ -101,3 +102,25 @@ def test_replay_of_two_sensors_that_contradict_has_a_wide_covariance(tmp_path: P
     log = drive(tmp_path / "log.mcap", gyro=-1.0 if is_gyro else 1.0, names=names)
     for result in replay_metrics(tmp_path, log)["results"]:  # type: ignore[attr-defined]
         assert result["nees_mean"] < 6.0
+
+
+def test_calibrate_with_the_right_side_inverted_names_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--robot", str(ROBOT_TOML), "--model", "skid_steer", "--out", str(tmp_path / "r.toml")]
+    assert main(["calibrate", str(CASES / "H06-right-side-inverted" / "log.mcap"), *options]) == 2
+    error = capsys.readouterr().err
+    assert 'Write: joints.reversed = ["front_right_wheel", "rear_right_wheel"]' in error
+    assert "Corrected in this run" not in error
+
+
+def test_log_for_notebooks_has_the_corrected_robot() -> None:
+    log = skidloc.open(CASES / "H06-right-side-inverted" / "log.mcap", ROBOT)
+    assert log.robot.joints.reversed == RIGHT
+    assert "the right side counts backwards" in " ".join(log.log.warnings())
+
+
+def test_wiring_without_gyro_has_no_sentence_about_it(tmp_path: Path) -> None:
+    with_gyro = report_of(drive(tmp_path / "log.mcap", names=(*RIGHT, *LEFT))).findings[0]
+    assert "the gyro's must be positive" in with_gyro
+    assert "record a LiDAR or the driver's odometry" in with_gyro
+    without = check_wiring(open_log(tmp_path / "log.mcap", ROBOT, TopicOverrides(imu="")))
+    assert without.findings == ()
