@@ -22,6 +22,7 @@ from motion_models.se2 import FloatArray
 from motion_models.text_files import read_text
 
 _MOVING = ("revolute", "continuous", "prismatic")
+_OPTENV = re.compile(r"\$\(optenv \S+ ([^$()]*)\)")
 _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FILE.urdf"
 
 
@@ -106,7 +107,11 @@ def load_urdf(path: str | Path) -> Urdf:
 
 
 def parse_urdf(text: str, source: str) -> Urdf:
-    """The URDF of an XML text; ``source`` names it in errors. Raises `RobotError`."""
+    """The URDF of an XML text; ``source`` names it in errors. Of $(optenv NAME DEFAULT), which xacro may leave, the default counts.
+
+    Raises `RobotError`.
+    """
+    text = _OPTENV.sub(r"\1", text)
     try:
         # ElementTree takes bytes where the XML declares an encoding.
         root = ET.fromstring(text.encode())
@@ -115,8 +120,11 @@ def parse_urdf(text: str, source: str) -> Urdf:
         raise RobotError(f"{source}: {_XACRO if '<xacro:' in text else f'not valid XML: {error}'}.") from error
     if root.tag != "robot":
         raise RobotError(f"{source}: the outermost element is <{root.tag}>; a URDF has <robot>.")
-    if any("xacro}" in e.tag or any("${" in v or "$(" in v for v in e.attrib.values()) for e in root.iter()):
+    if any("xacro}" in e.tag for e in root.iter()):
         raise RobotError(f"{source}: {_XACRO}.")
+    left = next((v for e in root.iter() for v in e.attrib.values() if "${" in v or "$(" in v), None)
+    if left is not None:
+        raise RobotError(f"{source}: {_XACRO} ('{left}' is in it).")
 
     links: dict[str, Link] = {}
     for element in root.findall("link"):
@@ -266,7 +274,7 @@ def round_shapes(text: str, source: str) -> dict[str, tuple[float, FloatArray]]:
     Raises `RobotError` for lengths that are no numbers; ``source`` names the text.
     """
     found: dict[str, tuple[float, FloatArray]] = {}
-    for link in ET.fromstring(text.encode()).findall("link"):
+    for link in ET.fromstring(_OPTENV.sub(r"\1", text).encode()).findall("link"):
         name = link.get("name", "")
         for shape in (*link.findall("collision"), *link.findall("visual")):
             cylinder, sphere = shape.find("geometry/cylinder"), shape.find("geometry/sphere")

@@ -34,7 +34,8 @@ from motion_models.se2 import FloatArray
 
 _WHEEL = re.compile(r"wheel|tire|tyre|whl|sprocket", re.IGNORECASE)
 _CASTER = re.compile(r"caster|castor|swivel|ball_?wheel", re.IGNORECASE)
-_PASSIVE = re.compile(rf"{_CASTER.pattern}|roller|(?<!skid)(?<!skid[_\-])steer", re.IGNORECASE)
+_STEER = re.compile(r"(?<!skid)(?<!skid[_\-])steer", re.IGNORECASE)
+_PASSIVE = re.compile(rf"{_CASTER.pattern}|roller|{_STEER.pattern}", re.IGNORECASE)
 _LIMB = re.compile(r"shoulder|elbow|wrist|ankle|flipper|gripper|finger|propell|(^|[_\-/])(arm|hip|knee|leg|head|neck)", re.IGNORECASE)
 """Joints that turn about lateral axes and are no wheels."""
 _LEFT = re.compile(r"left|(^|[_\-/])(l|fl|rl|bl|ml|cl|lf|lr|lb|lm)([_\-/]|$)", re.IGNORECASE)
@@ -254,15 +255,16 @@ class _Finder:
             above = next((a for a in self._above[joint.name] if a.kind in _TURNING and abs(self._axis(a)[2]) > _ALONG), None)
             if above is None:
                 driven.append(self._wheel(joint))
-            elif above.kind == "continuous":
+            elif above.kind == "continuous" and not _STEER.search(above.name + above.child):
                 passive.append(self._wheel(joint))
             else:
                 kinds.append(STEERED)
-        if passive and not driven:
+        if passive and not driven and not kinds:
             kinds.append(OMNI)  # swerve modules
         named = [j for j in self._urdf.joints if _CASTER.search(j.name + j.child)]
         passive += [self._wheel(j) for j in [j for j in named if j.child in self._shapes] or named]
-        driven = _on_ground(driven)
+        driven = _on_ground(driven, driven)
+        passive = _on_ground(passive, driven)
         largest = max((wheel.radius for wheel in driven if wheel.radius > 0.0), default=math.nan)
         passive += [wheel for wheel in driven if wheel.radius < _SMALL * largest]
         return _Found([wheel for wheel in driven if not wheel.radius < _SMALL * largest], passive, kinds, has_names)
@@ -319,12 +321,12 @@ def _turns(joint: Joint) -> bool:
     return joint.kind == "continuous" or (joint.kind == "revolute" and joint.upper - joint.lower >= _FULL_TURN)
 
 
-def _on_ground(wheels: list[_Wheel]) -> list[_Wheel]:
-    """Those whose lowest point is below the lowest axle: no flywheels, spare wheels and steering wheels."""
-    if not wheels:
+def _on_ground(wheels: list[_Wheel], driven: Sequence[_Wheel]) -> list[_Wheel]:
+    """Those whose lowest point is below the lowest axle of those ``driven``: no flywheels, spare wheels, steering wheels and heads."""
+    if not driven:
         return wheels
-    assumed = 0.3 * _extent(wheel.position[1] for wheel in wheels)  # radius of a wheel whose mesh alone is known
-    lowest = min(float(wheel.position[2]) for wheel in wheels)
+    assumed = 0.3 * _extent(wheel.position[1] for wheel in driven)  # radius of a wheel whose mesh alone is known
+    lowest = min(float(wheel.position[2]) for wheel in driven)
     return [w for w in wheels if float(w.position[2]) - (w.radius if w.radius > 0.0 else assumed) <= lowest]
 
 

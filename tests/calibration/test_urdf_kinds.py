@@ -190,6 +190,12 @@ KINDS = {
         wheelbase=None,
         named=("tracks",),
     ),
+    "head that swivels": Kind(
+        urdf(wheels(), link("head", 0.1), joint("head_swivel", "head", "0.1 0 0.5", "continuous", "0 0 1")),
+    ),
+    "origin by an environment variable": Kind(
+        urdf(wheels(), link("imu", None), joint("imu_joint", "imu", "$(optenv IMU_XYZ 0.19 0 0.149)")),
+    ),
     "mecanum plugin": Kind(
         urdf(
             wheels(),
