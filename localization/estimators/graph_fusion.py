@@ -23,6 +23,7 @@ from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
+from localization.maps.grid import Grid, GrowingGrid
 from localization.settings import Positive, Settings, Signed
 from localization.trajectory import Trajectory, through_nodes
 from motion_models import se2
@@ -45,6 +46,8 @@ _FOUND_SHARE = 0.5
 """Variance of the position over that at the last keyframe, below which a scan has found the place of a robot that was lost."""
 _LONGEST_WAIT = 2.0
 """Distances between keyframes after which the next one no longer waits for a scan: the LiDAR is silent."""
+_CELL_M, _MAX_CELLS = 0.1, 4_000_000
+"""Side of the cells of the grid that is published [m]; it doubles until there are at most so many."""
 _CORRECTION_EPOCH_S = 60.0
 """Corrections are constant for this long [s]; as a random walk of an hour they change by an eighth of their prior sigma meanwhile."""
 
@@ -82,6 +85,7 @@ class GraphFusion(Estimator):
         self._map_T_odom, self._key_cov = np.zeros(3), np.zeros((3, 3))
         self._moving_s, self._end_ns = 0.0, 0
         self._smoothed_covs: FloatArray | None = None
+        self._grid = GrowingGrid(_CELL_M, _MAX_CELLS)
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
         self._waiting: list[PositionSample] = []
         self._is_aligned, self._failure = False, ""
@@ -315,6 +319,13 @@ class GraphFusion(Estimator):
             edge_information=np.array([edge.information for edge in edges]).reshape(-1, 3, 3),
             edge_is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
         )
+
+    def occupancy(self) -> Grid | None:
+        """As `Estimator.occupancy`."""
+        keys = self._loops.keyframes
+        if not any(len(key.points) for key in keys):
+            return None
+        return self._grid.update(self.graph.poses(), [key.points for key in keys], [key.lidar for key in keys])
 
     def map_points(self) -> Points2:
         """(M, 2) the scans of all keyframes, where the graph has them [m]."""

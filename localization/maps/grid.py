@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ from localization.errors import MapError
 from localization.maps.keyframe_map import IntArray, KeyframeMap
 from motion_models import se2
 from motion_models.compiled import kernel, subroutine
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Points2
 
 _HIT, _PASS = math.log(0.7 / 0.3), math.log(0.35 / 0.65)
 """Log-odds of a scan that hits a cell (0.7: OctoMap, Hornung 2013), and of one that passes. Two passes make a cell free by nav2's 0.25."""
@@ -21,6 +23,10 @@ _LOW, _HIGH = -2.0, 3.5
 OCCUPIED, FREE = 0.65, 0.25
 """Probabilities above which a cell is occupied, and below which it is free: the defaults of nav2's map saver."""
 _MARGIN_CELLS = 4
+_REDRAWN_CELLS = 0.5
+"""A growing grid is drawn anew where a keyframe has moved by more [cells]."""
+_BLOCK_M = 10.0
+"""It grows by blocks of this side [m]."""
 _MAX_CELLS = 100_000_000
 """A square of 500 m at 0.05 m; its arrays take 1.7 GB."""
 
@@ -57,10 +63,70 @@ def draw_grid(mapped: KeyframeMap, resolution: float, free: float = FREE) -> Gri
     log_odds = np.zeros((int(shape[1]), int(shape[0])))
     starts, ends = np.floor(starts / resolution) - low, np.floor(ends / resolution) - low
     _cast(log_odds, starts.astype(np.int64), ends.astype(np.int64), np.repeat(np.arange(len(starts)), mapped.counts))
+    return _classify(log_odds, low, resolution, free)
+
+
+def _classify(log_odds: FloatArray, low: FloatArray, resolution: float, free: float) -> Grid:
+    """Cells (H, W) of ``log_odds``, whose first one has the indices ``low`` (2,)."""
     cells = np.full(log_odds.shape, -1, np.int8)
     cells[log_odds > math.log(OCCUPIED / (1.0 - OCCUPIED))] = 100
     cells[log_odds < math.log(free / (1.0 - free))] = 0
     return Grid(cells, (float(low[0] * resolution), float(low[1] * resolution)), resolution)
+
+
+class GrowingGrid:
+    """The grid of a map that grows: new keyframes are added, and all are drawn anew where a loop has moved those that were."""
+
+    def __init__(self, resolution: float, max_cells: int) -> None:
+        """``resolution``: side of a cell [m]; it doubles until there are at most ``max_cells``."""
+        self._resolution, self._max_cells = resolution, max_cells
+        self._clear()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """It is drawn from the keyframes again."""
+        return {"resolution": self._resolution, "max_cells": self._max_cells}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._resolution, self._max_cells = state["resolution"], state["max_cells"]
+        self._clear()
+
+    def _clear(self) -> None:
+        self._drawn, self._low, self._log_odds = np.empty((0, 3)), np.zeros(2), np.zeros((0, 0))
+
+    def update(self, poses: FloatArray, scans: Sequence[Points2], lidars: Sequence[FloatArray]) -> Grid:
+        """The grid of keyframes at ``poses`` (K, 3), with ``scans`` (n, 2) in their body frames and the places (2,) of their LiDARs [m]."""
+        old = poses[: len(self._drawn)]
+        if len(poses) < len(self._drawn) or np.hypot(*(old - self._drawn)[:, :2].T).max(initial=0.0) > _REDRAWN_CELLS * self._resolution:
+            self._clear()
+        new = range(len(self._drawn), len(poses))
+        starts = [se2.transform(poses[k], lidars[k]) for k in new]
+        ends = [se2.transform(poses[k], scans[k]) for k in new if len(scans[k])]
+        if ends:
+            points, counts = np.vstack(ends), np.array([len(scans[k]) for k in new])
+            if not self._grow(np.vstack([points, *starts])):
+                return self.update(poses, scans, lidars)
+            first, last = (np.floor(where / self._resolution) - self._low for where in (np.array(starts), points))
+            _cast(self._log_odds, first.astype(np.int64), last.astype(np.int64), np.repeat(np.arange(len(starts)), counts))
+        self._drawn = poses.copy()
+        return _classify(self._log_odds, self._low, self._resolution, FREE)
+
+    def _grow(self, points: Points2) -> bool:
+        """Make room for ``points`` (N, 2); False where the cells became larger, and all is to be drawn anew."""
+        block = max(round(_BLOCK_M / self._resolution), 1)
+        low = np.floor(points.min(axis=0) / self._resolution / block) * block
+        high = (np.floor(points.max(axis=0) / self._resolution / block) + 1.0) * block
+        rows, columns = self._log_odds.shape
+        if rows:
+            low, high = np.minimum(low, self._low), np.maximum(high, self._low + np.array([columns, rows]))
+        if np.prod(high - low) > self._max_cells:
+            self._resolution *= 2.0
+            self._clear()
+            return False
+        grown = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])))
+        x, y = (self._low - low).astype(int) if rows else (0, 0)
+        grown[y : y + rows, x : x + columns] = self._log_odds
+        self._low, self._log_odds = low, grown
+        return True
 
 
 @kernel

@@ -341,7 +341,7 @@ class Node:
             if grid is None:
                 self._publisher.publish_map(self.session.pipeline.estimator.map_points(), stamp_ns)
             else:
-                self._publisher.publish_grid(grid, stamp_ns)
+                self._publisher.publish_grid(grid, stamp_ns, self.session.state.start.map_T_start)
 
 
 class StopSignal:

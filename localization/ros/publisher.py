@@ -47,6 +47,7 @@ _MAX_PATH_POSES, _PATH_SPACING_M = 500, 0.05
 _CELL_M, _MAX_CELLS = 0.1, 4_000_000
 """Edge of the map's cells [m]; it doubles until the map has at most so many."""
 
+_NO_OFFSET = np.zeros(3)
 _NS = 1e-9
 _KEEP_S = 2.0
 """Wheel samples are stored for this long [s]."""
@@ -143,8 +144,8 @@ class EstimatePublisher:
         origin, cell, cells = occupancy_grid(points)
         self.publish_grid(Grid(cells, (float(origin[0]), float(origin[1])), cell), stamp_ns)
 
-    def publish_grid(self, grid: Grid, stamp_ns: int) -> None:
-        """nav_msgs/OccupancyGrid with free space."""
+    def publish_grid(self, grid: Grid, stamp_ns: int, map_T_grid: FloatArray = _NO_OFFSET) -> None:
+        """nav_msgs/OccupancyGrid with free space; ``map_T_grid`` (3,): of the frame that ``grid`` was drawn in."""
         frame = self._frames.map_frame if self._path.is_in_map else self._frames.odom_frame
         height, width = grid.cells.shape
         info = make(
@@ -153,7 +154,7 @@ class EstimatePublisher:
             resolution=grid.resolution,
             width=width,
             height=height,
-            origin=_pose(np.array([*grid.origin, 0.0])),
+            origin=_pose(se2.compose(map_T_grid, np.array([*grid.origin, 0.0]))),
         )
         self._publish(MAP, make(_TYPES[MAP], header=self._header(stamp_ns, frame), info=info, data=grid.cells.ravel()))
 

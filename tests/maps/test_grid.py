@@ -12,8 +12,9 @@ from PIL import Image
 
 from localization.errors import MapError
 from localization.maps.export import exports
-from localization.maps.grid import draw_grid
-from tests.helpers import square_room
+from localization.maps.grid import Grid, GrowingGrid, draw_grid
+from localization.ros.state_serialization import deserialize, serialize
+from tests.helpers import floor_plan, square_room
 
 ROOM = square_room.make_map()
 CELL = 0.05
@@ -104,3 +105,49 @@ def test_export_ply_has_the_points() -> None:
     points = np.frombuffer(body, "<f4").reshape(-1, 3)
     np.testing.assert_allclose(points[:, :2], ROOM.points_in_map(), atol=1e-6)
     assert not points[:, 2].any()
+
+
+def keyframes_of(mapped):
+    return mapped.poses, mapped.scans(), list(mapped.sensors)
+
+
+def test_growing_grid_by_parts_is_the_grid_of_all() -> None:
+    mapped = floor_plan.make_map()
+    poses, scans, lidars = keyframes_of(mapped)
+    growing = GrowingGrid(0.1, 4_000_000)
+    for k in (1, 2, 10, len(poses)):
+        grid = growing.update(poses[:k], scans[:k], lidars[:k])
+    assert_same_cells(grid, draw_grid(mapped, 0.1))
+
+
+def test_growing_grid_is_drawn_anew_where_keyframes_have_moved() -> None:
+    mapped = floor_plan.make_map()
+    poses, scans, lidars = keyframes_of(mapped)
+    growing = GrowingGrid(0.1, 4_000_000)
+    growing.update(poses + np.array([0.0, 0.3, 0.02]), scans, lidars)
+    assert_same_cells(growing.update(poses, scans, lidars), draw_grid(mapped, 0.1))
+    resumed = pickle_free_copy(growing)
+    assert_same_cells(resumed.update(poses, scans, lidars), draw_grid(mapped, 0.1))
+
+
+def test_growing_grid_of_too_many_cells_has_larger_ones() -> None:
+    mapped = floor_plan.make_map()
+    grid = GrowingGrid(0.1, 20_000).update(*keyframes_of(mapped))
+    assert grid.resolution == 0.2
+    assert grid.cells.size <= 20_000
+
+
+def pickle_free_copy(growing: GrowingGrid) -> GrowingGrid:
+    text, blob = serialize(growing)
+    assert len(text) + len(blob) < 500
+    return deserialize(text, blob)
+
+
+def assert_same_cells(one: Grid, other: Grid) -> None:
+    """Known cells are the same; their margins differ."""
+    found = []
+    for grid in (one, other):
+        rows, columns = np.nonzero(grid.cells >= 0)
+        x, y = (np.round(origin / grid.resolution) for origin in grid.origin)
+        found.append({(int(c + x), int(r + y)): int(grid.cells[r, c]) for r, c in zip(rows, columns, strict=True)})
+    assert found[0] == found[1]

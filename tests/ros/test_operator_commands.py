@@ -216,12 +216,13 @@ def test_commands_by_topics_do_what_the_services_do():
 
 def test_path_and_map_are_published_in_the_frame_of_the_estimates():
     transport = LogTransport(drive_log())
-    node, _ = run_node(transport, "graph", config=NodeConfig(wait_s=0.0))
+    node, _ = run_node(transport, "graph", config=NodeConfig(wait_s=0.0, map_period_s=0.001))
     path, grid = published(transport, PATH)[-1], published(transport, MAP)[-1]
     assert path.header.frame_id == grid.header.frame_id == "map"
     assert 1 < len(path.poses) <= 500
     cells = np.asarray(grid.data).reshape(grid.info.height, grid.info.width)
-    assert set(np.unique(cells)) == {-1, 100}
+    assert set(np.unique(cells)) == {-1, 0, 100}
+    assert (cells == 0).mean() > 0.15
     assert grid.info.resolution == pytest.approx(0.1)
     assert node._publisher._path.poses[0][1] == pytest.approx(np.zeros(3), abs=0.1)
 
