@@ -35,8 +35,8 @@ _OPEN = np.diag([1e-2, 1e-2, 1.0])
 """Information of a scan along directions that the scene leaves open, at least [1/m^2, 1/m^2, 1/rad^2]."""
 _BY_WALLS, _BY_FREE, _BY_MARGIN, _BY_POINTS, _OFFSET = 7.2, -5.3, 11.2, 1.7, -7.8
 """Log-odds that the best place of a search is the right one, by its shares on walls and in free space, its margin over the next place (at
-most 0.5) and log(points / 200): logistic regression of 640 searches in halves of three buildings, most of them of another building. Of 400
-others, 40 had more than 0.9, and all of these were right."""
+most 0.5) and log(points / 200): logistic regression of 640 searches in halves of three buildings, most of them of another building. All of
+the 64 that have more than 0.9 are right."""
 _RIVALRY = 20.0
 """By which the probability of a place falls with its score: a place that scores 0.11 less than the best is one tenth as probable."""
 _MAX_MARGIN, _POINTS = 0.5, 200.0
@@ -138,12 +138,12 @@ class Localizer:
     def _track(self, points: Points2) -> None:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
         place = self._align(points)
-        if place is None or (place.on_walls + place.in_free < _KNOWN_SHARE and place.in_free < _CONTRADICTING_SHARE):
+        if place is None or (place.on_walls + place.contradicting < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE):
             return
         R = np.asarray(np.linalg.inv(place.fit.information + _OPEN)) * max(place.residual_variance, 1.0) + _BEND
         measured = se2.compose(place.pose, se2.exp(-np.linalg.solve(place.fit.information + _OPEN, place.fit.gradient)))
         is_outlier = mahalanobis(self.pose, measured, self._cov + R) > OUTLIER_SIGMAS**2
-        evidence = _TRACK_GAIN * (place.on_walls - _CONTRADICTION * place.in_free)
+        evidence = _TRACK_GAIN * (place.on_walls - _CONTRADICTION * place.contradicting)
         self._track_odds = min(self._track_odds + (-_TRACK_GAIN if is_outlier else evidence), _MAX_LOG_ODDS)
         self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
         if self.state == "localized" and _sigmoid(self._track_odds) < _LOST:

@@ -25,7 +25,7 @@ CELL_M = 0.1
 _SURFACE_CELL_M = 0.08
 """Voxel of the surfaces that scans are aligned with [m]."""
 _CERTAINLY_FREE = 0.125
-"""Probability below which a cell contradicts a point in it: four passes. With two, walls that a map has by few, slanting beams have up to
+"""Probability below which a cell contradicts a tracked place: four passes. With two, walls that a map has by few, slanting beams have up to
 0.3 of the points of a right place in free space (ACES, halves); with four, 0.13."""
 _SEARCH_POINTS = 150
 """Points of a search: what is aligned afterwards has all."""
@@ -55,6 +55,8 @@ class Place:
     """Share of the points that lie on walls of the map."""
     in_free: float
     """Share of the points that lie in space that is free in the map; the others are where the map is unknown."""
+    contradicting: float
+    """The same, of space that is free for certain (`_CERTAINLY_FREE`)."""
 
     @property
     def residual_variance(self) -> float:
@@ -108,7 +110,7 @@ class PlaceMap:
         return scores, reduce_image(scores)
 
     def _grid_values(self, points: Points2) -> FloatArray:
-        return _look_up(self._certain.cells.T, points - self._certain.origin, -1)
+        return _look_up(self.grid.cells.T, points - self.grid.origin, -1)
 
     def _free_blocks(self, keyframes: KeyframeMap) -> FloatArray:
         """(C, 2) centres of the blocks of `COARSE` cells that hold free space or a keyframe [m]."""
@@ -168,7 +170,9 @@ class PlaceMap:
         moved = np.asarray(se2.transform(fit.pose, points))
         is_near = _look_up(self._walls.levels[0], moved - self._walls.origin) >= _NEAR
         values = self._grid_values(moved)
-        return Place(fit.pose, fit, float(is_near.mean()), float((~is_near & (values == 0)).mean()))
+        certain = _look_up(self._certain.cells.T, moved - self._certain.origin, -1)
+        shares = [float((~is_near & (cells == 0)).mean()) for cells in (values, certain)]
+        return Place(fit.pose, fit, float(is_near.mean()), *shares)
 
 
 def _look_up(image: NDArray[Any], points: Points2, outside: float = 0.0) -> FloatArray:
