@@ -77,8 +77,8 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
     report = UnitReport(robot, ratios=ratios)
     by_gyro = [unit for unit in wrong.values() if unit.by_gyro]
     known = [unit for unit in measured.values() if unit is not None]
-    if by_gyro and len(by_gyro) == len(known) and all(_GYRO_IN_DEGREES[0] <= u.value <= _GYRO_IN_DEGREES[1] for u in by_gyro):
-        return _gyro_in_degrees(report, by_gyro[0].value)
+    if by_gyro and len(by_gyro) == len(known) and all(is_in_degrees(u.value) for u in by_gyro):
+        return gyro_in_degrees(report, by_gyro[0].value)
     right = next((what for what, unit in measured.items() if unit is not None and what not in wrong), None)
     for what, unit in wrong.items():
         report = _name_unit(report, signals, what, unit if right is None else _of_messages(signals, what) or unit)
@@ -172,7 +172,13 @@ def _is_plausible(signals: WheelSignals, robot: Robot) -> bool:
     return not len(rates) or float(np.abs(rates).max()) * robot.geometry.wheel_radius_m <= _FASTEST_M_S
 
 
-def _gyro_in_degrees(report: UnitReport, ratio: float) -> UnitReport:
+def is_in_degrees(ratio: float) -> bool:
+    """Whether a gyro whose turns are ``ratio`` times the wheels' can only be in deg/s."""
+    return _GYRO_IN_DEGREES[0] <= ratio <= _GYRO_IN_DEGREES[1]
+
+
+def gyro_in_degrees(report: UnitReport, ratio: float) -> UnitReport:
+    """``report`` with the unit of a gyro that publishes deg/s."""
     unit = float(f"{_DEG * report.robot.imu.rate_unit_rad_s:.6g}")
     text = (
         f"the gyro's rates are {ratio:.3g} times what the wheels' turns allow: it publishes deg/s (57.3). {CORRECTED}"

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.calibration.wheel_signals import WheelSignals, lidar_motion, read_signals
-from localization.calibration.wheel_units import CORRECTED, check_units, expected_scaling
+from localization.calibration.wheel_units import CORRECTED, UnitReport, check_units, expected_scaling, gyro_in_degrees, is_in_degrees
 from localization.logs import Log, TopicOverrides, open_log
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
@@ -180,6 +180,9 @@ def _check_multiplier(log: Log, ratio: float, measured: Mapping[str, float]) -> 
     robot = log.robot
     expected = expected_scaling(robot) * robot.driver.wheel_separation_multiplier
     ratios = {"turn by the gyro over turn by the driver": ratio}
+    if is_in_degrees(ratio / expected):
+        found = gyro_in_degrees(UnitReport(robot), ratio / expected)
+        return WiringReport(found.robot, found.findings, found.keys, correlations=measured, ratios=ratios)
     is_default = robot.driver.wheel_separation_multiplier == 1.0 and "k_0" not in robot.models.get("skid_steer", {})
     if not is_default or abs(ratio - 1.0) > _SAME_TURN or abs(expected / ratio - 1.0) < _OTHER_TURN or min(measured.values()) < 0.95:
         return WiringReport(robot, correlations=measured, ratios=ratios)

@@ -88,3 +88,8 @@ def test_driver_odometry_opposite_to_the_gyro_blames_none(tmp_path: Path) -> Non
     report = report_of(drive(tmp_path / "log.mcap", gyro=-1.0, has_odometry=True, has_joints=False))
     assert report.is_ambiguous
     assert "or the gyro's sign is reversed" in report.findings[0]
+
+
+def test_units_of_gyro_in_degrees_beside_odometry_are_corrected(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", gyro=1.0 / DEG, has_odometry=True, has_joints=False))
+    assert report.robot.imu.rate_unit_rad_s == pytest.approx(DEG, rel=1e-4)
