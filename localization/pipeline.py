@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from localization.errors import LogError
 from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.estimators import (
@@ -210,8 +212,12 @@ class Run:
     """State, probability and times of the estimator that localizes in a saved map."""
     in_space: Trajectory3 | None = None
     """Filtered poses in space, with height, roll and pitch, where an IMU shows that the ground tilts."""
+    parameter_history: Mapping[str, FloatArray] = field(default_factory=dict)
+    """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
 
 
+_PARAMETERS_EVERY_NS = 2_000_000_000
+"""Time between two samples of the estimated parameters, in `Run.parameter_history`."""
 _EQUAL_CHARACTERS = 60
 """Of warnings of one fault: its time and kind, up to the numbers."""
 
@@ -263,6 +269,8 @@ class _Replay:
     def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
         self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
         self._table3 = Trajectory3Table()
+        self._parameters: dict[str, list[tuple[float, float, float]]] = {}
+        self._next_ns = 0
 
     def process(self, event: Event) -> None:
         begin = time.perf_counter()
@@ -272,6 +280,10 @@ class _Replay:
     def _add(self, estimates: Iterator[Estimate]) -> None:
         for estimate in estimates:
             self._table.add(estimate)
+            if estimate.stamp_ns >= self._next_ns:
+                self._next_ns = estimate.stamp_ns + _PARAMETERS_EVERY_NS
+                for name, (mean, sigma) in self._pipeline.estimator.parameters().items():
+                    self._parameters.setdefault(name, []).append((estimate.stamp_ns * 1e-9, mean, sigma))
             if self._pipeline.pose3 is not None:
                 self._table3.add(self._pipeline.pose3)
 
@@ -303,4 +315,5 @@ class _Replay:
             estimator.keyframe_map(),
             estimator.localization(),
             self._table3.trajectory() if self._pipeline.is_tilting else None,
+            {name: np.array(rows) for name, rows in self._parameters.items()},
         )

@@ -51,6 +51,15 @@ def test_replay_by_api_equals_the_functions_of_localization(log: skidloc.RobotLo
     assert len(runs[:1]) == 1
 
 
+def test_parameter_history_has_each_parameter_with_its_sigma_over_time(runs: skidloc.Runs) -> None:
+    run = next(scored.result.run for scored in runs if scored.result.run.parameters)
+    assert set(run.parameter_history) == set(run.parameters)
+    for name, rows in run.parameter_history.items():
+        assert (np.diff(rows[:, 0]) >= 2.0 - 1e-6).all()
+        assert rows[-1, 2] <= rows[0, 2] * 1.5, name  # sigmas hardly grow
+        assert abs(rows[-1, 1] - run.parameters[name][0]) < 3.0 * rows[-1, 2]
+
+
 def test_tables_have_stamps_poses_variances_and_twists(runs: skidloc.Runs) -> None:
     run = runs["diff_drive/ekf"]
     array = run.to_numpy()

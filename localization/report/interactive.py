@@ -70,6 +70,7 @@ def _run(run: PlottedRun, start_ns: int, most: int) -> dict[str, Any]:
         "nis": _innovations(run, t),
         "loops": _loops(run),
         "lost": _lost(run, t),
+        "parameters": {name: _history(rows, start_ns) for name, rows in run.result.run.parameter_history.items()},
     }
 
 
@@ -121,6 +122,13 @@ def _lost(run: PlottedRun, t: FloatArray) -> list[list[float | None]]:
     if t[-1] - matched[-1] > _LOST_AFTER_S:
         found.append([float(matched[-1]), float(t[-1])])
     return [_numbers(np.array(pair), 2) for pair in found]
+
+
+def _history(rows: FloatArray, start_ns: int) -> dict[str, list[float | None]]:
+    """Mean and sigma over time of one estimated parameter; three digits of its final sigma."""
+    rows = rows[:: max(-(-len(rows) // _MOST_MEANS), 1)]
+    digits = int(np.clip(2.0 - np.floor(np.log10(max(float(rows[-1, 2]), 1e-9))), 0, 9))
+    return {"t": _numbers(rows[:, 0] - start_ns * 1e-9, 2), "mean": _numbers(rows[:, 1], digits), "sigma": _numbers(rows[:, 2], digits)}
 
 
 def _reference(track: ReferenceTrack, start_ns: int) -> dict[str, Any]:

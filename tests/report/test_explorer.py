@@ -56,7 +56,14 @@ def results():
         (),
         1.0,
     )
-    fused = dataclasses.replace(plain, estimator="ekf", trajectory=Trajectory(STAMPS, POSES, cov), nis=nis, map_points=np.ones((9, 2)))
+    fused = dataclasses.replace(
+        plain,
+        estimator="ekf",
+        trajectory=Trajectory(STAMPS, POSES, cov),
+        nis=nis,
+        map_points=np.ones((9, 2)),
+        parameter_history={"k_0": np.array([[0.0, 0.5, 0.1], [40.0, 0.55, 0.01]])},
+    )
     reference = ReferenceTrack(STAMPS[::4], POSES[::4, :2], POSES[::4, 2])
     return score([plain, fused], reference), reference
 
@@ -92,7 +99,7 @@ def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', shown)[1])
     assert seen["at20"][1] == pytest.approx(10.0, abs=0.1)
     assert (seen["text"], seen["log"], seen["way"]) == ("20.0 s", "log", "way [m]")
-    assert {"position error [m]", "heading error [deg]", "position sigma [m]", "NIS (3 expected)"} == set(seen["titles"])
+    assert {"position error [m]", "heading error [deg]", "position sigma [m]", "NIS (3 expected)", "k_0 ± sigma"} == set(seen["titles"])
     assert seen["difference"]
     assert seen["isStaticHidden"]
     assert seen["bands"] == 1

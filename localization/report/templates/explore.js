@@ -53,8 +53,15 @@
     ["heading error [deg]", "log", run => run.errors && run.errors.heading && [along(run, run.errors), run.errors.heading]],
     ["position sigma [m]", "log", run => run.sigma && [along(run), run.sigma]],
     ["NIS (3 expected)", "log", run => run.nis && [run.nis.t.map(t => isWay() ? run.way[before(run.t, t)] : t), run.nis.nis]],
-  ].concat(difference()).filter(row => runs.some(run => row[2](run)));
+  ].concat(parameter(), difference()).filter(row => runs.some(run => row[2](run)));
 
+  const parameter = () => {
+    const name = box("parameter").value;
+    return name ? [[name + " ± sigma", "linear", run => {
+      const p = run.parameters[name];
+      return p && [p.t.map(t => isWay() ? run.way[before(run.t, t)] : t), p.mean, p.sigma];
+    }]] : [];
+  };
   const difference = () => {
     const [a, b] = ["a", "b"].map(name => runs[+box(name).value]);
     if (!a || !b || a === b) return [];
@@ -73,8 +80,11 @@
       more["yaxis" + name] = axis("", {type, domain: [Math.max(top - height, 0), top], exponentformat: "power", automargin: true});
       runs.forEach(run => {
         const s = series(run);
+        if (s && s[2]) [1, -1].forEach(sign => traces.push({x: s[0], y: s[1].map((m, k) => m + sign * s[2][k]), yaxis: "y" + name, mode: "lines",
+          line: {width: 0}, fill: sign < 0 ? "tonexty" : "none", fillcolor: colour(run.colour) + "30", showlegend: false, hoverinfo: "skip",
+          legendgroup: run.label}));
         if (s) traces.push({x: s[0], y: s[1], yaxis: "y" + name, mode: "lines", name: run.label, legendgroup: run.label,
-          showlegend: !traces.some(t => t.legendgroup === run.label), line: {...style(run), width: 1.4}, hovertemplate: "%{y:.3g}"});
+          showlegend: !traces.some(t => t.name === run.label), line: {...style(run), width: 1.4}, hovertemplate: "%{y:.3g}"});
       });
     });
     more.annotations = found.map(([title], i) => ({text: title, xref: "paper", yref: "paper", x: 0, y: 1 - i * (height + gap), showarrow: false,
@@ -119,12 +129,16 @@
   const events = [...runs.flatMap(run => run.lost.map(l => [l[0], "no scan matched for " + (l[1] - l[0]).toFixed(1) + " s, " + run.label])),
                   ...runs.flatMap(run => run.loops.map(l => [l[4], "loop closed, " + run.label]))].sort((p, q) => p[0] - q[0]);
   events.forEach(([t, text]) => box("event").add(new Option(t.toFixed(1) + " s: " + text, t)));
+  const names = [...new Set(runs.flatMap(run => Object.keys(run.parameters)))];
+  names.forEach(name => box("parameter").add(new Option(name, name)));
+  box("parameter").value = names[0] || "";
+  box("parameter").parentElement.hidden = !names.length;
   box("event").parentElement.hidden = !events.length;
   box("slider").max = end;
   draw();
   box("slider").addEventListener("input", event => show(+event.target.value));
   box("event").addEventListener("change", event => event.target.value && show(+event.target.value));
-  ["axis", "a", "b"].forEach(name => box(name).addEventListener("change", draw));
+  ["axis", "a", "b", "parameter"].forEach(name => box(name).addEventListener("change", draw));
   box("time").on("plotly_click", event => {
     const x = event.points[0].x;
     show(isWay() ? runs[0].t[before(runs[0].way, x)] : x);
