@@ -11,8 +11,10 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 
 from localization.commands.common import PlainConsole
+from localization.commands.short_help import short_help
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2
@@ -52,7 +54,7 @@ def overview() -> str:
             "commands:",
             *lines,
             "",
-            "`skidloc COMMAND --help` describes the options of a command.",
+            "`skidloc COMMAND --help` describes the options of a command, `--help-all` all of its settings as well.",
         ]
     )
 
@@ -65,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if given and given[0] in ("-h", "--help"):
             print(overview())
+        elif given == ["--version"]:
+            print(f"skidloc {version('skidloc')}")
         elif not given or given[0] not in COMMANDS:
             errors.print(f"skidloc: {_unknown(given)}", markup=False)
             return _BAD_INPUT
@@ -134,9 +138,14 @@ def _unknown(given: Sequence[str]) -> str:
 
 
 def _run(name: str, options: Sequence[str]) -> None:
+    text = short_help(name, COMMANDS[name][0]) if list(options) in (["-h"], ["--help"]) else None
+    if text is not None:
+        print(text)
+        return
     import tyro
 
     command = getattr(importlib.import_module(f"localization.commands.{name}"), COMMANDS[name][0])
+    options = ["--help" if option == "--help-all" else option for option in options]
     tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,)).run(PlainConsole(highlight=False))
 
 

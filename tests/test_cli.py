@@ -1,12 +1,15 @@
 """The command line itself: the overview, unknown commands, and what it imports."""
 
+import dataclasses
 import importlib
+import importlib.metadata
 import subprocess
 import sys
 
 import pytest
 
 from localization.cli import COMMANDS, main
+from localization.commands.short_help import short_help
 
 HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "tyro")
 
@@ -31,3 +34,26 @@ def test_help_without_command_lists_all_and_imports_no_numerical_library() -> No
 def test_unknown_command_is_refused_with_the_nearest(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
     assert expected in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("map", "online")])
+def test_short_help_has_each_option_of_the_command(command: str) -> None:
+    """Against the dataclass that tyro reads, for which everything is imported."""
+    name = COMMANDS[command][0]
+    text = short_help(command, name)
+    assert text is not None
+    for field in dataclasses.fields(getattr(importlib.import_module(f"localization.commands.{command}"), name)):
+        flag = "--" + field.name.replace("_", "-")
+        assert any(line.startswith(("  " + flag, "  " + field.name.upper())) for line in text.splitlines()) or f"{flag}.*" in text
+
+
+def test_help_of_a_command_imports_no_numerical_library() -> None:
+    code = f"import sys; from localization.cli import main; main(['replay', '--help']); print([n for n in {HEAVY} if n in sys.modules])"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.splitlines()[-1] == "[]"
+    assert "--estimator" in shown
+
+
+def test_version_is_that_of_the_distribution(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"skidloc {importlib.metadata.version('skidloc')}\n"
