@@ -59,6 +59,7 @@ def warm_up(run: LiveRun) -> None:
                 predictor.reset(estimate, pipeline.estimator.params, pipeline.estimator.clock_offset_s)
             predictor.predict()
         pipeline.estimator.map_points()
+        pipeline.estimator.occupancy()
         pipeline.finish()
 
 
