@@ -106,15 +106,11 @@ def load_urdf(path: str | Path) -> Urdf:
     return parse_urdf(text, source=str(path))
 
 
-def parse_urdf(text: str, source: str) -> Urdf:
-    """The URDF of an XML text; ``source`` names it in errors. Of $(optenv NAME DEFAULT), which xacro may leave, the default counts.
-
-    Raises `RobotError`.
-    """
-    text = _OPTENV.sub(r"\1", text)
+def urdf_root(text: str, source: str) -> ET.Element:
+    """<robot> of an XML text. Of $(optenv NAME DEFAULT), which xacro may leave, the default counts. Raises `RobotError`."""
     try:
-        # ElementTree takes bytes where the XML declares an encoding.
-        root = ET.fromstring(text.encode())
+        # ElementTree takes bytes where the XML declares an encoding; a file may start with a mark of its byte order.
+        root = ET.fromstring(_OPTENV.sub(r"\1", text).lstrip("\ufeff \t\r\n").encode())
     except ET.ParseError as error:
         # An old xacro file may not declare its namespace, which is an error of XML already.
         raise RobotError(f"{source}: {_XACRO if '<xacro:' in text else f'not valid XML: {error}'}.") from error
@@ -125,7 +121,12 @@ def parse_urdf(text: str, source: str) -> Urdf:
     left = next((v for e in root.iter() for v in e.attrib.values() if "${" in v or "$(" in v), None)
     if left is not None:
         raise RobotError(f"{source}: {_XACRO} ('{left}' is in it).")
+    return root
 
+
+def parse_urdf(text: str, source: str) -> Urdf:
+    """The URDF of an XML text; ``source`` names it in errors. Raises `RobotError`."""
+    root = urdf_root(text, source)
     links: dict[str, Link] = {}
     for element in root.findall("link"):
         link = _link(element, source)
@@ -274,7 +275,7 @@ def round_shapes(text: str, source: str) -> dict[str, tuple[float, FloatArray]]:
     Raises `RobotError` for lengths that are no numbers; ``source`` names the text.
     """
     found: dict[str, tuple[float, FloatArray]] = {}
-    for link in ET.fromstring(_OPTENV.sub(r"\1", text).encode()).findall("link"):
+    for link in urdf_root(text, source).findall("link"):
         name = link.get("name", "")
         for shape in (*link.findall("collision"), *link.findall("visual")):
             cylinder, sphere = shape.find("geometry/cylinder"), shape.find("geometry/sphere")

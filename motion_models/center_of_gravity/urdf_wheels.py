@@ -28,7 +28,7 @@ from motion_models.center_of_gravity.drive_controllers import (
     urdf_controllers,
     velocity_joints,
 )
-from motion_models.center_of_gravity.urdf import Joint, Urdf, first_names, link_poses, parse_urdf, round_shapes
+from motion_models.center_of_gravity.urdf import Joint, Urdf, first_names, link_poses, parse_urdf, round_shapes, urdf_root
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
 
@@ -149,7 +149,7 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
     is no URDF, a missing ``base_link``, for one with neither, and for lengths that are not metres.
     """
     urdf = parse_urdf(text, source)
-    root = ET.fromstring(text.encode())
+    root = urdf_root(text, source)
     poses = link_poses(urdf, base_link)
     found = _Finder(urdf, poses, round_shapes(text, source)).find(velocity_joints(root))
     controllers, kinds = urdf_controllers(root), _kinds(urdf, root, found)
@@ -240,6 +240,11 @@ class _Finder:
             parent = by_child.get(joint.parent)
             self._above[joint.name] = () if parent is None else (parent, *self._above[parent.name])
             by_child[joint.child] = joint
+        self._behind: dict[str, list[Joint]] = {joint.name: [] for joint in urdf.joints}
+        """Moving joints that hang on each joint, by its name."""
+        for joint in urdf.joints:
+            for above in self._above[joint.name] if joint.moves else ():
+                self._behind[above.name].append(joint)
 
     def find(self, commanded: frozenset[str]) -> _Found:
         """Driven and passive wheels; ``commanded`` joints are driven by velocity."""
@@ -249,7 +254,12 @@ class _Finder:
         if rollers:
             along = [abs(self._axis(j)[0]) for j in self._urdf.joints if j.name in rollers]
             kinds.append(OMNI if statistics.median(along) > _ALONG else MECANUM)
-        joints = [j for j in joints if j.name not in rollers and (not self._is_above(j, joints) or self._rollers(j))]
+        names = {joint.name for joint in joints}
+        joints = [
+            j
+            for j in joints
+            if j.name not in rollers and (self._rollers(j) or not any(other.name in names for other in self._behind[j.name]))
+        ]
         driven, passive = [], []
         for joint in joints:
             above = next((a for a in self._above[joint.name] if a.kind in _TURNING and abs(self._axis(a)[2]) > _ALONG), None)
@@ -287,17 +297,12 @@ class _Finder:
 
     def _is_part_of_arm(self, joint: Joint) -> bool:
         """Whether something that moves hangs on a ``joint`` that turns without end."""
-        moving = [other for other in self._urdf.joints if other.moves and not _PASSIVE.search(other.name)]
-        return _turns(joint) and self._is_above(joint, moving)
+        return _turns(joint) and not all(_PASSIVE.search(other.name) for other in self._behind[joint.name])
 
     def _rollers(self, wheel: Joint) -> list[Joint]:
         """Joints on the circumference of a mecanum or omni ``wheel``."""
-        behind = [j for j in self._urdf.joints if _turns(j) and self._is_above(wheel, [j])]
+        behind = [joint for joint in self._behind[wheel.name] if _turns(joint)]
         return behind if len(behind) >= _ROLLERS else []
-
-    def _is_above(self, joint: Joint, others: Sequence[Joint]) -> bool:
-        """Whether one of ``others`` hangs on ``joint``."""
-        return any(joint is above for other in others for above in self._above[other.name])
 
     def _axis(self, joint: Joint) -> FloatArray:
         if not joint.moves:

@@ -196,6 +196,7 @@ KINDS = {
     "origin by an environment variable": Kind(
         urdf(wheels(), link("imu", None), joint("imu_joint", "imu", "$(optenv IMU_XYZ 0.19 0 0.149)")),
     ),
+    "blank line before the declaration": Kind('\ufeff\n<?xml version="1.0" encoding="utf-8"?>' + urdf(wheels())),
     "mecanum plugin": Kind(
         urdf(
             wheels(),
