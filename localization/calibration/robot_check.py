@@ -17,6 +17,8 @@ from localization.calibration.wheel_signals import STEP_S, LidarMotion, WheelSig
 from localization.calibration.wheel_units import expected_scaling
 from localization.calibration.wheel_wiring import WiringReport, open_checked
 from localization.errors import LogError
+from localization.evaluation.reference_files import load_reference
+from localization.evaluation.references import ReferenceTrack, Relations
 from localization.events import Event, ImuSample
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
@@ -49,6 +51,9 @@ _SIGMAS = 3.0
 _MIN_TURNING_RAD_S = 0.05
 _MIN_SPEED_M_S, _MAX_TURN_RAD_S, _MIN_TRAVEL_INTERVALS, _MIN_COHERENCE = 0.05, 0.1, 6, 0.9
 _GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 20, 8.0, 12.0
+_LAGS_S = tuple(float(lag) for lag in np.arange(-60.0, 60.5, 0.5))
+"""Clock offsets of a reference that are tried [s]: GPS time is 18 s ahead."""
+_SAME_WAY, _MIN_REFERENCE_LIKENESS, _SURE_LIKENESS = 1.4, 0.7, 0.95
 _MAX_ODD_SHARE = 0.02
 """Of a topic's messages or time."""
 _CHORD_STEPS = 10
@@ -103,9 +108,11 @@ def model_of(robot: Robot) -> str:
     return "diff_drive" if robot.drive == DIFF_DRIVE else "skid_steer"
 
 
-def check_robot(path: Path, robot: Robot | None, given: Given) -> RobotCheck:
-    """Check the robot of the log at ``path``: ``robot``, else as the log and ``given`` describe it. Raises what opening the log does, and
-    `RobotError` for lengths that nothing gives."""
+def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | None = None) -> RobotCheck:
+    """Check the robot of the log at ``path``: ``robot``, else as the log and ``given`` describe it; and ``reference``, a topic or a file.
+
+    Raises what opening the log and reading the reference do, and `RobotError` for lengths that nothing gives.
+    """
     draft = None
     if robot is None or given.urdf is not None or given.controller is not None:
         draft = draft_robot(survey_log(path), replace(given, like=robot), path)
@@ -123,7 +130,7 @@ def check_robot(path: Path, robot: Robot | None, given: Given) -> RobotCheck:
     if signals is not None:
         rows += [*_scale_rows(log, wiring, signals, motion), *_lidar_rows(log, signals, motion, mounts)]
     run = _replayed(log, mounts, "ekf", signals)
-    rows += [*_filter_rows(log, run), *_imu_rows(log), *_reference_rows(log, signals)]
+    rows += [*_filter_rows(log, run), *_imu_rows(log), *_reference_rows(log, signals, reference)]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
     model = make_model(model_of(log.robot), log.robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
@@ -364,31 +371,57 @@ def _imu_rows(log: Log) -> list[CheckRow]:
     return [CheckRow("axes of IMU", value, second, "contradiction", f"{what}: correct roll and pitch of '{frame}' in /tf_static.")]
 
 
-def _reference_rows(log: Log, signals: WheelSignals | None) -> list[CheckRow]:
+def _reference_rows(log: Log, signals: WheelSignals | None, given: str | None) -> list[CheckRow]:
     """Way and turn of the reference over those of wheels and gyro."""
-    topic = log.reference_topic
+    topic = given or log.reference_topic
     if topic is None:
         return [CheckRow("reference", "none", "", "cannot be seen", "none is needed; with one (mocap, GPS, map) errors can be measured.")]
-    track = [(r.stamp_ns, *r.position.tolist()) for r in log.references(topic) if np.isfinite(r.position).all()]
-    if signals is None or len(track) < 10:
-        return [CheckRow("reference", topic, f"{len(track)} poses", "cannot be seen", "its poses are too few.")]
-    t, x, y = np.array(track).T
-    edges = signals.first_ns + (signals.start_s + STEP_S * np.arange(len(signals.rates) + 1)) * 1e9
-    inside = (edges >= t[0]) & (edges <= t[-1])
+    found = load_reference(log, topic)
+    if isinstance(found, Relations):
+        return [CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")]
+    if signals is None or len(found.stamps_ns) < _CHORD_STEPS:
+        return [CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", "its poses are too few.")]
     wheels = _dead_reckoned(log, signals)
-    a, b = inside[:-_CHORD_STEPS] & inside[_CHORD_STEPS:], slice(None, -_CHORD_STEPS)
-    paths = np.stack([np.interp(edges, t, v) for v in (x, y)], axis=1), wheels
-    chords = [(path[_CHORD_STEPS:] - path[b])[a] @ [1.0, 1.0j] for path in paths]
-    if len(chords[0]) <= 2 * _CHORD_STEPS or float(np.abs(chords[1]).max()) < 1.0:
+    compared = {lag: _compare(found, signals, wheels, lag) for lag in (0.0, *_LAGS_S)}
+    now = compared[0.0]
+    best = max((lag for lag, one in compared.items() if one is not None), key=lambda lag: _likeness(compared[lag]), default=0.0)
+    if now is None and _likeness(compared[best]) < _SURE_LIKENESS:
         return [CheckRow("reference", topic, "no common motion", "cannot be seen", "another time, or the robot hardly moves in it.")]
-    ratio = float(np.abs(chords[0]).sum() / np.abs(chords[1]).sum())
-    turns = [chord[_CHORD_STEPS:] * np.conj(chord[:-_CHORD_STEPS]) for chord in chords]
-    together = float(np.real(np.vdot(turns[1], turns[0])) / max(np.linalg.norm(turns[0]) * np.linalg.norm(turns[1]), 1e-12))
-    second = f"way {ratio:.3g} times the wheels', likeness of turns {together:.2f}"
-    if 1.0 / 1.4 <= ratio <= 1.4 and together > 0.7:
+    second = "no common motion" if now is None else f"way {now[0]:.4g} times the wheels', likeness of turns {now[1]:.2f}"
+    if now is not None and 1.0 / _SAME_WAY <= now[0] <= _SAME_WAY and now[1] > _MIN_REFERENCE_LIKENESS:
         return [CheckRow("reference", topic, second, "ok")]
-    advice = "its unit is another (millimetres?)." if together > 0.7 else "its stamps, axes or run are others."
+    if now is not None and now[1] > _MIN_REFERENCE_LIKENESS:
+        advice = f"its lengths are {now[0]:.4g} times the wheels': another unit (1000: millimetres), or a wrong wheel radius."
+    elif _likeness(compared[best]) >= _SURE_LIKENESS:
+        advice = (
+            f"its stamps are about {abs(best):.1f} s {'late' if best > 0.0 else 'early'} (18 s: GPS time): moved so, it fits the sensors."
+        )
+    else:
+        advice = "its stamps, axes or run are others."
     return [CheckRow("reference", topic, second, "contradiction", advice)]
+
+
+def _likeness(one: tuple[float, float] | None) -> float:
+    return -1.0 if one is None else one[1]
+
+
+def _compare(track: ReferenceTrack, signals: WheelSignals, wheels: FloatArray, lag_s: float) -> tuple[float, float] | None:
+    """Way of a reference, whose stamps are late by ``lag_s``, over that of ``wheels`` (n + 1, 2) [m], and the cosine between the turns from
+    one displacement to the next; None where they share too little motion."""
+    known = np.isfinite(track.positions).all(axis=1)
+    t, (x, y) = (track.stamps_ns[known] - signals.first_ns) * 1e-9 - lag_s, track.positions[known].T
+    edges = signals.start_s + STEP_S * np.arange(len(wheels))
+    inside = (edges >= t[0]) & (edges <= t[-1]) if len(t) else np.zeros(len(edges), dtype=bool)
+    use = inside[:-_CHORD_STEPS] & inside[_CHORD_STEPS:]
+    if use.sum() <= 2 * _CHORD_STEPS:
+        return None
+    paths = np.interp(edges, t, x) + 1j * np.interp(edges, t, y), wheels @ [1.0, 1.0j]
+    ours, theirs = ((path[_CHORD_STEPS:] - path[:-_CHORD_STEPS])[use] for path in reversed(paths))
+    if float(np.abs(ours).max()) < 1.0 or not theirs.any():
+        return None
+    turns = [chord[_CHORD_STEPS:] * np.conj(chord[:-_CHORD_STEPS]) for chord in (ours, theirs)]
+    likeness = float(np.real(np.vdot(turns[0], turns[1]))) / max(float(np.linalg.norm(turns[0]) * np.linalg.norm(turns[1])), 1e-12)
+    return float(np.abs(theirs).sum() / np.abs(ours).sum()), likeness
 
 
 def _dead_reckoned(log: Log, signals: WheelSignals) -> FloatArray:

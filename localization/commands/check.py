@@ -44,7 +44,7 @@ class Check:
     controller: Path | None = None
     """YAML of the robot's drive controller (diff_drive_controller, ros2_control)."""
     reference: str | None = None
-    """Topic of the log whose poses are compared with the sensors. Default: the robot file's, if any."""
+    """Topic of the log, or file, whose poses are compared with the sensors. Default: the robot file's topic, if any."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """New folder for check.html, check.json, robot.toml, diff_drive_controller.yaml, robot_localization.yaml and slam_toolbox.yaml."""
@@ -59,7 +59,7 @@ class Check:
                 raise LogError(f"{option} '{path}': there is no such file.")
         given = Given(urdf=self.urdf, controller=self.controller, topics=self.topic.scored_against(self.reference))
         with console.status("checking"):
-            found = check_robot(self.log, None if self.robot is None else load_robot(self.robot), given)
+            found = check_robot(self.log, None if self.robot is None else load_robot(self.robot), given, self.reference)
         _print(console, found)
         content = _content(found)
         if self.out is not None:

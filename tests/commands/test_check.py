@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from localization.cli import main
@@ -74,3 +75,14 @@ def test_check_without_gyro_has_no_sentence_about_it(tmp_path: Path) -> None:
     texts = [row for row in found["rows"] if "by the gyro" in row["second_source"] or row["quantity"] == "axes of IMU"]
     assert texts == []
     assert open_log(CASES / "base-log" / "log.mcap", load_robot(ROBOT_TOML)).sources.imu is not None
+
+
+@pytest.mark.parametrize(("scale", "late_s", "text"), [(1000.0, 0.0, "1000: millimetres"), (1.0, 18.0, "about 18.0 s late")])
+def test_check_of_reference_names_its_unit_and_clock(tmp_path: Path, scale: float, late_s: float, text: str) -> None:
+    rows = np.loadtxt(CASES / "base-log" / "reference.tum")
+    rows[:, 1:3] *= scale
+    rows[:, 0] += late_s
+    np.savetxt(tmp_path / "reference.tum", rows, fmt="%.9f")
+    options = ("--robot", str(ROBOT_TOML), "--reference", str(tmp_path / "reference.tum"))
+    found = check(tmp_path, CASES / "base-log" / "log.mcap", *options)
+    assert [text in row["advice"] for row in found["rows"] if row["quantity"] == "reference"] == [True]
