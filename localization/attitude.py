@@ -90,6 +90,7 @@ class AttitudeFilter:
         self._samples: list[tuple[int, FloatArray, FloatArray]] = []
         self._first: list[FloatArray] = []
         self._scale, self._problem = 0.0, ""  # of the force, 0 until known; why there is no attitude
+        self._is_unusable = False
         self._turn_by_wheels = self._agreement = 0.0
         self._last_ns = 0
         self._window = np.zeros(7)  # sum of the forces, velocity at its begin, both turned into the body as it is now; length [s]
@@ -151,7 +152,7 @@ class AttitudeFilter:
             self._rotation = self._mounts[sample.frame_id].rotation()
             mount = self._mounts[sample.frame_id]
             self._place = np.array([mount.x, mount.y, mount.z])
-        if sample.frame_id != self._frame or self._problem:
+        if sample.frame_id != self._frame or self._problem or self._is_unusable:
             return
         if not self._scale:
             self._first.append(sample.linear_acceleration)
@@ -168,11 +169,14 @@ class AttitudeFilter:
             self._scale = 1.0
         elif _IN_G[0] < size < _IN_G[1]:
             self._scale = GRAVITY
+        elif not size:  # no accelerometer
+            self._is_unusable = True
         elif size < _NO_GRAVITY:
             self._problem = f"{named} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it. Slopes are not modelled."
         else:
             self._problem = f"{named} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g. Slopes are not modelled."
-        self._samples = [] if self._problem else self._samples
+        if self._problem or self._is_unusable:
+            self._samples = []
 
     def advance(self, end_ns: int, dt_s: FloatArray, rates: FloatArray) -> Tilt | None:
         """Advance to ``end_ns``; wheels rolled at ``rates`` (n, 2) [rad/s] for ``dt_s`` (n,) [s] each, n = 0 where that is not known.

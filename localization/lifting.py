@@ -15,7 +15,7 @@ import numpy as np
 
 from localization.attitude import AttitudeFilter
 from localization.output import whole_file
-from localization.trajectory import IntArray
+from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
@@ -27,7 +27,6 @@ _LASTING_M = 2.0
 class Pose3:
     """A pose ``world_T_body`` in space, z up."""
 
-    stamp_ns: int
     position: FloatArray
     """(3,) [m]."""
     rotation: FloatArray
@@ -44,24 +43,26 @@ class Lifting:
         self._position, self._rotation = np.zeros(3), np.eye(3)
         self._way = 0.0
 
-    def add(self, stamp_ns: int, planar: Pose2, cov: Cov3 | None, attitude: AttitudeFilter) -> Pose3:
-        """The pose in space at the planar pose (3,), whose right perturbation has the covariance ``cov`` (3, 3)."""
+    def add(self, planar: Pose2, cov: Cov3, ground_up: FloatArray, variances: tuple[float, float]) -> Pose3:
+        """The pose in space at the planar pose (3,), whose right perturbation has the covariance ``cov`` (3, 3).
+
+        ``ground_up`` (3,) and ``variances`` as of `AttitudeFilter`: the vertical there, and what is uncertain about it.
+        """
         if self._planar is None:
             self._position[:2], self._rotation = planar[:2], _yaw(float(planar[2]))
-            self._rotation = self._rotation @ _aligning(attitude.ground_up, np.array([0.0, 0.0, 1.0]))
+            self._rotation = self._rotation @ _aligning(ground_up, np.array([0.0, 0.0, 1.0]))
         else:
             dx, dy, turn = se2.between(self._planar, planar).tolist()
             before, turned = self._rotation, self._rotation @ _yaw(turn)
-            self._rotation = turned @ _aligning(attitude.ground_up, turned[2])
+            self._rotation = turned @ _aligning(ground_up, turned[2])
             along = np.array([dx, dy, 0.0])
             self._position = self._position + 0.5 * (before @ along + self._rotation @ (_yaw(-turn) @ along))
             self._way += math.hypot(dx, dy)
         self._planar = planar
-        return Pose3(stamp_ns, self._position, self._rotation, self._covariance(np.zeros((3, 3)) if cov is None else cov, attitude))
+        return Pose3(self._position, self._rotation, self._covariance(cov, *variances))
 
-    def _covariance(self, cov: Cov3, attitude: AttitudeFilter) -> FloatArray:
+    def _covariance(self, cov: Cov3, tilt: float, mount: float) -> FloatArray:
         """(6, 6): the planar covariance in the body's plane, and height, roll and pitch by the attitude's."""
-        tilt, mount = attitude.tilt_variances
         net = float(self._position[:2] @ self._position[:2])
         body = np.zeros((3, 3))
         body[:2, :2], body[2, 2] = cov[:2, :2], mount * net + tilt * self._way * min(self._way, _LASTING_M)
@@ -122,24 +123,31 @@ class Trajectory3:
     """(N, 6) of x, y, z, roll, pitch, yaw [m, rad]."""
 
 
-class Trajectory3Table:
-    """Poses in space in memory, 112 bytes each; one that is not later than the last is left out."""
+class AttitudeTable:
+    """The ground's verticals in body axes by stamp, 48 bytes each; one that is not later than the last is left out."""
 
     def __init__(self) -> None:
         self._stamps, self._numbers = array("q"), array("d")
 
-    def add(self, pose: Pose3) -> None:
-        """Append a pose."""
-        if self._stamps and pose.stamp_ns <= self._stamps[-1]:
+    def add(self, stamp_ns: int, attitude: AttitudeFilter) -> None:
+        """Append the vertical as it is."""
+        if self._stamps and stamp_ns <= self._stamps[-1]:
             return
-        self._stamps.append(pose.stamp_ns)
-        sigmas = np.sqrt(np.maximum(np.diagonal(pose.covariance), 0.0))
-        self._numbers.extend([*pose.position.tolist(), *quaternion(pose.rotation), *sigmas.tolist()])
+        self._stamps.append(stamp_ns)
+        self._numbers.extend((*attitude.ground_up.tolist(), *attitude.tilt_variances))
 
-    def trajectory(self) -> Trajectory3:
-        """All poses so far."""
-        rows = np.array(self._numbers).reshape(-1, 13)
-        return Trajectory3(np.array(self._stamps, dtype=np.int64), rows[:, :3], rows[:, 3:7], rows[:, 7:])
+    def lift(self, planar: Trajectory) -> Trajectory3:
+        """The poses in space of a ``planar`` trajectory, from the first vertical on."""
+        stamps, rows = np.array(self._stamps, dtype=np.int64), np.array(self._numbers).reshape(-1, 5)
+        lifting, known, numbers = Lifting(), np.isin(planar.stamps_ns, stamps), []
+        at = np.searchsorted(stamps, planar.stamps_ns[known])
+        covariances = np.zeros((len(planar), 3, 3)) if planar.covariances is None else planar.covariances
+        for pose, cov, row in zip(planar.poses[known], covariances[known], rows[at], strict=True):
+            found = lifting.add(pose, cov, row[:3], (float(row[3]), float(row[4])))
+            sigmas = np.sqrt(np.maximum(np.diagonal(found.covariance), 0.0))
+            numbers.append([*found.position, *quaternion(found.rotation), *sigmas])
+        table = np.array(numbers).reshape(-1, 13)
+        return Trajectory3(planar.stamps_ns[known], table[:, :3], table[:, 3:7], table[:, 7:])
 
 
 def write_tum3(path: Path, trajectory: Trajectory3 | None) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from localization.attitude import AttitudeFilter
 from localization.errors import LogError
 from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
 from localization.estimators import (
@@ -28,7 +29,7 @@ from localization.estimators import (
 )
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
-from localization.lifting import Lifting, Pose3, Trajectory3, Trajectory3Table
+from localization.lifting import AttitudeTable, Trajectory3
 from localization.maps import KeyframeMap
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
@@ -86,17 +87,14 @@ class Pipeline:
         if trial.prior is not None:
             self.estimator = MapFusion(self.estimator, trial.prior)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
-        self._lifting = Lifting()
-        self.pose3: Pose3 | None = None
-        """The last estimate in space; None without an attitude."""
         self.wheel_twist: FloatArray | None = None
         """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
 
     @property
-    def is_tilting(self) -> bool:
-        """Whether the ground has been found to tilt."""
-        attitude = self.synchronizer.attitude
-        return attitude is not None and attitude.is_tilting
+    def attitude(self) -> AttitudeFilter | None:
+        """Roll and pitch; None where they are not known."""
+        found = self.synchronizer.attitude
+        return found if found is not None and found.has_attitude else None
 
     def process(self, event: Event) -> list[Estimate]:
         """Take ``event``; the estimates that it completes, none or several. Raises `EstimatorError`.
@@ -107,7 +105,7 @@ class Pipeline:
         return list(self.stream(event))
 
     def stream(self, event: Event) -> Iterator[Estimate]:
-        """`process`, one estimate at a time: what else is known of each (`pose3`) holds until the next is taken."""
+        """`process`, one estimate at a time: `attitude` is that of the estimate until the next is taken."""
         if isinstance(event, PositionSample):
             self.estimator.add_position(event)
             return
@@ -125,9 +123,6 @@ class Pipeline:
             self.checks.compare_residuals(self.estimator)
             estimate = self.checks.inflate(estimate)
             self._feed_back(step, is_scan_matched=estimate.nis is not None)
-            attitude = self.synchronizer.attitude
-            if attitude is not None and attitude.has_attitude:
-                self.pose3 = self._lifting.add(estimate.stamp_ns, estimate.pose, estimate.covariance, attitude)
             yield estimate  # publish
 
     def _calibrate(self) -> None:
@@ -211,7 +206,7 @@ class Run:
     localization: Mapping[str, Any] | None = None
     """State, probability and times of the estimator that localizes in a saved map."""
     in_space: Trajectory3 | None = None
-    """Filtered poses in space, with height, roll and pitch, where an IMU shows that the ground tilts."""
+    """``trajectory`` in space, with height, roll and pitch, where an IMU shows that the ground tilts."""
     parameter_history: Mapping[str, FloatArray] = field(default_factory=dict)
     """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
 
@@ -268,7 +263,7 @@ class _Replay:
 
     def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
         self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
-        self._table3 = Trajectory3Table()
+        self._attitudes = AttitudeTable()
         self._parameters: dict[str, list[tuple[float, float, float]]] = {}
         self._next_ns = 0
 
@@ -284,8 +279,9 @@ class _Replay:
                 self._next_ns = estimate.stamp_ns + _PARAMETERS_EVERY_NS
                 for name, (mean, sigma) in self._pipeline.estimator.parameters().items():
                     self._parameters.setdefault(name, []).append((estimate.stamp_ns * 1e-9, mean, sigma))
-            if self._pipeline.pose3 is not None:
-                self._table3.add(self._pipeline.pose3)
+            attitude = self._pipeline.attitude
+            if attitude is not None:
+                self._attitudes.add(estimate.stamp_ns, attitude)
 
     def finish(self) -> Run:
         begin = time.perf_counter()
@@ -296,11 +292,13 @@ class _Replay:
         filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
         smoothed = estimator.finish(filtered)
         smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)
+        attitude, final = self._pipeline.attitude, filtered if smoothed is None else smoothed
+        in_space = self._attitudes.lift(final) if attitude is not None and attitude.is_tilting else None
         self._seconds += time.perf_counter() - begin
         return Run(
             self._trial.model.name,
             self._trial.estimator,
-            filtered if smoothed is None else smoothed,
+            final,
             table[:, TWIST],
             table[:, TWIST_COV].reshape(-1, 3, 3),
             table[:, NIS],
@@ -314,6 +312,6 @@ class _Replay:
             self._pipeline.lidar,
             estimator.keyframe_map(),
             estimator.localization(),
-            self._table3.trajectory() if self._pipeline.is_tilting else None,
+            in_space,
             {name: np.array(rows) for name, rows in self._parameters.items()},
         )

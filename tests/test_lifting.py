@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from localization.lifting import Lifting, Trajectory3Table, quaternion, write_tum3
+from localization.lifting import AttitudeTable, Lifting, quaternion, write_tum3
+from localization.trajectory import Trajectory
 
 
 class Vertical:
@@ -25,7 +26,7 @@ def test_lifting_up_a_ramp_gains_its_height():
     nose_up = Rotation.from_euler("y", -10.0, degrees=True).as_matrix()
     attitude.set_rotation(nose_up)
     for x in np.linspace(0.0, 5.0, 51):
-        pose = lifting.add(int(1e9 + 1e8 * x), np.array([x, 0.0, 0.0]), None, attitude)
+        pose = lifting.add(np.array([x, 0.0, 0.0]), np.zeros((3, 3)), attitude.ground_up, attitude.tilt_variances)
     c, s = math.cos(math.radians(10.0)), math.sin(math.radians(10.0))
     np.testing.assert_allclose(pose.position, [5.0 * c, 0.0, 5.0 * s], atol=1e-9)
     np.testing.assert_allclose(pose.rotation, nose_up, atol=1e-9)
@@ -39,7 +40,7 @@ def test_lifting_a_circle_on_a_plane_returns_to_its_start():
     for angle in np.linspace(0.0, 2.0 * math.pi, 201):
         attitude.set_rotation(plane @ Rotation.from_euler("z", angle).as_matrix())
         planar = np.array([2.0 * math.sin(angle), 2.0 - 2.0 * math.cos(angle), angle])
-        pose = lifting.add(int(1e9 * (1.0 + angle)), planar, np.diag([0.01, 0.02, 0.001]), attitude)
+        pose = lifting.add(planar, np.diag([0.01, 0.02, 0.001]), attitude.ground_up, attitude.tilt_variances)
         first = first or pose
         assert abs((first.rotation[:, 2]) @ pose.position) < 5e-3
     np.testing.assert_allclose(pose.position, 0.0, atol=5e-3)
@@ -56,13 +57,14 @@ def test_quaternion_is_that_of_scipy():
 
 
 def test_tum_file_of_poses_in_space_has_eight_columns(tmp_path):
-    lifting, attitude, table = Lifting(), Vertical(), Trajectory3Table()
-    for i in range(3):
-        table.add(lifting.add(1_500_000_000 + i, np.array([0.1 * i, 0.0, 0.0]), None, attitude))
-    write_tum3(tmp_path / "a.tum", table.trajectory())
+    table, stamps = AttitudeTable(), np.array([1_500_000_000, 1_500_000_001, 1_500_000_002])
+    for stamp in stamps[1:]:
+        table.add(int(stamp), Vertical())
+    planar = Trajectory(stamps, np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]]))
+    write_tum3(tmp_path / "a.tum", table.lift(planar))
     lines = (tmp_path / "a.tum").read_text().splitlines()
-    assert lines[2].split()[0] == "1.500000001"
-    np.testing.assert_allclose([float(v) for v in lines[2].split()[1:]], [0.1, 0, 0, 0, 0, 0, 1], atol=1e-12)
+    assert lines[1].split()[0] == "1.500000001"
+    np.testing.assert_allclose([float(v) for v in lines[1].split()[1:]], [0.1, 0, 0, 0, 0, 0, 1], atol=1e-12)
     write_tum3(tmp_path / "none.tum", None)
     assert not (tmp_path / "none.tum").exists()
 

@@ -77,6 +77,11 @@ def turn_in_place(t: float, position: FloatArray, heading: float) -> tuple[float
     return (0.0, 0.0) if t < 2.0 else (0.0, 1.0)
 
 
+def steady(vx: float, wz: float):
+    """Rest, then a straight line or an arc."""
+    return lambda t, position, heading: (0.0, 0.0) if t < 2.0 else (vx, wz)
+
+
 class Wander:
     """Straight on, arcs and turns in place by chance, towards the middle where far from it."""
 

@@ -24,7 +24,7 @@ from motion_models.registry import make_model
 from motion_models.robot import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
-from tests.helpers.mujoco_hills import HillDrive, Wander, drive, turn_in_place
+from tests.helpers.mujoco_hills import HillDrive, Wander, drive, steady, turn_in_place
 
 _RADIUS_M, _STEP_S = 0.165, 0.02
 _MODEL = FrictionModel.from_robot(load_robot("husky_a200"))
@@ -147,6 +147,10 @@ def print_replays() -> None:
     drives = {
         f"in place, {deg:.0f} deg, mu {mu}": (turn_in_place, 12.0, mu, deg)
         for deg, mu in ((5.0, 0.8), (10.0, 0.8), (5.0, 0.5), (10.0, 0.5))
+    }
+    drives |= {
+        f"{name}, 10 deg, mu 0.8": (steady(*c), 12.0, 0.8, 10.0)
+        for name, c in (("up", (0.5, 0.0)), ("arc", (0.6, 0.2)), ("tight arc", (0.3, 0.6)))
     }
     drives |= {f"hills, seed {seed}": (Wander(seed), 120.0, 0.8, None) for seed in (1, 2)}
     for name, how in drives.items():
