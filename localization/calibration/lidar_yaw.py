@@ -13,12 +13,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from localization.events import Scan, WheelSample
+from localization.events import Event, Scan, WheelSample
 from localization.lidar import LidarConfig, Sweep
 from localization.logs import Log
 from localization.sensor_checks.scan_motion import ScanOdometry
 from motion_models import se2
-from motion_models.robot import Mount
+from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray, Pose2
 
 _INTERVAL_S = 0.5
@@ -28,6 +28,7 @@ _MAX_CURVATURE_RAD_M = 0.6
 """Sharper turns slide sideways."""
 _SURE_WAY_M, _MAX_S, _MAX_SCANS = 1.0, 60.0, 1200
 """Way after which a mount is healthy, and the longest that is read [s from the first motion; scans in all]."""
+_SCANS_PER_RESULT = 10  # after that way
 _MIN_COHERENCE = 0.9
 _MAX_SLIDE_RAD = math.radians(20.0)
 """As in the sensor check of the direction of travel: no slide of 99.9 % of the windows of three buildings is larger."""
@@ -45,11 +46,13 @@ class LidarYaw:
     frame: str
     mount: Mount | None
     """As it is used in place of the log's; None where other causes are as likely."""
+    is_certain: bool = False
+    """More driving would not change it."""
 
 
 @dataclass
 class _Travel:
-    """Of one LiDAR: its motion and the wheels', interval by interval."""
+    """Of one LiDAR: its motion, interval by interval."""
 
     odometry: ScanOdometry = field(default_factory=ScanOdometry)
     begin_ns: int = 0
@@ -58,30 +61,117 @@ class _Travel:
     rows: list[tuple[int, int, Pose2]] = field(default_factory=list)
 
 
+class LidarYawCheck:
+    """`add` the events of a drive until `is_done`; then `result` is what they show."""
+
+    def __init__(self, mounts: Mapping[str, Mount], robot: Robot, topic: str) -> None:
+        """``topic``: of the scans, for the sentence."""
+        self._mounts, self._radius_m, self._topic = mounts, robot.geometry.wheel_radius_m, topic
+        self._wheels: list[WheelSample] = []
+        self._travels: dict[str, _Travel] = defaultdict(_Travel)
+        self._config = LidarConfig()
+        self._moving_ns: int | None = None
+        self._scans, self._next_scan, self._way_m = 0, 0, 0.0
+        self.is_done = False
+        """The mount agrees, or is certainly wrong, or a minute has passed."""
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the wheels have turned so far."""
+        return self._moving_ns is not None
+
+    def add(self, event: Event) -> None:
+        """Take the next event."""
+        if isinstance(event, WheelSample):
+            self._add_wheels(event)
+        elif isinstance(event, Scan) and self.has_moved:
+            self._scans += 1
+            _register(self._travels[event.frame_id], event, self._mounts.get(event.frame_id, Mount()), self._config)
+            if self._way_m > _SURE_WAY_M and self._scans >= self._next_scan:
+                self._next_scan = self._scans + _SCANS_PER_RESULT
+                is_healthy = all(self._is_healthy(frame) for frame in self._travels)
+                self.is_done |= is_healthy or ((found := self.result()) is not None and found.is_certain)
+        is_late = self._moving_ns is not None and event.stamp_ns > self._moving_ns + _MAX_S * 1e9
+        self.is_done |= is_late or self._scans > _MAX_SCANS
+
+    def _add_wheels(self, sample: WheelSample) -> None:
+        if self._wheels and self._moving_ns is None:
+            self._moving_ns = sample.stamp_ns if _has_moved(self._wheels[0], sample) else None
+            self._wheels[1:] = []  # while it stands
+        if self._wheels and self.has_moved:
+            steps = sample.position - self._wheels[-1].position
+            seconds = (sample.stamp_ns - self._wheels[-1].stamp_ns) * 1e-9
+            steps = steps if np.isfinite(steps).all() else np.nan_to_num(sample.velocity) * seconds
+            self._way_m += abs(float(steps.mean())) * self._radius_m
+        self._wheels.append(sample)
+
+    def result(self) -> LidarYaw | None:
+        """What was found so far; None where the mount agrees, or the drive does not show it."""
+        found = (self._judge(frame) for frame in list(self._travels) if frame in self._mounts)
+        return next((one for one in found if one is not None), None)
+
+    def _is_healthy(self, frame: str) -> bool:
+        direction = _direction(*self._compare(frame)[:2])
+        return direction is not None and abs(direction) <= _MAX_SLIDE_RAD
+
+    def _compare(self, frame: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Way of the sensor by the wheels and by the scans (n,) complex [m] on gentle arcs, and turns (m, 2) by wheels, up to a scale, and
+        scans [rad] of all intervals."""
+        mount = self._mounts.get(frame, Mount())
+        t, ways = _ways(self._wheels, self._radius_m)
+        by_wheels, by_scans, turns = [], [], []
+        for begin_ns, end_ns, delta in self._travels[frame].rows:
+            edges = np.array([begin_ns - self._wheels[0].stamp_ns, end_ns - self._wheels[0].stamp_ns]) * 1e-9
+            if edges[0] < t[0] or edges[1] > t[-1]:
+                continue
+            left, right = (np.diff(np.interp(edges, t, side))[0] for side in ways.T)
+            turn, forward = float(delta[2]), 0.5 * (left + right)
+            turns.append((right - left, turn))
+            if abs(forward) >= _MIN_WAY_M and abs(turn) <= _MAX_CURVATURE_RAD_M * abs(forward):
+                lever = (np.exp(1j * turn) - 1.0) * complex(mount.x, mount.y)
+                by_wheels.append(forward * np.exp(0.5j * turn) + lever)
+                by_scans.append(complex(delta[0], delta[1]) + lever)
+        return np.array(by_wheels), np.array(by_scans), np.array(turns).reshape(-1, 2)
+
+    def _judge(self, frame: str) -> LidarYaw | None:
+        mount = self._mounts[frame]
+        by_wheels, by_scans, turns = self._compare(frame)
+        direction = _direction(by_wheels, by_scans)
+        if direction is None or abs(direction) <= _MAX_SLIDE_RAD:
+            return None
+        quarter = round(direction / (0.5 * math.pi)) * 0.5 * math.pi
+        is_quarter = abs(direction - quarter) <= _SNAP_RAD
+        direction = quarter if is_quarter else direction
+        yaw = math.remainder(mount.yaw - direction, math.tau)
+        side = "backwards" if abs(abs(direction) - math.pi) < _SNAP_RAD else f"{abs(math.degrees(direction)):.0f} deg to the "
+        side += "" if side == "backwards" else "left" if direction > 0.0 else "right"
+        begin = f"{self._topic}: by its scans the robot travels {side} against the wheels over {np.abs(by_wheels).sum():.1f} m"
+        likeness = _likeness(turns)
+        if likeness is None and side == "backwards":
+            return LidarYaw(
+                f"{begin}: the yaw of '{frame}' is wrong by 180 deg, or all wheels count backwards; a turn shows which.", frame, None
+            )
+        if likeness is not None and likeness < _MIN_TURN_LIKENESS:
+            return None  # turns differ as well: wheels or an upside-down LiDAR
+        where = f"in /tf_static, or in [mounts.{frame}] where the log has none"
+        turned = "" if likeness is None else ", and turns as they do"
+        text = (
+            f"{begin}{turned}: the yaw of '{frame}' is wrong by {abs(math.degrees(direction)):.0f} deg. Corrected in this run by"
+            f" {-math.degrees(direction):+.0f} deg; write yaw = {yaw:.4f} rad {where}."
+        )
+        return LidarYaw(text, frame, replace(mount, yaw=yaw), is_certain=is_quarter and likeness is not None)
+
+
 def check_lidar_yaw(log: Log) -> LidarYaw | None:
     """Compare the first minute of driving; None where the mount agrees, or the drive does not show it."""
     if log.sources.lidar is None or log.sources.wheels is None or log.wheels_error is not None:
         return None
-    wheels: list[WheelSample] = []
-    travels: dict[str, _Travel] = defaultdict(_Travel)
-    mounts, config = log.mounts, LidarConfig()
-    moving_ns, scans, next_way = None, 0, _SURE_WAY_M
+    check = LidarYawCheck(log.mounts, log.robot, log.sources.lidar.topic)
     for event in log.events():
-        if isinstance(event, WheelSample):
-            wheels.append(event)
-            if moving_ns is None and _has_moved(wheels[0], event):
-                moving_ns = event.stamp_ns
-        elif isinstance(event, Scan) and moving_ns is not None:
-            scans += 1
-            _register(travels[event.frame_id], event, mounts.get(event.frame_id, Mount()), config)
-        if moving_ns is not None and (event.stamp_ns > moving_ns + _MAX_S * 1e9 or scans > _MAX_SCANS):
+        check.add(event)
+        if check.is_done:
             break
-        if moving_ns is not None and isinstance(event, Scan) and _way(log, wheels, moving_ns) > next_way:
-            next_way *= 2.0
-            if all(_is_healthy(log, wheels, travel, mounts.get(frame, Mount())) for frame, travel in travels.items()):
-                return None
-    found = (_judge(log, wheels, travel, frame) for frame, travel in travels.items() if frame in mounts)
-    return next((one for one in found if one is not None), None)
+    return check.result()
 
 
 def _has_moved(first: WheelSample, now: WheelSample) -> bool:
@@ -102,39 +192,14 @@ def _register(travel: _Travel, scan: Scan, mount: Mount, config: LidarConfig) ->
         travel.begin_ns, travel.delta = now, np.zeros(3)
 
 
-def _angles(log: Log, wheels: Sequence[WheelSample]) -> tuple[FloatArray, FloatArray]:
+def _ways(wheels: Sequence[WheelSample], radius_m: float) -> tuple[FloatArray, FloatArray]:
     """Stamps (n,) [s] after the first, and accumulated ways (n, 2) of left and right wheels [m]."""
     t = np.array([sample.stamp_ns - wheels[0].stamp_ns for sample in wheels]) * 1e-9
     angles = np.array([sample.position for sample in wheels])
     if not np.isfinite(angles).all():
         rates = np.nan_to_num(np.array([sample.velocity for sample in wheels]))
         angles = np.vstack([np.zeros((1, 2)), np.cumsum(np.diff(t)[:, None] * rates[:-1], axis=0)])
-    return t, angles * log.robot.geometry.wheel_radius_m
-
-
-def _way(log: Log, wheels: Sequence[WheelSample], since_ns: int) -> float:
-    """Path of the robot by the wheels since ``since_ns`` [m]."""
-    t, ways = _angles(log, wheels)
-    return float(np.abs(np.diff(ways.mean(axis=1)))[t[1:] >= (since_ns - wheels[0].stamp_ns) * 1e-9].sum())
-
-
-def _compare(log: Log, wheels: Sequence[WheelSample], travel: _Travel, mount: Mount) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Way of the sensor by the wheels and by the scans (n,) complex [m] on gentle arcs, and turns (m, 2) by wheels, up to a scale, and
-    scans [rad] of all intervals."""
-    t, ways = _angles(log, wheels)
-    by_wheels, by_scans, turns = [], [], []
-    for begin_ns, end_ns, delta in travel.rows:
-        edges = np.array([begin_ns, end_ns]) * 1e-9 - wheels[0].stamp_ns * 1e-9
-        if edges[0] < t[0] or edges[1] > t[-1]:
-            continue
-        left, right = (np.diff(np.interp(edges, t, side))[0] for side in ways.T)
-        turn, forward = float(delta[2]), 0.5 * (left + right)
-        turns.append((right - left, turn))
-        if abs(forward) >= _MIN_WAY_M and abs(turn) <= _MAX_CURVATURE_RAD_M * abs(forward):
-            lever = (np.exp(1j * turn) - 1.0) * complex(mount.x, mount.y)
-            by_wheels.append(forward * np.exp(0.5j * turn) + lever)
-            by_scans.append(complex(delta[0], delta[1]) + lever)
-    return np.array(by_wheels), np.array(by_scans), np.array(turns).reshape(-1, 2)
+    return t, angles * radius_m
 
 
 def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
@@ -144,44 +209,6 @@ def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
     if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < _MIN_COHERENCE * size:
         return None
     return float(np.angle(product.sum()))
-
-
-def _is_healthy(log: Log, wheels: Sequence[WheelSample], travel: _Travel, mount: Mount) -> bool:
-    direction = _direction(*_compare(log, wheels, travel, mount)[:2])
-    return direction is not None and abs(direction) <= _MAX_SLIDE_RAD
-
-
-def _judge(log: Log, wheels: Sequence[WheelSample], travel: _Travel, frame: str) -> LidarYaw | None:
-    mount = log.mounts[frame]
-    by_wheels, by_scans, turns = _compare(log, wheels, travel, mount)
-    direction = _direction(by_wheels, by_scans)
-    if direction is None or abs(direction) <= _MAX_SLIDE_RAD:
-        return None
-    quarter = round(direction / (0.5 * math.pi)) * 0.5 * math.pi
-    direction = quarter if abs(direction - quarter) <= _SNAP_RAD else direction
-    yaw = math.remainder(mount.yaw - direction, math.tau)
-    side = "backwards" if abs(abs(direction) - math.pi) < _SNAP_RAD else f"{abs(math.degrees(direction)):.0f} deg to the "
-    side += "" if side == "backwards" else "left" if direction > 0.0 else "right"
-    begin = f"{_topic(log)}: by its scans the robot travels {side} against the wheels over {np.abs(by_wheels).sum():.1f} m"
-    likeness = _likeness(turns)
-    if likeness is None and side == "backwards":
-        return LidarYaw(
-            f"{begin}: the yaw of '{frame}' is wrong by 180 deg, or all wheels count backwards; a turn shows which.", frame, None
-        )
-    if likeness is not None and likeness < _MIN_TURN_LIKENESS:
-        return None  # turns differ as well: wheels or an upside-down LiDAR
-    where = f"in /tf_static, or in [mounts.{frame}] where the log has none"
-    turned = "" if likeness is None else ", and turns as they do"
-    text = (
-        f"{begin}{turned}: the yaw of '{frame}' is wrong by {abs(math.degrees(direction)):.0f} deg. Corrected in this run by"
-        f" {-math.degrees(direction):+.0f} deg; write yaw = {yaw:.4f} rad {where}."
-    )
-    return LidarYaw(text, frame, replace(mount, yaw=yaw))
-
-
-def _topic(log: Log) -> str:
-    assert log.sources.lidar is not None
-    return log.sources.lidar.topic
 
 
 def _likeness(turns: FloatArray) -> float | None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from localization.calibration.lidar_yaw import LidarYawCheck, corrected
 from localization.errors import CheckpointError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
@@ -24,6 +25,7 @@ from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
 from localization.ros.jit_warm_up import warm_up
+from localization.ros.lidar_entrance import LidarEntrance
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
 from localization.ros.payloads import Payloads
@@ -66,6 +68,7 @@ class Node:
         self._predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s) if run.node.predict else None
         self._commands = OperatorCommands(self, transport, names, report)
         self._problems: set[str] = set()  # that were reported
+        self._entrance: LidarEntrance | None = None
         self._next_status = self._next_path = self._next_map = -float("inf")
         self._newest_ns = 0
         self._begin_ns: int | None = None
@@ -129,6 +132,8 @@ class Node:
                 self.session.view = view
             if self.session.head:
                 self._continue_from(self.session.head, discovered.start_ns)
+            elif self._sources.lidar is not None and self._sources.wheels is not None:
+                self._entrance = LidarEntrance(LidarYawCheck(mounts, self._run.robot, self._sources.lidar.topic))
             for received in discovered.backlog:
                 self._receive(received, is_backlog=True)
             failing.pop_all()
@@ -185,6 +190,7 @@ class Node:
     def restart(self, start: StartPose) -> None:
         """Begin anew at ``start``: with a new map, and nothing learned of the motion model."""
         pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
+        self._entrance = None
         if self._trial.prior is not None:  # the saved map stays where it is
             start = replace(start, map_T_start=np.zeros(3), map_cov=np.zeros((3, 3)))
         self.session.restart(pipeline, start)
@@ -262,11 +268,33 @@ class Node:
         estimates = self.session.process(event, partial(self._publish, event, arrived_ns))
         if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
+        if self._entrance is not None and self._entrance.add(event):
+            self._pass_entrance(self._entrance)
         self.session.observe(event)
         self._doctor.observe(event)
         if isinstance(event, Scan):
             self._check_frames()
         return bool(estimates)
+
+    def _pass_entrance(self, entrance: LidarEntrance) -> None:
+        """Go on with the LiDAR's mount as it is, or with the right one: then from the start of the drive on."""
+        self._entrance = None
+        found, events = entrance.result()
+        if found is None:
+            return
+        self._report(found.text)
+        if found.mount is None:
+            return
+        mounts = corrected(self.session.pipeline.mounts, found)
+        self.session.restart(Pipeline(self._trial, self._run.robot, mounts, self.has_lidar, self._run.config), self.session.state.start)
+        for event in events:
+            self.session.pipeline.process(event)
+        self.payloads.mounts = self.session.pipeline.mounts
+        self._doctor.add_mounts(mounts)
+        if self._predictor is not None:
+            self._predictor.stop()
+        if self.session.view is not None:
+            self.session.view.begin(self._run.robot, mounts)
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""
