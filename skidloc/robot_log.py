@@ -80,7 +80,7 @@ class RobotLog:
         model, separator, estimator = pair.partition("/")
         if not separator:
             raise ModelError(f"'{pair}' is no pair of motion model and estimator. Write MODEL/ESTIMATOR, as skid_steer/ekf.")
-        check_estimator(estimator, self.has_lidar)
+        check_estimator(estimator, self.has_lidar, no_wheels=self.log.no_wheels)
         return Trial(make_model(model, self.robot), estimator)
 
     def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:

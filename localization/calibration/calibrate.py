@@ -123,8 +123,8 @@ def cut_log(
     log = open_wired(path, robot, topics.scored_against(reference))
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(
-            f"{log.path.name} has no wheels: neither joint states ({robot.topics.joint_states}) nor the driver's odometry"
-            f" ({robot.topics.odometry}); name them with --topic.joint-states or --topic.odometry. `skidloc info` lists the topics."
+            f"{log.path.name} has {log.no_wheels or 'no wheels by these options.'} Name them with --topic.joint-states or --topic.odometry."
+            " `skidloc info` lists the topics."
         )
     motion_reference, words = make_motion_reference(log, robot, reference_name, reference, config, reference_sigmas)
     events = log.events()

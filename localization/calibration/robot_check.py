@@ -121,7 +121,7 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
         robot = _drafted(draft, given, path)
     log, wiring = open_checked(path, robot, given.topics)
     if log.sources.wheels is None:
-        raise log.wheels_error or LogError(f"{path.name} has no wheels: neither joint states nor a driver's odometry; record one of them.")
+        raise log.wheels_error or LogError(f"{path.name} has {log.no_wheels or 'no wheels by these options.'} Record one of them.")
     info = inspect_log(log)
     signals = read_signals(log)
     rows, mounts = [*_topic_rows(info), *_stamp_rows(info)], dict(log.mounts)

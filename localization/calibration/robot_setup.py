@@ -33,6 +33,7 @@ from localization.logs.chunks import RawMessage, merge_channels
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.reader import open_log, open_source
 from localization.logs.serialization import LogDeserializer
+from localization.logs.topic_names import is_measured_outside, is_other_estimate
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.drive_controllers import TRACKS, ControllerValues
 from motion_models.center_of_gravity.parts import TYPICAL
@@ -50,10 +51,6 @@ DRIVE_60_S = (
 )
 _FIRST_JOINT_STATES = 200
 """Messages in which all joints have been named: wheels and arms often publish separately."""
-_NOT_THE_DRIVERS = re.compile(
-    r"truth|reference|filter|fused|ekf|ukf|gps|gnss|slam|icp|lidar|laser|visual|vio|amcl|map|mocap|vicon", re.IGNORECASE
-)
-_REFERENCE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack", re.IGNORECASE)
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _LIGHT_ARMS = 0.02
 """Share of the mass in moving parts up to which the centre of gravity is the body's; a spinning LiDAR's."""
@@ -209,7 +206,7 @@ def _motion_topic(draft: Draft, survey: Survey) -> str | None:
 
 
 def _is_drivers(topic: str) -> bool:
-    return not _NOT_THE_DRIVERS.search(topic)
+    return not is_other_estimate(topic)
 
 
 def _wheel_names(
@@ -261,7 +258,7 @@ def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
         draft.reasons.append(f"topics.{role} = {best}: {why}.")
     if given.reference is not None:
         _take_topic(draft, survey, "reference", given.reference)
-    references = [t for t in survey.topics if _REFERENCE.search(t) and t not in draft.topics.values()]
+    references = [t for t in survey.topics if is_measured_outside(t) and t not in draft.topics.values()]
     if references and given.reference is None:
         draft.topics["reference"] = references[-1]
         draft.reasons.append(f"topics.reference = {references[-1]}: by its name; results are scored against it, never estimated from it.")

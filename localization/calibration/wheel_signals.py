@@ -6,7 +6,6 @@ Nothing is clipped and no side is averaged: signs, units and sides are what is i
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ from localization.logs import Log
 from localization.logs.clouds import cloud_decoder
 from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry, scan_decoder
 from localization.logs.event_decoder import TopicDecoder, arc
+from localization.logs.topic_names import is_other_estimate
 from localization.logs.topic_roles import TYPES
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
 from localization.sensor_checks.scan_motion import ScanOdometry
@@ -35,10 +35,6 @@ _MOVED = 0.02
 """Of an angle or rate, in any unit that practice has: above the noise of rates at standstill."""
 _MAX_LIDAR_S = 60.0
 """Of scans [s]; registering one takes some milliseconds."""
-_NOT_THE_DRIVERS = re.compile(
-    r"truth|reference|filter|fused|ekf|ukf|gps|gnss|slam|icp|lidar|laser|visual|vio|amcl|map|mocap|vicon|optitrack|rtab|camera|zed", re.I
-)
-"""Names of odometry that is not made of wheels."""
 _GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2, _MAX_TILT_COSINE = 20, 8.0, 12.0, 0.87
 """As in `localization.gyro`: where the mean specific force of the first samples shows that the mount is wrong."""
 _JUMP_FACTOR = 8.0
@@ -112,7 +108,7 @@ def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
         found[log.sources.imu.topic] = lambda message, stamp: decode_imu(message, stamp, unit)
     reserved = {log.reference_topic, log.robot.topics.reference}
     for topic, kind in log.types.items():
-        if kind == TYPES["odometry"] and topic not in reserved and not _NOT_THE_DRIVERS.search(topic):
+        if kind == TYPES["odometry"] and topic not in reserved and not is_other_estimate(topic):
             found.setdefault(topic, decode_odometry)
     return found
 

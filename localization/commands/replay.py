@@ -114,7 +114,7 @@ class Replay:
         forms = names(self.corrections, "--corrections")
         pairs = [
             Trial(model, estimator, form, prior if estimator == LOCALIZER else None)
-            for estimator in self._estimators(has_lidar)
+            for estimator in self._estimators(log)
             for model in models
             for form in check_forms(forms)[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
         ]
@@ -168,12 +168,13 @@ class Replay:
             save_map(self.save_map, saved_map(runs, head, mounts, dataclasses.asdict(self.config)))
         self._print(console, head, results, reference)
 
-    def _estimators(self, has_lidar: bool) -> list[str]:
+    def _estimators(self, log: Log) -> list[str]:
+        has_lidar, is_default = log.sources.lidar is not None, self.estimator == type(self).estimator
         found = names(self.estimator, "--estimator")
         found += [LOCALIZER] if self.map is not None and LOCALIZER not in found else []
         for name in found:
-            check_estimator(name, has_lidar or (self.estimator == type(self).estimator and name != LOCALIZER), self.map is not None)
-        if self.estimator == type(self).estimator and not has_lidar:
+            check_estimator(name, has_lidar or (is_default and name != LOCALIZER), self.map is not None, log.no_wheels)
+        if is_default and not has_lidar:
             found.remove(_WHEELLESS)
         return found
 

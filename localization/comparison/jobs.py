@@ -117,7 +117,7 @@ def _run(job: Job) -> list[Row]:
     rows, able = [], []
     for trial in job.trials:
         try:
-            check_estimator(trial.estimator, has_lidar)
+            check_estimator(trial.estimator, has_lidar, no_wheels=log.no_wheels)
             able.append(trial)
         except SkidlocError as error:
             rows.append({**_head(job, trial), "status": FAILED, "error": str(error)})

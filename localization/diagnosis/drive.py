@@ -198,7 +198,9 @@ def drive_of_log(
     config = config or WindowConfig()
     robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
-        raise CalibrationError(f"{log.path.name} has no wheels: name their topic with --topic.joint-states or --topic.odometry.")
+        raise CalibrationError(
+            f"{log.path.name} has {log.no_wheels or 'no wheels by these options.'} Name them with --topic.joint-states or --topic.odometry."
+        )
     if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))

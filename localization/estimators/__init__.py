@@ -52,8 +52,11 @@ ESTIMATORS_WITH_MAP = ("graph", LOCALIZER)
 """Those whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
 
 
-def check_estimator(name: str, has_lidar: bool, has_map: bool = False) -> None:
-    """Raises `EstimatorError` for a name that does not exist, or for one that needs a LiDAR or a saved map without one."""
+def check_estimator(name: str, has_lidar: bool, has_map: bool = False, no_wheels: str = "") -> None:
+    """Raises `EstimatorError` for a name that does not exist, or for one that needs a LiDAR, a saved map or wheels without one.
+
+    ``no_wheels``: why the log has none (`Log.no_wheels`).
+    """
     if name == LOCALIZER and not has_map:
         raise EstimatorError(f"the estimator '{LOCALIZER}' needs a saved map. Name one by --map, or use graph.")
     if name not in (*ESTIMATORS, LOCALIZER):
@@ -62,6 +65,9 @@ def check_estimator(name: str, has_lidar: bool, has_map: bool = False) -> None:
         raise EstimatorError(
             f"the estimator '{name}' needs scans, and there are none in this log. Use odometry, ekf or graph, or pass --topic.scan."
         )
+    if no_wheels and name != "lidar":
+        instead = "Record the wheels, or use --estimator lidar" if has_lidar else "Record the wheels"
+        raise EstimatorError(f"the estimator '{name}' needs wheels: {no_wheels} {instead}.")
 
 
 def make_estimator(

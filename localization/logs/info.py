@@ -200,12 +200,10 @@ def header_stamp_ns(data: bytes, *, is_ros1: bool) -> int:
 def _find_problems(log: Log, topics: list[TopicInfo]) -> list[str]:
     found: list[str] = []
     wanted = log.robot.topics
-    if log.wheels_error is not None:
-        found.append(str(log.wheels_error))
+    if log.no_wheels:
+        found.append(log.no_wheels)
     elif log.sources.wheels is None:
-        found.append(
-            f"no wheels: neither joint states ({wanted.joint_states}) nor the driver's odometry ({wanted.odometry}) are in the log."
-        )
+        found.append("no wheels: options leave them out.")
     if log.sources.lidar is None:
         found.append(f"no LiDAR: neither a planar scan ({wanted.scan}) nor a point cloud ({wanted.points}) is in the log.")
     if log.sources.imu is None:

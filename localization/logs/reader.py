@@ -24,6 +24,7 @@ from localization.logs.decode import MessageStats, UnusableError, frame_name, st
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
 from localization.logs.references import reference_decoder
 from localization.logs.serialization import LogDeserializer
+from localization.logs.topic_names import find_in_namespace
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, odometry_edge
@@ -106,7 +107,15 @@ class Log:
         asked = self._overrides.reference
         names = (self.robot.topics.reference, _GPS) if asked is None else (asked,)
         there = self._chooser.of_type(*REFERENCE_TYPES)
-        return next((name for name in names if name in there), None)
+        named = next((name for name in names if name in there), None)
+        return named if named is not None or asked is not None else find_in_namespace(self.robot.topics.reference, there)
+
+    @property
+    def no_wheels(self) -> str:
+        """Why nothing can be estimated from wheels; "" where the log has some, or where options leave them out."""
+        if self.sources.wheels is not None:
+            return ""
+        return str(self.wheels_error) if self.wheels_error is not None else self._chooser.no_wheels()
 
     def events(self) -> Iterator[Event]:
         """Wheel, CG, IMU samples and scans by header stamp, never decreasing; within a topic always increasing.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from localization.errors import TopicError
 from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
+from localization.logs.topic_names import find_in_namespace, is_filter, is_other_estimate
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.model import CgModel
@@ -130,15 +131,37 @@ class TopicChooser:
         if getattr(self._overrides, kind) is not None:
             return None
         topics = self.candidates(kind)
+        wanted = getattr(self._robot.topics, kind)
+        topic = find_in_namespace(wanted, topics)
+        if topic is not None and len(topics) > 1:
+            self.warnings.append(f"{topic} is used as {kind.replace('_', ' ')}: it is {wanted} in a namespace.")
+            return TopicSource(topic, kind, "robot")
         if len(topics) > 1:
             option = f"--topic.{kind.replace('_', '-')}"
             self.warnings.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
         return TopicSource(topics[0], kind, "only") if len(topics) == 1 else None
 
     def candidates(self, kind: str) -> list[str]:
-        """Topics of the matching type. What the run is scored against must not be what it is estimated from."""
+        """Topics of the matching type that no option names. What the run is scored against must not be what it is estimated from."""
         kept_out = {self._robot.topics.reference, self._overrides.reference}
-        return [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
+        found = [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
+        return [topic for topic in found if kind != "odometry" or not is_other_estimate(topic)]
+
+    def no_wheels(self) -> str:
+        """That the log has no wheels; "" where options leave them out."""
+        wanted, topics = self._overrides, self._robot.topics
+        if wanted.joint_states == "" or wanted.odometry == "":
+            return ""
+        found = f"no wheels: neither joint states ({topics.joint_states}) nor the driver's odometry ({topics.odometry}) are in {self._log}."
+        return f"{found}{self.describe_other_odometry()}"
+
+    def describe_other_odometry(self) -> str:
+        """Which Odometry is by its name none of wheels, and what it is for: a sentence after a blank, "" where there is none."""
+        others = sorted(set(self.of_type(TYPES["odometry"])) - set(self.candidates("odometry")))
+        if not others:
+            return ""
+        are = "is a reference or another estimate by its name" if len(others) == 1 else "are references or other estimates by name"
+        return f" {', '.join(others)} {are}: score against it by --reference, or pass --topic.odometry if wheels make it."
 
     def require(self, topic: str, types: tuple[str, ...], option: str) -> None:
         """Raises `TopicError` unless the log has ``topic`` with one of these types."""
@@ -338,7 +361,8 @@ class _RoleChooser:
             self._warnings.append(f"{missing_joints}; the wheels are taken from {odometry.topic}.")
         elif is_missing_joints:
             self._error = TopicError(
-                f"{missing_joints}. Name them in the robot file's [joints], or go without wheels by an empty --topic.joint-states."
+                f"{missing_joints}.{self._chooser.describe_other_odometry()} Name them in the robot file's [joints], or go without wheels"
+                " by an empty --topic.joint-states."
             )
         return odometry
 
@@ -346,10 +370,11 @@ class _RoleChooser:
         """A measured velocity, else the odometry frame on /tf, where the log has neither joint states nor an Odometry of the driver."""
         if self._overrides.odometry is not None or self._overrides.joint_states:
             return None
-        twists = [topic for topic in self._chooser.of_type(*TWIST_TYPES) if is_measured_twist(topic)]
+        twists = [topic for topic in self._chooser.of_type(*TWIST_TYPES) if is_measured_twist(topic) and not is_other_estimate(topic)]
         if len(twists) > 1:
             self._warnings.append(f"{', '.join(twists)} could each be the wheels' velocity; name one with --topic.odometry.")
-        transforms = [topic for topic in self._chooser.of_type(*TF_TYPES) if not topic.endswith("_static")]
+        is_filtered = any(map(is_filter, self._chooser.of_type(TYPES["odometry"])))  # which publishes the odometry's transform, too
+        transforms = [topic for topic in self._chooser.of_type(*TF_TYPES) if not topic.endswith("_static") and not is_filtered]
         topics = twists or transforms
         if len(topics) != 1:
             return None

@@ -216,3 +216,45 @@ def test_reference_topic_missing_or_of_wrong_type_is_refused(tmp_path: Path) -> 
     with pytest.raises(TopicError, match=r"'/joint_states'.*carries sensor_msgs/JointState"):
         log.references("/joint_states")
     assert len(list(log.references("/vicon"))) == 20
+
+
+@pytest.mark.parametrize(
+    "topic",
+    ["/gazebo/ground_truth", "/vrpn_client/robot/odom", "/mocap/odom", "/odometry/filtered", "/odometry/gps", "/amcl_odom", "/truth/odom"],
+)
+def test_topic_odometry_of_another_estimate_is_never_wheels(tmp_path: Path, topic: str) -> None:
+    log = log_of(tmp_path, {topic: "odom", "/scan": "scan"})
+    assert parts(log)["wheels"] is None
+    assert log.no_wheels.startswith("no wheels: ")
+    assert f"{topic} is a reference or another estimate by its name" in log.no_wheels
+    (tmp_path / "named").mkdir()
+    assert log_of(tmp_path / "named", {topic: "odom"}, TopicOverrides(odometry=topic)).no_wheels == ""
+
+
+def test_topic_joint_states_without_wheels_name_the_reference(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/joint_states": "arm", "/vicon/odom": "odom"})
+    with pytest.raises(TopicError, match=r"front_left_wheel.*/vicon/odom is a reference.*\[joints\]"):
+        log.events()
+
+
+def test_topic_in_a_namespace_is_found_by_its_end(tmp_path: Path) -> None:
+    robot = dataclasses.replace(ROBOT, topics=Topics(odometry="/platform/odom", imu="/imu/data"))
+    topics = {"/j1/platform/odom": "odom", "/j1/other/odom": "odom", "/j1/a/imu/data": "imu", "/j1/b/imu": "imu"}
+    records = [(topic, make(START + i * S // 10, kind), START + i * S // 10) for i in range(20) for topic, kind in topics.items()]
+    log = open_log(bags.write_mcap(tmp_path / "run.mcap", records), robot)
+    assert parts(log)["wheels"] == ("/j1/platform/odom", "robot")
+    assert parts(log)["imu"] == ("/j1/a/imu/data", "robot")
+    assert "/j1/platform/odom is used as odometry: it is /platform/odom in a namespace." in log.warnings()
+
+
+def test_topic_in_two_namespaces_is_not_chosen(tmp_path: Path) -> None:
+    assert parts(log_of(tmp_path, {"/r1/odom": "odom", "/r2/odom": "odom"}))["wheels"] is None
+
+
+def test_topic_ground_truth_in_a_namespace_is_the_reference(tmp_path: Path) -> None:
+    log = log_of(tmp_path, {"/r1/odom": "odom", "/r1/ground_truth/odom": "odom"})
+    assert (parts(log)["wheels"], log.reference_topic) == (("/r1/odom", "only"), "/r1/ground_truth/odom")
+
+
+def test_topic_wheels_left_out_by_option_need_no_reason(tmp_path: Path) -> None:
+    assert log_of(tmp_path, {"/scan": "scan"}, TopicOverrides(joint_states="")).no_wheels == ""

@@ -1,0 +1,35 @@
+"""What names of topics say about their origin: other estimates than the wheels', and namespaces of robots."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+_OTHER_ESTIMATE = re.compile(
+    r"truth|reference|mocap|vicon|optitrack|vrpn|qualisys|motive"  # measured from outside
+    r"|filter|fused|ekf|ukf|kalman|gps|gnss|rtk|navsat|slam|icp|lidar|laser|visual|vio(?!l)|vslam|amcl|map(?!p)|rtab|camera|zed|t265",
+    re.IGNORECASE,
+)
+_FILTER = re.compile(r"filter|fused|ekf|ukf|kalman", re.IGNORECASE)
+_MEASURED_OUTSIDE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack|vrpn|qualisys", re.IGNORECASE)
+
+
+def is_other_estimate(topic: str) -> bool:
+    """Whether an Odometry is by its name no driver's: ground truth, mocap, GPS, SLAM, or a filter's."""
+    return bool(_OTHER_ESTIMATE.search(topic))
+
+
+def is_filter(topic: str) -> bool:
+    """Whether an Odometry is by its name that of a filter, which publishes odom -> base_link on /tf as well."""
+    return bool(_FILTER.search(topic))
+
+
+def is_measured_outside(topic: str) -> bool:
+    """Whether a topic is by its name measured from outside the robot, so that results may be scored against it."""
+    return bool(_MEASURED_OUTSIDE.search(topic))
+
+
+def find_in_namespace(wanted: str, topics: Iterable[str]) -> str | None:
+    """The only one of ``topics`` that is ``wanted`` in a namespace: /j100_0000/platform/odom for /platform/odom; None for several."""
+    found = [topic for topic in topics if topic != wanted and topic.endswith("/" + wanted.lstrip("/"))]
+    return found[0] if wanted and len(found) == 1 else None
