@@ -43,6 +43,15 @@ class ReferenceTrack:
     """False where the source has none, and the poses were spread over the log's scans."""
 
     @property
+    def position_noise_m(self) -> float | None:
+        """Root mean square of the noise of its positions by its covariances [m]; None without any."""
+        if self.covariances is None:
+            return None
+        variances = self.covariances[:, 0, 0] + self.covariances[:, 1, 1]
+        known = variances[np.isfinite(variances) & (variances > 0.0)]
+        return math.sqrt(float(known.mean())) if known.size else None
+
+    @property
     def poses(self) -> FloatArray:
         """(N, 3) x, y, yaw. Raises `EvaluationError` where the source has no yaw."""
         if self.yaws is None:

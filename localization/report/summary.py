@@ -35,6 +35,7 @@ from motion_models.se2 import FloatArray
 _DOF = 3  # x, y, heading
 _BLOCKS = 10  # of a drive; errors in different tenths are taken as independent
 _EQUAL_RELATIVE_ERROR = 0.02  # a smaller difference of errors has no consequence
+_NOISE_FACTOR = 1.25  # errors up to it times the reference's noise are 0.75 of the noise or less: both add by squares
 _MIN_SIGMA_FACTOR = 1.25  # the band of thousands of innovations is so narrow that every filter leaves it; smaller factors are not reported
 
 
@@ -61,14 +62,34 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         *_coverage(best),
         *_consistency(best),
         *_exactness(best, reference),
-        *_advice(lines, best, equals),
+        *_visibility(best, reference),
+        *_advice(lines, best, equals, reference),
     ]
 
 
 def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> list[PlottedRun]:
     """The scored runs but ``best`` that are not significantly worse on this log, or differ by less than 2 %."""
     others = [line for line in lines if line is not best and line.error is not None]
-    return [line for line in others if is_close(line, best) or not _is_worse(line, best, reference)]
+    return [
+        line for line in others if is_close(line, best) or is_within_noise(line, best, reference) or not _is_worse(line, best, reference)
+    ]
+
+
+def is_within_noise(line: PlottedRun, best: PlottedRun, reference: ReferenceTrack | Relations) -> bool:
+    """True if the error is that of the reference itself, by its covariances."""
+    floor = _noise_floor(best, reference)
+    return floor is not None and line.error is not None and line.error <= _NOISE_FACTOR * floor
+
+
+def _noise_floor(best: PlottedRun, reference: ReferenceTrack | Relations) -> float | None:
+    """The reference's noise [m] where it makes the best run's error; None where that is larger, or the noise unknown.
+
+    An error below what the covariances state shows that the noise is smaller: a constant offset of a receiver drops out by alignment.
+    """
+    noise = None if isinstance(reference, Relations) else reference.position_noise_m
+    if noise is None or _error(best) > _NOISE_FACTOR * noise:
+        return None
+    return noise if noise <= _NOISE_FACTOR * _error(best) else _error(best)
 
 
 def metres(value: float) -> str:
@@ -123,11 +144,15 @@ def _ranking(
     if len(lines) == 1:
         alone = "Nothing else was run for comparison."
         return [f"{capitalize(best.words)}: {metres(best.error)} {measure}.", alone]
-    near, unproven = [x for x in equals if is_close(x, best)], [x for x in equals if not is_close(x, best)]
+    near = [x for x in equals if is_close(x, best)]
+    noisy = [x for x in equals if x not in near and is_within_noise(x, best, reference)]
+    unproven = [x for x in equals if x not in near and x not in noisy]
     found = "has the smallest error" if equals else "is best"
-    sentences = [f"{capitalize(best.words)} {found}: {metres(best.error)} {measure}{_gains(lines, best)}."]
+    sentences = [f"{capitalize(best.words)} {found}: {metres(best.error)} {measure}{_gains([x for x in lines if x not in noisy], best)}."]
     if near:
         sentences.append(f"Within 2 % of it: {_listed(near)}.")
+    if noisy:
+        sentences.append(f"Within the reference's noise of it: {_listed(noisy)}.")
     if unproven:
         sentences.append(f"Not proven worse by this one drive: {_listed(unproven)}.")
     return sentences
@@ -232,6 +257,15 @@ def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[
     return ["NEES takes this reference as exact, because it has no covariances: pass its noise with --reference-sigma."]
 
 
+def _visibility(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
+    """Which errors the reference's own noise hides."""
+    floor = _noise_floor(best, reference)
+    if floor is None or isinstance(reference, Relations) or reference.position_noise_m is None:
+        return []
+    noise = "" if floor == reference.position_noise_m else f" of {metres(reference.position_noise_m)}"
+    return [f"Errors below {metres(floor)} cannot be seen with {reference.source}, by its own covariances{noise}."]
+
+
 def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:
     """("over" | "under" | "fits", words). Beyond the band it must be by a factor in sigma that matters, too."""
     factor = math.sqrt(mean / _DOF)
@@ -244,13 +278,17 @@ def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple
     return "fits", f"{text} (up to {band[1]:.1f} by chance)" if factor > _MIN_SIGMA_FACTOR else text
 
 
-def _advice(lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun]) -> list[str]:
+def _advice(
+    lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun], reference: ReferenceTrack | Relations
+) -> list[str]:
     if len(lines) == 1:
         return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
     with_lidar = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
     if best.result.run.estimator == DEAD_RECKONING and with_lidar and not any(line in equals for line in with_lidar):
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]
     base = baseline_run(lines)
+    if base is not None and base is not best and is_within_noise(base, best, reference):
+        return ["Whether it is better than dead reckoning takes a reference of less noise (RTK, mocap, a surveyed map)."]
     if base is not None and base in equals:
         return ["Confirm on another drive, before relying on it, that it is better than dead reckoning."]
     if any(line.result.run.estimator == best.result.run.estimator for line in equals):

@@ -35,9 +35,7 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_command_without_wheels_ends_with_exit_code_2(
-    command: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_without_wheels_ends_with_exit_code_2(command: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = COMMANDS[command]
     out = [str(tmp_path / ("robot.toml" if command == "calibrate" else "out"))] if "--out" in options else []
     assert main([command.split()[0], str(log), "--robot", "husky_a200", *options, *out]) == 2
