@@ -8,6 +8,12 @@ from localization.calibration.robot_check import NEXT_DRIVE, CheckRow, RobotChec
 from localization.report.page import Block, Cell, Page, Paragraph, Section, Table, bullets, glossary, render, write_new
 
 _MARKS = {"ok": "green", "contradiction": "red", "cannot be seen": "grey"}
+_FILES = {
+    "robot.toml": "the robot, with what is certain corrected; every command takes it as --robot.",
+    "diff_drive_controller.yaml": "radius, separation, multipliers and covariance for ros2_controllers.",
+    "robot_localization.yaml": "what the filter may fuse of these wheels.",
+    "slam_toolbox.yaml": "frames, topic and when to take a scan.",
+}
 _TERMS = {
     "Value": "What the robot file, the URDF or the log has, and with which skidloc runs where nothing contradicts it.",
     "Second source": "Another measurement of the same quantity, and what it measured.",
@@ -29,7 +35,7 @@ def check_page(found: RobotCheck, files: dict[str, str]) -> str:
         Section("Contradictions", bullets([f"{row.quantity}: {row.advice}" for row in wrong])),
         Section("All quantities", _table(found.rows)),
         Section("To record or to drive", _to_drive(unseen)),
-        *(Section(name, [Paragraph(line, is_small=True) for line in text.splitlines() if line.strip()]) for name, text in files.items()),
+        Section("Files beside this page", bullets([f"{name}: {_FILES.get(name, '')}" for name in files])),
         glossary(_TERMS),
     ]
     facts = f"{found.robot.name} · {found.duration_s:.0f} s · {len(found.rows)} quantities"
