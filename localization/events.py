@@ -149,6 +149,12 @@ class Turn:
     """[rad^2], of white noise; without bias and scale."""
     duration: float
     """Time that the bias acted [s]."""
+    rate: float | None = None
+    """At its end [rad/s], bias and scale still in it; None where the gyro has no sample there."""
+    rate_variance: float = 0.0
+    """[rad^2/s^2], by the scatter of the last samples."""
+    rate_age_s: float = 0.0
+    """Time from the newest sample to the end, where that is later: the rate is the sample's [s]."""
 
 
 def turn_twist(turn: Turn | None) -> Twist2:
@@ -199,6 +205,11 @@ class Step:
         prior of k and the centre of rotation covers it."""
         D = self.predicted.d_cg
         return np.asarray(self.predicted.cov + D @ self.cg_cov @ D.T)
+
+    @property
+    def twist_change(self) -> FloatArray:
+        """(3,) by the wheels from the mean of the step to its end; zero where they are not used."""
+        return self.twist - self.mean_twist if self.has_wheels else np.zeros(3)
 
     @property
     def mean_twist(self) -> FloatArray:

@@ -16,6 +16,8 @@ _MAX_GAP_NS, _MAX_HOLD_NS = 500_000_000, 100_000_000
 _MAX_SILENCE_NS = 2_000_000_000
 """After which another IMU of the topic is used: longer than a driver drops messages, for its bias and scale are others."""
 _FIRST_SAMPLES = 20
+_SCATTER_SAMPLES = 25
+"""Over which the scatter of the rates is measured: half a second of most drivers."""
 _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, do not show the mount
 _MAX_TILT_RAD = math.radians(30.0)
 _JUMP_RAD_PER_S, _JUMP_RAD_PER_S2 = 2.0, 200.0  # noise and shaking, and how fast such a robot may begin to turn
@@ -42,6 +44,7 @@ class GyroBuffer:
         self._noise, self._mounts = noise, mounts
         self._keep_ns = int(keep_s / _NS)
         self._stamps: list[int] = []
+        self._rates: list[float] = []
         self._angles: list[float] = []
         self._sum_squared_differences: list[float] = []  # second ones, of the rate
         self._rate = self._rate_before = 0.0
@@ -100,9 +103,10 @@ class GyroBuffer:
             self._sum_squared_differences.append(0.0)
         self._rate_before, self._rate = self._rate, rate
         self._stamps.append(stamp_ns)
+        self._rates.append(rate)
         if self._stamps[0] < stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._stamps, stamp_ns - self._keep_ns)
-            del self._stamps[:n], self._angles[:n], self._sum_squared_differences[:n]
+            del self._stamps[:n], self._rates[:n], self._angles[:n], self._sum_squared_differences[:n]
 
     def _reject(self) -> None:
         self._spikes += len(self._pending)
@@ -133,7 +137,23 @@ class GyroBuffer:
             self._sign = math.copysign(1.0, self._agreement)
         dt = (end_ns - start_ns) * _NS
         variance = self._noise.white_rad_per_sqrt_s**2 * dt + self._sampling_variance(start_ns, end_ns)
-        return Turn(self._sign * angle, variance, dt)
+        age_s = max(end_ns - self._stamps[-1], 0) * _NS
+        return Turn(self._sign * angle, variance, dt, self._sign * self._rate_at(end_ns), self._rate_variance(end_ns), age_s)
+
+    def _rate_at(self, stamp_ns: int) -> float:
+        """Between samples by interpolation, after the newest its own [rad/s]."""
+        i = bisect.bisect_left(self._stamps, stamp_ns)
+        if i in (0, len(self._stamps)):
+            return self._rates[min(i, len(self._stamps) - 1)]
+        part = (stamp_ns - self._stamps[i - 1]) / (self._stamps[i] - self._stamps[i - 1])
+        return self._rates[i - 1] + part * (self._rates[i] - self._rates[i - 1])
+
+    def _rate_variance(self, stamp_ns: int) -> float:
+        """Of `_rate_at` [rad^2/s^2]: white noise sigma gives second differences the variance 6 sigma^2; shaking adds to both."""
+        j = min(bisect.bisect_left(self._stamps, stamp_ns), len(self._stamps) - 1)
+        i = max(j - _SCATTER_SAMPLES, 0)
+        squares = self._sum_squared_differences[j] - self._sum_squared_differences[i]
+        return squares / 6.0 / (j - i) if j > i else 0.0
 
     def _sampling_variance(self, start_ns: int, end_ns: int) -> float:
         """Of the turn [rad^2], by what the rate does between samples: shaking, wheels that slip by jerks.
@@ -199,6 +219,7 @@ class GyroBuffer:
     def _reset(self) -> None:
         self._reject()
         self._stamps.clear()
+        self._rates.clear()
         self._angles.clear()
         self._sum_squared_differences.clear()
 

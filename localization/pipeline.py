@@ -88,7 +88,7 @@ class Pipeline:
             self.estimator = MapFusion(self.estimator, trial.prior)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
-        """(3,) mean twist of the last step by the wheels alone; None where wheel data were missing in it."""
+        """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""
 
     @property
     def attitude(self) -> AttitudeFilter | None:
@@ -136,7 +136,7 @@ class Pipeline:
             self.synchronizer.restart_gap()
         self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
         if step.duration > 0.0:
-            self.wheel_twist = step.mean_twist if step.has_wheels else None
+            self.wheel_twist = step.twist if step.has_wheels else None
 
     def run_deferred(self) -> None:
         """Do the work that published estimates need not wait for. Left out, the next `process` does it first."""

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 
 from localization.attitude import AttitudeFilter, Tilt
-from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, WheelSample, turn_twist
+from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, Turn, WheelSample, turn_twist
 from localization.gyro import GyroBuffer
 from localization.lidar.frames import LidarFrames
 from localization.settings import Positive, Settings, at_least
@@ -153,6 +153,10 @@ class Synchronizer:
             self._empty_scans += not len(event.points)
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, event.middle_ns, key=lambda scan: scan[0]), (event.middle_ns, event))
+
+    def turn(self, start_ns: int, end_ns: int) -> Turn | None:
+        """By the gyro's samples so far, as `GyroBuffer.turn`; changes nothing."""
+        return self._gyro.turn(start_ns, end_ns, by_wheels=0.0) if end_ns > start_ns else None
 
     @property
     def stored_samples(self) -> int:

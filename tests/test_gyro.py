@@ -117,6 +117,19 @@ def test_gyro_variance_covers_what_the_rate_does_between_samples(white):
     assert 0.8 < np.mean(squares) < 1.2
 
 
+def test_gyro_rate_at_the_end_has_the_scatter_of_the_samples():
+    """Interpolated between samples; that of the newest sample, with its age, after it."""
+    rng = np.random.default_rng(0)
+    made = history(samples(4.0, wz=lambda t: rate(t) + 5e-3 * rng.normal()))
+    found = [made.turn(T0 + S, T0 + 2 * S + i * 13 * MS, 0.0) for i in range(100)]
+    errors = [turn.rate - rate(1.0 + turn.duration) for turn in found]
+    assert np.std(errors) == pytest.approx(np.mean([math.sqrt(turn.rate_variance) for turn in found]), rel=0.35)
+    assert all(turn.rate_age_s == 0.0 for turn in found)
+    late = made.turn(T0 + S, T0 + 4 * S + 30 * MS, 0.0)
+    assert late.rate_age_s == pytest.approx(0.03)
+    assert late.rate == made.turn(T0 + S, T0 + 4 * S, 0.0).rate
+
+
 def test_gyro_turn_outside_samples_is_none():
     past = history(samples(1.0, start_s=1.0))
     assert past.turn(T0 + 900 * MS, T0 + 1500 * MS, 0.0) is None

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from localization.events import PositionSample, Step
+from localization.events import PositionSample, Step, Turn
 from localization.lidar import LostScans
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
 NO_POINTS = np.empty((0, 2))
 
@@ -61,6 +61,29 @@ class Residuals(NamedTuple):
     """(3,) motion by the wheels with the robot file's parameters."""
 
 
+class GyroCalibration(NamedTuple):
+    """What an estimator has learned of the gyro."""
+
+    bias: float
+    """[rad/s]"""
+    scale: float
+    bias_variance: float
+    """[rad^2/s^2]"""
+    scale_variance: float
+
+    def correct_rate(self, turn: Turn) -> tuple[float, float] | None:
+        """Turn rate at the end of ``turn`` and its variance [rad/s, rad^2/s^2]; None where it has none."""
+        if turn.rate is None:
+            return None
+        rate = (turn.rate - self.bias) / (1.0 + self.scale)
+        return rate, turn.rate_variance + self.bias_variance + rate**2 * self.scale_variance
+
+    def correct_angle(self, turn: Turn) -> tuple[float, float]:
+        """Angle of ``turn`` and its variance [rad, rad^2]."""
+        angle, dt = (turn.angle - self.bias * turn.duration) / (1.0 + self.scale), turn.duration
+        return angle, turn.variance + dt**2 * self.bias_variance + angle**2 * self.scale_variance
+
+
 class Estimator(ABC):
     """State inside; one `step` after the other, then `finish`. The defaults are those of an estimator without map and corrections."""
 
@@ -99,6 +122,11 @@ class Estimator(ABC):
         return None
 
     @property
+    def gyro_calibration(self) -> GyroCalibration | None:
+        """Bias and scale of the gyro; None where it was not used in the last step."""
+        return None
+
+    @property
     def residuals(self) -> Residuals | None:
         """Those of the last step; None where measurements are not fused."""
         return None
@@ -134,6 +162,30 @@ class Estimator(ABC):
     def map_points(self) -> Points2:
         """(M, 2) points of the map in the world [m]."""
         return NO_POINTS
+
+
+_SLIP_LASTS_S = 1.0
+"""Noise of the wheels is that of slip that lasts, not of single steps: over a shorter step it is the twist's noise over this time."""
+_TWIST_FLOOR = np.diag([3e-3, 3e-3, 2e-3]) ** 2
+"""Of every twist [m^2/s^2, m^2/s^2, rad^2/s^2]: a robot whose wheels stand rocks on its tyres by 1 mm/s and 1 mrad/s (simulated)."""
+CHANGE_SHARE = 0.5
+"""Sigma of the change of the twist within a step, by wheel rates that are means over their own interval."""
+
+
+def twist_at_end(mean: Twist2, cov: Cov3, change: Twist2, measured_over_s: float) -> tuple[Twist2, Cov3]:
+    """Twist (3,) at the end of a step and its covariance (3, 3), by its ``mean`` and the ``cov`` of that.
+
+    ``change`` (3,): of the wheels' twist from its mean over the step to its end. ``measured_over_s``: duration of a step that the wheels
+    have measured alone [s]; infinite where a scan has.
+    """
+    share = min(measured_over_s / _SLIP_LASTS_S, 1.0)
+    return mean + change, share * cov + np.diag((CHANGE_SHARE * change) ** 2) + _TWIST_FLOOR
+
+
+def fuse_turn(twist: Tangent2, cov: Cov3, turn: float, variance: float) -> tuple[Tangent2, Cov3]:
+    """``twist`` (3,), or a way along one, with ``cov`` (3, 3), updated by a measured turn (rate) and its variance."""
+    gain = cov[:, 2] / (cov[2, 2] + variance)
+    return twist + gain * (turn - twist[2]), cov - np.outer(gain, cov[2])
 
 
 def mean_twist(delta: Pose2, cov: Cov3, duration: float) -> tuple[Twist2, Cov3]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist
+from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist, twist_at_end
 from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
@@ -38,7 +38,9 @@ class DeadReckoning(Estimator):
         self._pose = se2.compose(self._pose, motion.delta)
         self._cov = A @ self._cov @ A.T + motion.cov
         self._by_cg = A @ self._by_cg + motion.d_cg @ _square_root(step.cg_cov)
-        twist, twist_cov = mean_twist(motion.delta, step.cov, step.duration) if step.duration > 0 else (step.twist, None)
+        twist, twist_cov = step.twist, None
+        if step.duration > 0.0:
+            twist, twist_cov = twist_at_end(*mean_twist(motion.delta, step.cov, step.duration), step.twist_change, step.duration)
         return Estimate(step.end_ns, self._pose, self._cov + self._by_cg @ self._by_cg.T, twist, twist_cov)
 
 

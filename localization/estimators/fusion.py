@@ -8,7 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators.base import NO_POINTS, Estimate, Estimator, LearnedParameter, Residuals, mean_twist
+from localization.estimators.base import (
+    NO_POINTS,
+    Estimate,
+    Estimator,
+    GyroCalibration,
+    LearnedParameter,
+    Residuals,
+    fuse_turn,
+    mean_twist,
+    twist_at_end,
+)
 from localization.estimators.filter import BIAS, CLOCK, MAP, PARAMS, POSE, RADIUS, SCALE, START, Filter, FilterConfig
 from localization.events import Step
 from localization.lidar import FORGETTING, OUTLIER_SIGMAS, LostScans, ScanMatchingSensor
@@ -100,7 +110,15 @@ class EkfFusion(Estimator):
         if step.duration > 0.0:
             twist, twist_cov = mean_twist(*ekf.motion_since(START), step.duration)
             self._twist, self._slip, self._is_slip_measured = twist, twist - step.mean_twist, nis is not None
+            twist, twist_cov = self._twist_at_end(step, twist, twist_cov, is_measured=nis is not None)
         return Estimate(step.end_ns, ekf.pose, ekf.P[POSE, POSE].copy(), twist, twist_cov, nis)
+
+    def _twist_at_end(self, step: Step, mean: Twist2, cov: Cov3, *, is_measured: bool) -> tuple[Twist2, Cov3]:
+        """Twist (3,) at the stamp, by the ``mean`` of the step with its ``cov``, and by the gyro."""
+        twist, cov = twist_at_end(mean, cov, step.twist_change, math.inf if is_measured or not step.has_wheels else step.duration)
+        gyro = self.gyro_calibration
+        rate = None if gyro is None or step.turn is None or step.is_standing else gyro.correct_rate(step.turn)
+        return (twist, cov) if rate is None else fuse_turn(twist, cov, *rate)
 
     def run_deferred(self) -> None:
         """The last scan enters the submap, if it is a key scan. Deferred until its estimate is out."""
@@ -149,6 +167,14 @@ class EkfFusion(Estimator):
         if not self._has_gyro:
             self._has_gyro = True
             self.filter.P[CLOCK, CLOCK] += self._clock_sigma_s**2
+
+    @property
+    def gyro_calibration(self) -> GyroCalibration | None:
+        """As `Estimator.gyro_calibration`."""
+        ekf = self.filter
+        if ekf.turn_innovation is None:
+            return None
+        return GyroCalibration(ekf.bias, ekf.scale, float(ekf.P[BIAS, BIAS]), float(ekf.P[SCALE, SCALE]))
 
     @property
     def residuals(self) -> Residuals:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate, Estimator, LearnedParameter, Residuals
+from localization.estimators.base import Estimate, Estimator, GyroCalibration, LearnedParameter, Residuals
 from localization.estimators.filter import KEY, PARAMS, RADIUS, START
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
@@ -100,6 +100,11 @@ class GraphFusion(Estimator):
     def params(self) -> FloatArray:
         """Parameters of the motion model with their corrections."""
         return self.odometry.params
+
+    @property
+    def gyro_calibration(self) -> GyroCalibration | None:
+        """See `EkfFusion.gyro_calibration`."""
+        return self.odometry.gyro_calibration
 
     @property
     def lost(self) -> LostScans | None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.estimators.base import Estimate, Estimator
+from localization.estimators.base import Estimate, Estimator, GyroCalibration
 from localization.estimators.filter import KEY, START
 from localization.estimators.fusion import EkfFusion
 from localization.events import Step
@@ -59,6 +59,11 @@ class MapFusion(Estimator):
     def params(self) -> FloatArray:
         """Parameters of the motion model with their corrections."""
         return self.odometry.params
+
+    @property
+    def gyro_calibration(self) -> GyroCalibration | None:
+        """See `EkfFusion.gyro_calibration`."""
+        return self.odometry.gyro_calibration
 
     @property
     def lost(self) -> LostScans | None:

@@ -330,10 +330,10 @@ class Node:
             self.session.health.add_latency((self._transport.now_ns() - arrived_ns) * 1e-9)
         if self._predictor is not None:
             estimator = self.session.pipeline.estimator
-            self._predictor.reset(estimate, estimator.params, estimator.clock_offset_s)
+            self._predictor.reset(estimate, estimator.params, estimator.clock_offset_s, estimator.gyro_calibration)
 
     def _publish_prediction(self) -> None:
-        prediction = None if self._predictor is None else self._predictor.predict()
+        prediction = None if self._predictor is None else self._predictor.predict(self.session.pipeline.synchronizer.turn)
         if prediction is not None:
             self._publisher.publish_prediction(prediction, self._stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=self.has_lidar))
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from localization.estimators import Estimate
-from localization.estimators.base import mean_twist
-from localization.events import CgSample, Event, WheelSample
+from localization.estimators.base import CHANGE_SHARE, GyroCalibration, fuse_turn, mean_twist, twist_at_end
+from localization.events import CgSample, Event, Turn, WheelSample
 from localization.logs.serialization import FusedWriter, encode, make
 from localization.logs.writer import FusedEstimate, odom_axes, six_by_six
 from localization.maps.grid import Grid
@@ -23,7 +23,7 @@ from localization.ros.transports.base import Transport
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
-from motion_models.preintegration import preintegrate
+from motion_models.preintegration import integrate_twists
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -191,10 +191,11 @@ class EstimatePublisher:
 
 
 class Predictor:
-    """``odom_T_body`` at the wheels' rate. It holds copies: nothing that it does reaches the estimator, so a replay gives the same numbers.
+    """``odom_T_body`` at the rate of the wheels, with the turns of the gyro. It holds copies: nothing that it does reaches the estimator,
+    so a replay gives the same numbers.
 
     `insert` each event and `reset` with each estimate; `predict` then gives the pose at the newest wheel sample. At an estimate the
-    predicted pose changes by that estimate's correction and by nothing else, for the same wheel motion is applied to both.
+    predicted pose changes by that estimate's correction and by nothing else, for the same motion of wheels and gyro is applied to both.
     """
 
     def __init__(self, model: MotionModel, robot: Robot, max_hold_s: float) -> None:
@@ -203,6 +204,7 @@ class Predictor:
         self._params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity, _KEEP_S)
         self._last: Estimate | None = None
+        self._gyro: GyroCalibration | None = None
         self._clock_offset_ns = 0
 
     def insert(self, event: Event) -> bool:
@@ -214,12 +216,12 @@ class Predictor:
         self._wheels.insert(event)
         return self._last is not None
 
-    def reset(self, estimate: Estimate, params: FloatArray | None, clock_offset_s: float) -> None:
+    def reset(self, estimate: Estimate, params: FloatArray | None, clock_offset_s: float, gyro: GyroCalibration | None = None) -> None:
         """Predict from ``estimate`` on, with ``params`` (k,) of the motion model (None: the nominal ones).
 
-        ``clock_offset_s``: the wheels' stamps are late by this much [s].
+        ``clock_offset_s``: the wheels' stamps are late by this much [s]. ``gyro``: None where it is not used.
         """
-        self._last = estimate
+        self._last, self._gyro = estimate, gyro
         self._params = self._model.nominal if params is None else params
         self._clock_offset_ns = round(clock_offset_s / _NS)
 
@@ -227,8 +229,11 @@ class Predictor:
         """Predict nothing until the next estimate."""
         self._last = None
 
-    def predict(self) -> Estimate | None:
-        """The estimate at the newest wheel sample; None where that is not newer than the last estimate, or the wheels have a gap since."""
+    def predict(self, measure_turn: Callable[[int, int], Turn | None] = lambda start_ns, end_ns: None) -> Estimate | None:
+        """The estimate at the newest wheel sample; None where that is not newer than the last estimate, or the wheels have a gap since.
+
+        ``measure_turn``: the gyro's turn between two stamps [ns].
+        """
         if self._last is None or self._wheels.rates_known_until_ns is None:
             return None
         begin_ns, end_ns = self._last.stamp_ns + self._clock_offset_ns, self._wheels.rates_known_until_ns
@@ -237,8 +242,29 @@ class Predictor:
         dt, rates, cg, missing = self._wheels.window(begin_ns, end_ns, self._max_hold_s)
         if missing or not len(dt):
             return None
-        motion = preintegrate(self._model, dt, rates, cg, self._params, self._noise)
-        return _propagated(self._last, motion, end_ns - self._clock_offset_ns)
+        by_model = self._model.twist(rates, cg, self._params)
+        motion, duration = integrate_twists(dt, by_model, self._noise), (end_ns - begin_ns) * _NS
+        mean, cov = mean_twist(motion.delta, motion.cov, duration)
+        twist, twist_cov = twist_at_end(mean, cov, by_model.value[-1] - mean, duration)
+        turn = None if self._gyro is None or not rates.any() else measure_turn(self._last.stamp_ns, end_ns - self._clock_offset_ns)
+        if turn is not None and self._gyro is not None:
+            way, way_cov = fuse_turn(se2.log(motion.delta), motion.cov, *self._gyro.correct_angle(turn))
+            motion = Motion(se2.exp(way), way_cov)
+            if (rate := self._gyro.correct_rate(turn)) is not None:
+                change, variance = _change_of_rate(dt, by_model.value[:, 2], turn.rate_age_s)
+                twist, twist_cov = fuse_turn(twist, twist_cov, rate[0] + change, rate[1] + variance)
+        return _propagated(self._last, motion, twist, twist_cov, end_ns - self._clock_offset_ns)
+
+
+def _change_of_rate(dt: FloatArray, rates: FloatArray, age_s: float) -> tuple[float, float]:
+    """How much turn ``rates`` (n,) [rad/s] of intervals ``dt`` (n,) [s] change in the last ``age_s`` [s], since the gyro's newest sample;
+    and its variance, by the second differences of the rates, which are 6 times that of one."""
+    at = min(int(np.searchsorted(np.cumsum(dt[::-1]), age_s, side="right")), len(rates) - 1)
+    change = float(rates[-1] - rates[-1 - at])
+    if at == 0:
+        return 0.0, 0.0
+    scatter = float(np.mean(np.diff(rates, 2) ** 2)) / 3.0 if len(rates) > 2 else change**2
+    return change, scatter + (CHANGE_SHARE * change) ** 2
 
 
 def _fused(estimate: Estimate, stamp_ns: int) -> FusedEstimate:
@@ -294,9 +320,8 @@ def _time(stamp_ns: int) -> object:
     return make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
 
 
-def _propagated(last: Estimate, motion: Motion, stamp_ns: int) -> Estimate:
+def _propagated(last: Estimate, motion: Motion, twist: FloatArray, twist_cov: FloatArray, stamp_ns: int) -> Estimate:
     """``last`` moved by ``motion``: right perturbations, P' = Ad(delta^-1) P Ad(delta^-1)^T + Q (Solà et al. 2018, eq. 55)."""
-    twist, twist_cov = mean_twist(motion.delta, motion.cov, (stamp_ns - last.stamp_ns) * _NS)
     A = se2.adjoint(se2.inverse(motion.delta))
 
     def moved(pose: FloatArray, cov: FloatArray | None) -> tuple[FloatArray, FloatArray | None]:

@@ -6,9 +6,11 @@ import functools
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.events import WheelSample
+from localization.logs.reader import open_source
 from localization.ros.discovery import TF
 from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY, Predictor
 from localization.ros.session import Files
@@ -103,6 +105,51 @@ def test_transforms_of_a_graph_reach_the_map_at_every_stamp(driven):
     assert last.header.frame_id == "map"
     assert last.pose.pose.position.x == estimate.pose[0]
     assert last.pose.covariance[35] == pytest.approx(estimate.covariance[2, 2])
+
+
+@functools.cache
+def true_twists() -> np.ndarray:
+    """(n, 4) stamp [ns], vx, vy and wz of the simulator."""
+    store, rows = get_typestore(Stores.ROS2_HUMBLE), []
+    for message in open_source(drive_log()).messages(["/ground_truth/odom"]):
+        odometry = store.deserialize_cdr(bytes(message.data), "nav_msgs/msg/Odometry")
+        twist = odometry.twist.twist
+        rows.append((stamp_of(odometry), twist.linear.x, twist.linear.y, twist.angular.z))
+    return np.array(rows, dtype=float)
+
+
+def twist_errors(transport, topic):
+    """Stamps (n,) [s], errors (n, 3) of the published twists, their covariances (n, 3, 3), and true twists (n, 3)."""
+    truth = true_twists()
+    messages = [m for m in published(transport, topic) if truth[0, 0] + 3 * S < stamp_of(m) < truth[-1, 0]]
+    stamps = np.array([stamp_of(m) for m in messages], dtype=float)
+    twists = np.array([(m.twist.twist.linear.x, m.twist.twist.linear.y, m.twist.twist.angular.z) for m in messages])
+    true = np.column_stack([np.interp(stamps, truth[:, 0], truth[:, i]) for i in (1, 2, 3)])
+    covs = np.array([m.twist.covariance.reshape(6, 6)[np.ix_((0, 1, 5), (0, 1, 5))] for m in messages])
+    return stamps * 1e-9, twists - true, covs, true
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+@pytest.mark.parametrize("topic", [ODOMETRY, PREDICTED_ODOMETRY])
+def test_published_twist_is_that_of_its_stamp_with_its_covariance(estimator, topic, driven):
+    """NEES over the drive and where the motion changes, by 3 degrees of freedom; the turn rate is known to 0.02 rad/s."""
+    stamps, errors, covs, true = twist_errors(driven(estimator, True)[0], topic)
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covs), errors) / 3.0
+    is_changing = np.abs(np.gradient(true[:, 2], stamps)) + np.abs(np.gradient(true[:, 0], stamps)) > 0.5
+    assert 0.1 < nees.mean() < 2.0
+    assert nees[is_changing].mean() < 4.0
+    assert np.median(np.sqrt(covs[:, 2, 2])) < 0.02
+    assert np.sqrt(np.diagonal(covs, axis1=1, axis2=2)).min() > 1e-3
+    assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 0.02
+
+
+def test_prediction_with_the_gyro_turns_as_the_robot_does(driven):
+    """Against the same node without it: the turn rates between scans."""
+    without = LogTransport(drive_log(), lambda messages: [m for m in messages if m.topic != "/imu/data"])
+    del without.types["/imu/data"]
+    run_node(without, "ekf", config=NodeConfig(wait_s=0.0))
+    rms = [np.sqrt(np.mean(twist_errors(t, PREDICTED_ODOMETRY)[1][:, 2] ** 2)) for t in (driven("ekf", True)[0], without)]
+    assert rms[0] < 0.8 * rms[1]
 
 
 def predictor_at(stamp_ns, clock_offset_s=0.0):
