@@ -128,6 +128,9 @@ def _run(job: Job) -> list[Row]:
     runs = replay(log.events(), named, log.robot, log.mounts, has_lidar, job.config)
     problems = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
     for trial, result in zip(able, score(runs, reference), strict=True):
+        if result.contradictions:
+            rows.append({**_head(job, trial), "status": FAILED, "error": " ".join(result.contradictions)})
+            continue
         scores = _scores(result.metrics(log.duration_s, with_timing=False))
         rows.append({**_head(job, trial), "status": OK, "error": "", **problems, **scores})
     return rows

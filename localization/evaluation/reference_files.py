@@ -97,7 +97,7 @@ def load_reference(log: Log, name: str, file: Path | None = None) -> ReferenceTr
     path = file if file is not None else Path(name)
     if path.exists():
         return read_reference_file(path, lambda: _log_stamps(log))
-    if name.startswith("/") and not path.parent.is_dir():
+    if name.startswith("/") and (path.parent == Path("/") or not path.parent.is_dir()):
         return reference_track(log.references(name), name)  # raises, and lists what there is
     raise EvaluationError(f"no reference '{name}': neither a topic of {log.path.name} nor a file. `skidloc info` lists the topics.")
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import Accuracy, evaluate
+from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.pipeline import Run
 
@@ -26,6 +27,8 @@ class Result:
     Of the filtered poses, where the trajectory is smoothed."""
     filtered: Accuracy | None = None
     """Of the filtered poses, where the run's trajectory is smoothed."""
+    contradictions: tuple[str, ...] = ()
+    """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
 
     @property
     def name(self) -> str:
@@ -54,6 +57,7 @@ class Result:
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
             "counts": dict(self.run.counts),
             "lidar": None if self.run.lidar is None else self.run.lidar.numbers(),
+            **({"reference_contradictions": list(self.contradictions)} if self.contradictions else {}),
             **({} if self.run.localization is None else {"localization": dict(self.run.localization)}),
             **{name: number for name, number in numbers.items() if self.accuracy or not name.startswith("n_")},
         }
@@ -71,14 +75,17 @@ def score(runs: Sequence[Run], reference: ReferenceTrack | Relations | None) -> 
     >>> f"{result.name}: {result.accuracy.ate_rmse_m:.1f} m, {100 * result.accuracy.overlap:.0f} % of the drive"
     'diff_drive_odometry: 7.0 m, 100 % of the drive'
     """
-    return [_score(run, reference) for run in runs]
+    contradictions: tuple[str, ...] = ()
+    if isinstance(reference, ReferenceTrack):
+        contradictions = reference_contradictions([run.trajectory for run in runs], reference)
+    return [_score(run, reference, contradictions) for run in runs]
 
 
-def _score(run: Run, reference: ReferenceTrack | Relations | None) -> Result:
+def _score(run: Run, reference: ReferenceTrack | Relations | None, contradictions: tuple[str, ...]) -> Result:
     if reference is None:
         return Result(run, None, None)
     accuracy = evaluate(run.trajectory, reference)
     filtered = run.trajectory if run.filtered is None else run.filtered  # their errors grow by increments, as the NEES here assumes
-    found = None if isinstance(reference, Relations) else pose_consistency(filtered, reference)
+    found = None if isinstance(reference, Relations) or contradictions else pose_consistency(filtered, reference)
     published = None if run.filtered is None else evaluate(run.filtered, reference)
-    return Result(run, accuracy, None if found is None else found.mean, published)
+    return Result(run, accuracy, None if found is None else found.mean, published, contradictions)

@@ -61,6 +61,15 @@ def test_summary_names_a_track_reference_with_ate_and_distance():
     assert f"over {results[2].accuracy.distance_m:.1f} m driven" in text
 
 
+def test_summary_with_a_wrong_reference_judges_nothing():
+    results = [dataclasses.replace(r, contradictions=("its scale is 1000.",)) for r in score([run(noise=0.1), run(noise=0.2)], track())]
+    text = verdict(results, track())
+    assert "scale is 1000" in text
+    assert "best" not in text
+    assert "overconfident" not in text
+    assert results[0].metrics(1.0, with_timing=False)["reference_contradictions"] == ["its scale is 1000."]
+
+
 def test_summary_without_reference_names_no_best():
     runs = three_runs()
     text = verdict(score(runs, None), None)

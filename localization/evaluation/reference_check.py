@@ -1,0 +1,241 @@
+"""Clock, scale and axes of a reference, by its speed and turning rate against those of the robot's sensors.
+
+Lengths and turns of chords do not depend on the frame. Both are compared at all offsets of the clocks; where one offset makes them
+alike, the ratio of lengths is the scale, and the sign of the turns shows mirrored axes.
+A reference is contradicted only if no run agrees with it better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.evaluation.references import ReferenceTrack
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+_STEP_S = 0.1
+_CHORDS_S = (1.0, 5.0, 15.0)
+"""Lengths of chords [s]: the longer ones for positions of metres of noise."""
+_MAX_SAMPLES = 4000
+"""Of the grid that are correlated; of long drives every second, third, ..."""
+_INDEPENDENT_S = 5.0
+"""Time after which a robot's speed and turning rate are taken as independent of what they were [s]: maneuvers last for seconds."""
+_MIN_SIGMAS = 4.0
+"""Significance of a correlation (Fisher's transformation), the largest of some hundred offsets."""
+_MAX_OFFSET_S = 40.0
+"""Leap seconds (18, or 37 for TAI) and clocks without NTP."""
+_MIN_OVERLAP_S, _MIN_OVERLAP_SHARE = 20.0, 0.5
+_ALIKE, _UNLIKE = 0.9, 0.5
+"""Correlations from which on chords need not be longer, and below which motions are not alike."""
+_MIRRORED = -0.35
+"""Correlation of turns of opposite sign; GPS of 2 m noise has +0.44 in a healthy log."""
+_MIN_OFFSET_S = 0.3
+"""What is named: GPS receivers and mocap bridges are late by up to 0.2 s [s]."""
+_MAX_SCALE = 1.4
+"""Radius of tyres and slip change the way by some 10 %, in bad cases 30 %."""
+_MIN_WAY_M, _MIN_TURN_RAD = 2.0, 0.1
+"""Way of the sensors in all, and RMS turn between chords, that are compared."""
+_MIN_SNR = 4.0
+"""Spread of the chords' lengths over their noise, below which the reference cannot be checked."""
+_UNITS = ((1000.0, "millimetres"), (100.0, "centimetres"), (0.001, "kilometres"), (3.281, "feet"), (39.37, "inches"))
+_LEAPS_S = ((18.0, " (GPS time is 18 s ahead of UTC)"), (37.0, " (TAI is 37 s ahead of UTC)"))
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """Chords on a grid of time; NaN where unknown."""
+
+    lengths: FloatArray
+    """(N,) [m]"""
+    bends: FloatArray
+    """(N,) cross product of a chord and the next one [m^2]: the turn of the path."""
+    turns: FloatArray | None
+    """(N,) change of the heading over a chord [rad]."""
+
+
+def reference_contradictions(trajectories: Sequence[Trajectory], reference: ReferenceTrack) -> tuple[str, ...]:
+    """Sentences on what of ``reference`` contradicts the sensors: clock, scale, axes, run; none where nothing does, or too little moves."""
+    usable = [t for t in trajectories if len(t) > 2 and t.distance(0.05) > _MIN_WAY_M]
+    if not usable or len(reference.stamps_ns) < 10:
+        return ()
+    best: _Comparison | None = None
+    for chord_s in _CHORDS_S:
+        for trajectory in usable:
+            found = _compare(trajectory, reference, chord_s)
+            if found is not None and (best is None or found.sigmas > best.sigmas):
+                best = found
+        if best is not None and best.likeness > _ALIKE:
+            break
+    return () if best is None else best.sentences(reference)
+
+
+@dataclass(frozen=True)
+class _Comparison:
+    """At the offset of the clocks where motions are most alike."""
+
+    offset_s: float
+    likeness: float
+    """Mean correlation, -1 to 1, there."""
+    unshifted: float
+    """The same without an offset."""
+    scale: float
+    """Length of the reference's chords over the sensors'."""
+    sigmas: float
+    """Significance of ``likeness``."""
+    bend: float | None
+    """Correlation of the turns of the path, -1 to 1; None where it hardly turns."""
+    turn: float | None
+    """The same of headings."""
+
+    def sentences(self, reference: ReferenceTrack) -> tuple[str, ...]:
+        name, found = reference.source, []
+        if self.sigmas < _MIN_SIGMAS:
+            if self.unshifted >= _UNLIKE:
+                return ()
+            return (
+                f"{name}: its motion is not that of the robot's sensors at any offset of the clocks up to {_MAX_OFFSET_S:g} s (correlation"
+                f" {self.likeness:.2f} at best): it is of another run or another robot, or its clock is not set.",
+            )
+        is_clear = 1.0 - self.unshifted > 2.0 * (1.0 - self.likeness) + 0.01
+        if reference.has_times and abs(self.offset_s) >= _MIN_OFFSET_S and is_clear:
+            leap = next((words for leap, words in _LEAPS_S if abs(abs(self.offset_s) - leap) < 0.25), "")
+            way, undo = ("ahead of", "Subtract") if self.offset_s > 0 else ("behind", "Add")
+            found.append(
+                f"{name}: its clock is {abs(self.offset_s):.1f} s {way} that of the sensors{leap}. {undo} {abs(self.offset_s):.1f} s"
+                f" {'from' if self.offset_s > 0 else 'to'} its stamps."
+            )
+        if not 1.0 / _MAX_SCALE < self.scale < _MAX_SCALE:
+            found.append(f"{name}: {self._scale_words()}")
+        if self.bend is not None and self.bend < _MIRRORED:
+            found.append(
+                f"{name}: its path turns opposite to the sensors': its axes are mirrored, as of NED (x north, y east) or a left-handed"
+                " system. Swap x and y, or invert y and the heading."
+            )
+        elif self.turn is not None and self.turn < _MIRRORED:
+            found.append(f"{name}: its headings turn opposite to the sensors', its path does not: they count clockwise. Invert them.")
+        return tuple(found)
+
+    def _scale_words(self) -> str:
+        for size, unit in _UNITS:
+            if 1.0 / 1.18 < self.scale / size < 1.18:
+                words = f"its way is {self.scale:.4g} times the sensors', as in {unit}"
+                return f"its scale is {size:g}: {words}. Divide its positions by {size:g}."
+        return (
+            f"its scale is {self.scale:.3g}: its way is that many times the sensors'. Divide its positions by that factor, or correct the"
+            " wheels' radius if that is the wrong one."
+        )
+
+
+def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) -> _Comparison | None:
+    """None where the motion is too small or too even to be compared, or one of them too noisy."""
+    start = int(trajectory.stamps_ns[0])
+    grid = np.arange(0.0, (int(trajectory.stamps_ns[-1]) - start) * 1e-9, _STEP_S)
+    n_chord, n_offset = round(chord_s / _STEP_S), round(_MAX_OFFSET_S / _STEP_S)
+    poses = trajectory.at(start + (grid * 1e9).astype(np.int64))
+    sensors = _motion(poses[:, :2], poses[:, 2], n_chord)
+    wide = np.r_[np.arange(-n_offset, 0) * _STEP_S, grid, grid[-1] + np.arange(1, n_offset + 1) * _STEP_S] if len(grid) else grid
+    if len(grid) * _STEP_S < _MIN_OVERLAP_S:
+        return None
+    found = _motion(*_interpolated(reference, start, wide), n_chord)
+    spread = float(np.nanstd(sensors.lengths))
+    if spread < 0.1 * float(np.nanmean(sensors.lengths)):
+        return None
+    scores = np.array([_likeness(sensors, found, i) for i in range(2 * n_offset + 1)])
+    if not np.isfinite(scores).any():
+        return None
+    best = int(scores.argmax())
+    part = _shifted(found, best, len(grid))
+    use = np.isfinite(part.lengths) & np.isfinite(sensors.lengths)
+    scale = float(np.sqrt(np.mean(part.lengths[use] ** 2) / np.mean(sensors.lengths[use] ** 2)))
+    n_independent = float(np.count_nonzero(use)) * _STEP_S / max(chord_s, _INDEPENDENT_S)
+    noise = max(_noise(reference.positions) / max(scale, 1.0), _noise(trajectory.poses[:, :2]))
+    if noise * math.sqrt(2.0) * _MIN_SNR > spread:
+        return None
+    bends = _rms(sensors.bends[use]) > _MIN_TURN_RAD * float(np.mean(sensors.lengths[use] ** 2))
+    turns = sensors.turns is not None and _rms(sensors.turns[use]) > _MIN_TURN_RAD
+    return _Comparison(
+        (best + _peak(scores, best) - n_offset) * _STEP_S,
+        float(scores[best]),
+        float(scores[n_offset]),
+        scale,
+        math.atanh(min(float(scores[best]), 0.999999)) * math.sqrt(max(n_independent - 3.0, 0.0)),
+        _correlation(sensors.bends, part.bends) if bends else None,
+        _correlation(sensors.turns, part.turns) if turns and part.turns is not None and sensors.turns is not None else None,
+    )
+
+
+def _motion(positions: FloatArray, yaws: FloatArray | None, n: int) -> _Motion:
+    chords = np.full(positions.shape, np.nan)
+    chords[n:] = positions[n:] - positions[:-n]
+    bends = np.full(len(positions), np.nan)
+    ahead, behind = chords[n:], chords[:-n]
+    bends[n:] = behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0]
+    turns = None
+    if yaws is not None:
+        turns = np.full(len(positions), np.nan)
+        turns[n:] = se2.wrap_angle(yaws[n:] - yaws[:-n])
+    return _Motion(np.hypot(chords[:, 0], chords[:, 1]), bends, turns)
+
+
+def _interpolated(reference: ReferenceTrack, start_ns: int, grid: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    """Positions (N, 2) and headings (N,) at times [s] since ``start_ns``; NaN outside and in gaps."""
+    t = (reference.stamps_ns - start_ns) * 1e-9
+    after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
+    gap = t[after] - t[after - 1]
+    is_known = (grid >= t[0]) & (grid <= t[-1]) & (gap <= max(1.0, 3.0 * float(np.median(np.diff(t)))))
+    positions = np.stack([np.where(is_known, np.interp(grid, t, axis), np.nan) for axis in reference.positions.T], axis=1)
+    if reference.yaws is None:
+        return positions, None
+    return positions, np.where(is_known, np.interp(grid, t, np.unwrap(reference.yaws)), np.nan)
+
+
+def _shifted(motion: _Motion, offset: int, n: int, stride: int = 1) -> _Motion:
+    part = slice(offset, offset + n, stride)
+    return _Motion(motion.lengths[part], motion.bends[part], None if motion.turns is None else motion.turns[part])
+
+
+def _likeness(sensors: _Motion, found: _Motion, offset: int) -> float:
+    """Mean correlation of lengths and (of either sign) turns at one offset; minus infinity for too short an overlap."""
+    stride = math.ceil(len(sensors.lengths) / _MAX_SAMPLES)
+    part, own = _shifted(found, offset, len(sensors.lengths), stride), _shifted(sensors, 0, len(sensors.lengths), stride)
+    n = stride * int(np.count_nonzero(np.isfinite(part.lengths) & np.isfinite(own.lengths)))
+    known = min(int(np.count_nonzero(np.isfinite(found.lengths))), len(sensors.lengths))
+    if n * _STEP_S < _MIN_OVERLAP_S or n < _MIN_OVERLAP_SHARE * known:
+        return -math.inf
+    speed = _correlation(own.lengths, part.lengths, is_centred=True)
+    if own.turns is None or part.turns is None or _rms(own.turns) < _MIN_TURN_RAD:
+        return speed
+    return 0.5 * (speed + abs(_correlation(own.turns, part.turns)))
+
+
+def _correlation(a: FloatArray, b: FloatArray, is_centred: bool = False) -> float:
+    use = np.isfinite(a) & np.isfinite(b)
+    u, v = a[use], b[use]
+    if is_centred:
+        u, v = u - u.mean(), v - v.mean()
+    size = math.sqrt(float(np.sum(u * u)) * float(np.sum(v * v)))  # sums: BLAS starts threads for a dot product
+    return float(np.sum(u * v)) / size if size > 0.0 else 0.0
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _peak(scores: FloatArray, best: int) -> float:
+    """Vertex of the parabola through the largest score and its neighbours, as a fraction of a step."""
+    if not 0 < best < len(scores) - 1 or not np.isfinite(scores[best - 1 : best + 2]).all():
+        return 0.0
+    before, at, after = scores[best - 1 : best + 2]
+    bend = before - 2.0 * at + after
+    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
+
+
+def _noise(positions: FloatArray) -> float:
+    """Standard deviation of a position [m] by the median of its second differences, which motion hardly changes."""
+    second = np.diff(positions, n=2, axis=0)
+    return float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))

@@ -1,0 +1,95 @@
+"""Clock, scale and axes of references against the motion by the sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localization.evaluation.reference_check import reference_contradictions
+from localization.evaluation.references import ReferenceTrack
+from localization.trajectory import Trajectory
+from motion_models import se2
+
+
+def _drive(seed: int = 3, duration_s: float = 90.0) -> Trajectory:
+    """Maneuvers of 1.5 to 5 s: straight, turns both ways, arcs and halts."""
+    rng = np.random.default_rng(seed)
+    n = int(duration_s * 20)
+    twists = np.zeros((n, 3))
+    at = 0
+    while at < n:
+        end = at + int(rng.uniform(30, 100))
+        twists[at:end, 0] = rng.choice([0.0, 0.0, 0.4, 0.8])
+        twists[at:end, 2] = rng.choice([0.0, 0.6, -0.6, -0.3])
+        at = end
+    poses = [np.zeros(3)]
+    for step in se2.exp(twists / 20.0):
+        poses.append(se2.compose(poses[-1], step))
+    return Trajectory(1_700_000_000 * 10**9 + 50_000_000 * np.arange(n + 1), np.array(poses))
+
+
+DRIVE = _drive()
+
+
+def _reference(period: int = 4, noise_m: float = 0.005, has_yaws: bool = True, drive: Trajectory = DRIVE) -> ReferenceTrack:
+    """In a plane of its own, turned by 2 rad."""
+    poses = se2.compose(np.array([5.0, -3.0, 2.0]), drive.poses[::period])
+    noise = np.random.default_rng(1).normal(0.0, noise_m, (len(poses), 2))
+    return ReferenceTrack(drive.stamps_ns[::period], poses[:, :2] + noise, se2.wrap_angle(poses[:, 2]) if has_yaws else None)
+
+
+def _sentence(reference: ReferenceTrack) -> str:
+    (found,) = reference_contradictions([DRIVE], reference)
+    return found
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize("has_yaws", [True, False])
+def test_reference_that_agrees_has_no_contradiction(noise_m, has_yaws):
+    assert reference_contradictions([DRIVE], _reference(noise_m=noise_m, has_yaws=has_yaws)) == ()
+    slow = replace(DRIVE, poses=DRIVE.poses * [0.85, 0.85, 1.0])
+    assert reference_contradictions([slow], _reference(noise_m=noise_m, has_yaws=has_yaws)) == ()
+
+
+@pytest.mark.parametrize("has_yaws", [True, False])
+@pytest.mark.parametrize(("offset_s", "words"), [(18.0, "18.0 s ahead"), (-18.0, "18.0 s behind"), (0.7, "0.7 s ahead"), (37.0, "TAI")])
+def test_reference_of_another_clock_is_named_with_its_offset(offset_s, words, has_yaws):
+    reference = _reference(has_yaws=has_yaws)
+    found = _sentence(replace(reference, stamps_ns=reference.stamps_ns + round(offset_s * 1e9)))
+    assert words in found
+    assert ("GPS time" in found) == (abs(offset_s) == 18.0)
+
+
+@pytest.mark.parametrize(("scale", "words"), [(1000.0, "scale is 1000"), (100.0, "centimetres"), (2.0, "scale is 2")])
+def test_reference_in_another_unit_is_named_with_its_scale(scale, words):
+    reference = _reference()
+    assert words in _sentence(replace(reference, positions=scale * reference.positions))
+
+
+def test_reference_with_mirrored_axes_is_named():
+    ned = _reference(has_yaws=False)
+    assert "mirrored" in _sentence(replace(ned, positions=ned.positions[:, ::-1]))
+    left = _reference()
+    assert "mirrored" in _sentence(replace(left, positions=left.positions * [1, -1], yaws=-left.yaws))
+
+
+def test_reference_with_clockwise_headings_is_named():
+    reference = _reference()
+    assert "clockwise" in _sentence(replace(reference, yaws=-reference.yaws))
+
+
+@pytest.mark.parametrize("has_yaws", [True, False])
+def test_reference_of_another_run_is_named(has_yaws):
+    assert "another run" in _sentence(_reference(drive=_drive(seed=8), has_yaws=has_yaws))
+
+
+def test_reference_check_counts_the_run_that_agrees_best():
+    wrong = replace(DRIVE, poses=_drive(seed=8).poses)
+    assert reference_contradictions([wrong, DRIVE], _reference()) == ()
+
+
+def test_reference_of_hardly_any_motion_is_not_judged():
+    still = replace(DRIVE, poses=0.01 * DRIVE.poses)
+    assert reference_contradictions([still], _reference()) == ()
