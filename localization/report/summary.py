@@ -50,6 +50,9 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     if not lines:
         return ["Nothing was run."]
     best, losses = best_run(lines), _losses(lines)
+    if contradictions := lines[0].result.contradictions:
+        ending = "Until that is corrected, errors against this reference show nothing, and no covariance is judged."
+        return [*contradictions, ending, *losses]
     if reference is None or best is None:
         line = _most_informed(lines)
         return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}")]
