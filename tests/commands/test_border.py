@@ -43,6 +43,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "diagnose": ("diagnose", "{log}", *COMMON, "--model", "skid_steer", "--out", "{out}"),
     "weigh": ("weigh", "{log}", *COMMON, "--out", "{out}.toml"),
     "init": ("init", "{log}", "--like", "{robot}", "--out", "{out}.toml"),
+    "check": ("check", "{log}", *COMMON, "--out", "{out}", "--json", "{out}.json"),
     "robots": ("robots", "--json", "{out}.json"),
     "cg": ("cg", "--posture", "ready", *COMMON, "--json", "{out}.json"),
     "map": ("map", "info", "{map}", "--json", "{out}.json"),

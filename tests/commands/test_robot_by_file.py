@@ -29,6 +29,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {
     "diagnose": ("{log}", "--out", "{out}", "--model", "skid_steer"),
     "weigh": ("{log}",),
     "init": ("{log}", "--like", "{robot}", "--out", "{out}.toml"),
+    "check": ("{log}", "--out", "{out}", "--json", "{out}.json"),
     "robots": (),
     "cg": ("--posture", "ready"),
     "map": ("export", "{log}", "--out", "{out}.pgm"),
@@ -80,7 +81,7 @@ def test_command_with_a_robot_by_file_gives_the_same(
         trajectories |= {(path.name, path.read_bytes()) for path in out.parent.rglob("*.tum")}
     assert all(found == results[0] for found in results)
     assert len(trajectories) == len({name for name, _ in trajectories})
-    assert results[0][0] == 0 or command in ("map", "weigh", "diagnose", "calibrate"), results[0]
+    assert results[0][0] == 0 or command in ("map", "weigh", "diagnose", "calibrate", "check"), results[0]
 
 
 def test_arguments_cover_each_command_with_a_robot() -> None:
