@@ -14,7 +14,7 @@ import numpy as np
 from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
 from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, draft_robot, finish_robot, survey_log
 from localization.calibration.wheel_signals import STEP_S, LidarMotion, WheelSignals, lidar_motion, read_signals
-from localization.calibration.wheel_units import expected_scaling
+from localization.calibration.wheel_units import CORRECTED, expected_scaling
 from localization.calibration.wheel_wiring import WiringReport, open_checked
 from localization.errors import LogError
 from localization.evaluation.reference_files import load_reference
@@ -230,8 +230,20 @@ def _cosine(a: FloatArray, b: FloatArray) -> float:
     return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
 
 
+_IN_FILE = "In the robot file:"
+
+
 def _wiring_rows(wiring: WiringReport, by_lidar: Mapping[str, float]) -> list[CheckRow]:
-    rows = [CheckRow("wheels and gyro", "as in the robot file", "", "contradiction", text) for text in wiring.findings]
+    rows = [
+        CheckRow(
+            "wheels and gyro",
+            "as in the robot file",
+            "wheels, gyro and driver beside each other",
+            "contradiction",
+            text.replace(CORRECTED, _IN_FILE),
+        )
+        for text in wiring.findings
+    ]
     if rows:
         return rows
     found = [

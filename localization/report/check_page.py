@@ -43,12 +43,11 @@ def check_page(found: RobotCheck, files: dict[str, str]) -> str:
 
 
 def _table(rows: tuple[CheckRow, ...]) -> list[Block]:
-    header = [Cell(title) for title in ("Quantity", "Value", "Second source", "Verdict")]
+    header = [Cell(title) for title in ("Quantity", "Verdict", "Value", "Second source")]
     cells = []
     for row in rows:
-        verdict = Cell(row.verdict, row.advice, mark=_MARKS[row.verdict])
-        cells.append([Cell(row.quantity), Cell(row.value), Cell(row.second_source), verdict])
-    return [Table(header, cells)]
+        cells.append([Cell(row.quantity), Cell(row.verdict, mark=_MARKS[row.verdict]), Cell(row.value), Cell(row.second_source)])
+    return [Table(header, cells, is_text=True)]
 
 
 def _to_drive(unseen: list[CheckRow]) -> list[Block]:

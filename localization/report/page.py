@@ -92,6 +92,8 @@ class Table:
     rows: Sequence[Row]
     summary: str = ""
     """Title under which the table is folded away; "" to show it."""
+    is_text: bool = False
+    """Words and not numbers: aligned left, and wrapped."""
 
 
 @dataclass(frozen=True)
