@@ -56,12 +56,6 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     if reference is None or best is None:
         line = _most_informed(lines)
         return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}")]
-    if contradictions := lines[0].result.contradictions:
-        return [
-            *contradictions,
-            "Until that is corrected, errors against this reference show nothing, and no covariance is judged.",
-            *losses,
-        ]
     equals = equally_good(lines, best, reference)
     ranking = _ranking(lines, best, equals, reference)
     return [
