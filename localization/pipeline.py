@@ -288,7 +288,7 @@ class _Replay:
         self._add(self._pipeline.stream_rest())
         stamps, table = self._table.stamps(), self._table.rows()
         if not len(stamps):
-            raise LogError("there are wheel samples and scans in the log, but no two that span an interval of time.")
+            raise LogError("no two wheel samples or scans span an interval of time. Check the log's length and options of topics.")
         filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
         smoothed = estimator.finish(filtered)
         smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)

@@ -137,6 +137,8 @@ class Init:
         left, right = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (self.left, self.right))
         if bool(left) != bool(right):
             raise RobotError("--left and --right go together: both sides have wheels.")
+        if shared := sorted({*left} & {*right}):
+            raise RobotError(f"--left and --right both have {', '.join(shared)}; a wheel is on one side.")
         for name, (low, high) in _BOUNDS.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= high:

@@ -143,3 +143,9 @@ def test_init_topic_options_go_before_guesses(tmp_path: Path, capsys: pytest.Cap
     assert main([*base, "--topic.joint-states", ""]) == 2
     assert main([*base, "--topic.reference", "/odom"]) == 0
     assert load_robot(tmp_path / "r.toml").topics.reference == "/odom"
+
+
+def test_init_one_joint_on_both_sides_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(DATA / "cases" / "base-log" / "log.mcap")
+    assert main(["init", log, "--left", "a,b", "--right", "b", "--out", str(tmp_path / "r.toml")]) == 2
+    assert "--left and --right both have b; a wheel is on one side" in capsys.readouterr().err
