@@ -29,38 +29,38 @@ _FIRST_SAMPLES = 20
 _MAX_GAP_S = 0.5
 """Without a sample for longer, the vertical starts anew."""
 _IN_M_S2, _IN_G, _NO_GRAVITY = (8.0, 12.0), (0.8, 1.2), 3.0
-"""Of the mean specific force: in m/s^2, in g (some drivers), and below which gravity was removed [m/s^2]."""
+"""Size of the mean specific force: its ranges in m/s^2 and in g (some drivers), and below what gravity was removed [m/s^2]."""
 _MAX_MOUNT_ERROR_RAD = math.radians(30.0)
 _MIN_TURN_RAD = 3.0
-"""Of turning by the wheels, difference of the sides' angles, after which it shows whether the gyro's axis points up."""
+"""Turn by the wheels, as difference of the sides' angles, after which it shows whether the gyro's axis points up."""
 _LEVEL = math.tan(math.radians(3.0))
 """Tilt up to which the ground counts as level: a Husky outdoors is level within 1.8 deg, and mounts are known to a degree or two."""
 _CERTAIN = 3.5
 """Sigmas at which the ground counts as tilted."""
 _MOUNT_SIGMA, _GROUND_SIGMA = math.radians(1.2), math.radians(6.0)
-"""Of mounts in robot files, and of hills (median 5.8 deg, 95 % below 10.7)."""
+"""Sigma of mounts in robot files, and of the slope of hills (median 5.8 deg, 95 % below 10.7)."""
 _HILL_M = 5.0
 """Way over which a slope changes."""
 _START_SIGMA, _MOVING_SIGMA = math.radians(0.5), math.radians(4.0)
-"""Of the first vertical, at rest and on the way."""
+"""Sigma of the first vertical, at rest and on the way [rad]."""
 _BIAS_SIGMA = 0.01
-"""Of a gyro that is not zeroed [rad/s]."""
+"""Sigma of the bias of a gyro that is not zeroed [rad/s]."""
 _ACCELEROMETER_RAD = math.radians(0.3)
-"""Of the vertical by an accelerometer's bias of 0.05 m/s^2."""
+"""Error of the vertical by an accelerometer's bias of 0.05 m/s^2 [rad]."""
 _LASTING = 2.0
 """For how many windows errors of the vertical last."""
 _SLOPE_EFFECT = 0.25
 """Relative uncertainty of a slope's effect, by mu and the height of the CG."""
 _MIN_UP = 0.2
-"""Of the vertical's z: beyond 78 deg nothing drives."""
+"""Least z of the vertical: beyond 78 deg nothing drives."""
 _WINDOW_S, _FIRST_WINDOW_S = 1.0, 0.5
 """Over which forces are summed [s]: wheels that are read at 10 Hz give accelerations from step to step to 3 m/s^2 only."""
 _FORGETTING = 0.8
-"""Of the noise, from window to window."""
+"""Factor of the older noise, from window to window."""
 _EXPLAINED, _UNEXPLAINED = 0.05, 0.5
 """Least noise of gravity, with the robot's own acceleration taken off and without [m/s^2]."""
 _AXES_ERROR = 3e-3
-"""Of a gyro's scale and axes [-]."""
+"""Relative error of a gyro's scale and axes [-]."""
 _BIAS_WALK = 1e-4
 """[rad/s/sqrt(s)]"""
 
@@ -125,7 +125,7 @@ class AttitudeFilter:
 
     @property
     def tilt_variances(self) -> tuple[float, float]:
-        """Of roll and pitch [rad^2]: by the attitude, and by the mount, which stays."""
+        """Variances of roll and pitch [rad^2]: by the attitude, and by the mount, which stays."""
         return 0.5 * float(self._cov[0, 0] + self._cov[1, 1]) + _ACCELEROMETER_RAD**2, 0.5 * float(
             self._split_cov[0, 0] + self._split_cov[1, 1]
         )

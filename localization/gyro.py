@@ -149,14 +149,14 @@ class GyroBuffer:
         return self._rates[i - 1] + part * (self._rates[i] - self._rates[i - 1])
 
     def _rate_variance(self, stamp_ns: int) -> float:
-        """Of `_rate_at` [rad^2/s^2]: white noise sigma gives second differences the variance 6 sigma^2; shaking adds to both."""
+        """Variance of `_rate_at` [rad^2/s^2]: white noise sigma gives second differences the variance 6 sigma^2; shaking adds to both."""
         j = min(bisect.bisect_left(self._stamps, stamp_ns), len(self._stamps) - 1)
         i = max(j - _SCATTER_SAMPLES, 0)
         squares = self._sum_squared_differences[j] - self._sum_squared_differences[i]
         return squares / 6.0 / (j - i) if j > i else 0.0
 
     def _sampling_variance(self, start_ns: int, end_ns: int) -> float:
-        """Of the turn [rad^2], by what the rate does between samples: shaking, wheels that slip by jerks.
+        """Variance of the turn [rad^2] by what the rate does between samples: shaking, wheels that slip by jerks.
 
         A white rate of density q [rad^2/s], sampled every dt as the mean over 2 dt around the stamp: second differences have the variance
         q / dt, and the sum of trapezoids errs by q dt / 8 at each end. White noise of the gyro adds 6 sigma^2 / dt to the former.
@@ -260,7 +260,7 @@ class GyroRecord:
         return max(len(self._stretches) - 1, 0)
 
     def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
-        """As `GyroBuffer.turn`; None also where there is a gap between."""
+        """The turn from ``start_ns`` to ``end_ns`` (see `GyroBuffer.turn`); None also where there is a gap between."""
         i = bisect.bisect_right(self._starts, start_ns) - 1
         return None if i < 0 else self._stretches[i].turn(start_ns, end_ns, by_wheels)
 

@@ -56,7 +56,7 @@ _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 _SLOPE_ERROR_S = 5.0
 """For which errors of a slope's effect last [s]."""
 _MIN_KNOWN_S = 1e-6
-"""Of a step: less than a microsecond with wheel data is rounding."""
+"""Least time with wheel data in a step that counts [s]: less than a microsecond is rounding."""
 
 
 class UnknownVelocity:
@@ -110,7 +110,7 @@ class Synchronizer:
             self.attitude = AttitudeFilter(robot.gyro_noise, mounts, robot.geometry.wheel_radius_m)
             self._slope_effect = SlopeEffect.from_robot(robot)
         self.frames = LidarFrames(mounts)
-        """Of the scans."""
+        """Frames of the scans, with their mounts."""
         self._has_lidar = has_lidar
         self._scans: deque[tuple[int, Scan]] = deque()  # and the middle of its sweep
         self._empty_scans, self._late_scans, self._no_wheel_data_s = 0, 0, 0.0
@@ -222,7 +222,8 @@ class Synchronizer:
         return None if end_ns - self._start_ns < least_ns else (end_ns, None)
 
     def _has_rates_until(self, stamp_ns: int) -> bool:
-        """Of the wheels, and of a gyro that is not silent: which of them comes first must not matter."""
+        """Whether the rates of the wheels, and of a gyro that is not silent, are known until ``stamp_ns``: which of them comes first must
+        not matter."""
         known_ns, gyro_ns = self._wheels.rates_known_until_ns, self._gyro.newest_ns
         is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + _ns(self.config.wait_s)
         return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + _ns(self._clock_offset_s)

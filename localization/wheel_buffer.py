@@ -23,9 +23,9 @@ class WheelInterval(NamedTuple):
     right: float
     """[rad/s]"""
     x: float
-    """Of the centre of gravity [m]."""
+    """x of the centre of gravity [m]."""
     y: float
-    """Of the centre of gravity [m]."""
+    """y of the centre of gravity [m]."""
     has_angles: bool
     """The rates are differences of angles, and give all of the motion in the interval."""
 

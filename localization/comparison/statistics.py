@@ -55,7 +55,7 @@ class Difference:
     worse: str
     n: int
     mean: float
-    """Of worse minus better, per log."""
+    """Mean over the logs of the worse one's number minus the better one's."""
     low: float
     high: float
     wins: int
@@ -96,7 +96,7 @@ def means(rows: Sequence[Row], metric: str, seed: int = 0) -> list[Mean]:
 
 
 def differences(rows: Sequence[Row], metric: str, seed: int = 0) -> list[Difference]:
-    """Of every two combinations with at least two logs in common, the smallest p-value first. Smaller numbers are better."""
+    """Differences of every two combinations with at least two logs in common, the smallest p-value first. Smaller numbers are better."""
     rng = np.random.default_rng(seed)
     found = []
     for (a, a_table), (b, b_table) in itertools.combinations(by_combination(rows, metric).items(), 2):

@@ -96,7 +96,7 @@ class Accuracy:
     """Mean over all sub-paths of all lengths."""
     rpe_rotation_deg_per_m: float | None = None
     rpe: tuple[RpeAtLength, ...] = ()
-    """The same by length."""
+    """Relative pose errors by length of the sub-paths."""
     end_error_m: float | None = None
     """Position error at the last match: aligned at the first matched pose where the reference has headings, else by the whole path."""
     drift_percent: float | None = None

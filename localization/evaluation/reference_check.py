@@ -22,7 +22,7 @@ _STEP_S = 0.1
 _CHORDS_S = (1.0, 5.0, 15.0)
 """Lengths of chords [s]: the longer ones for positions of metres of noise."""
 _MAX_SAMPLES = 4000
-"""Of the grid that are correlated; of long drives every second, third, ..."""
+"""Most steps of the grid that are correlated; of longer drives every second, third, ... one is."""
 _INDEPENDENT_S = 5.0
 """Time after which a robot's speed and turning rate are taken as independent of what they were [s]: maneuvers last for seconds."""
 _MIN_SIGMAS = 4.0
@@ -82,7 +82,7 @@ class _Comparison:
     likeness: float
     """Mean correlation, -1 to 1, there."""
     unshifted: float
-    """The same without an offset."""
+    """Mean correlation, -1 to 1, without an offset."""
     scale: float
     """Length of the reference's chords over the sensors'."""
     sigmas: float
@@ -90,7 +90,7 @@ class _Comparison:
     bend: float | None
     """Correlation of the turns of the path, -1 to 1; None where it hardly turns."""
     turn: float | None
-    """The same of headings."""
+    """Correlation of the turns of the headings, -1 to 1; None where one of both has none, or hardly turns."""
 
     def sentences(self, reference: ReferenceTrack) -> tuple[str, ...]:
         name, found = reference.source, []

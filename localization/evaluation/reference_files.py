@@ -33,7 +33,7 @@ _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 _MAX_FLAT_SHARE = 0.1
 """Spread along the vertical over the smaller one in the plane, where another axis than z is the vertical."""
 _MIN_SPREAD_M = 0.2
-"""Of positions; below, no axis is the vertical by its spread."""
+"""Least spread of positions [m]: below, no axis is the vertical by its spread."""
 _ROWS_PARSED = 100
 _KNOT_M_S, _DAY_NS = 0.514444, 86_400_000_000_000
 
@@ -103,7 +103,7 @@ def load_reference(log: Log, name: str, file: Path | None = None) -> ReferenceTr
 
 
 def _log_stamps(log: Log) -> IntArray:
-    """Of the log's scans, else of all its events, ascending [ns]."""
+    """Stamps of the log's scans, else of all its events, ascending [ns]."""
     of_scans: list[int] = []
     of_all: list[int] = []
     for event in log.events():
@@ -387,7 +387,7 @@ def _read_nmea(lines: Sequence[str], path: Path, log_stamps: LogStamps | None) -
 
 
 def _first_midnight_ns(sentences: Sequence[Sequence[str]]) -> int | None:
-    """Of the day of the first RMC with a date (ddmmyy)."""
+    """Midnight that begins the day of the first RMC sentence with a date (ddmmyy) [ns]; None without one."""
     for words in sentences:
         if words[0][3:] == "RMC" and len(words) > 9 and len(words[9]) == 6 and words[9].isdigit():
             day, month, year = int(words[9][:2]), int(words[9][2:4]), int(words[9][4:])
@@ -399,7 +399,7 @@ def _first_midnight_ns(sentences: Sequence[Sequence[str]]) -> int | None:
 
 
 def _degrees(word: str, side: str, where: str) -> float:
-    """Of NMEA's ddmm.mmmm and N, S, E or W."""
+    """Decimal degrees of NMEA's ddmm.mmmm and N, S, E or W, negative for S and W [deg]."""
     value = parse_float(word, where)
     degrees = math.floor(value / 100.0)
     found = degrees + (value - 100.0 * degrees) / 60.0

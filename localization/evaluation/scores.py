@@ -26,7 +26,7 @@ class Result:
     """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings.
     Of the filtered poses, where the trajectory is smoothed."""
     filtered: Accuracy | None = None
-    """Of the filtered poses, where the run's trajectory is smoothed."""
+    """Accuracy of the filtered poses, where the run's trajectory is smoothed."""
     contradictions: tuple[str, ...] = ()
     """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
 

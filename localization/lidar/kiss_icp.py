@@ -19,7 +19,7 @@ from motion_models.se2 import FloatArray, Pose2
 
 _NO_STAMPS = np.empty(0)
 _INITIAL_THRESHOLD_M, _MIN_MOTION_M = 0.5, 0.01
-"""Of the adaptive threshold, as suits indoor robots (its defaults, 2 and 0.1 m, are for cars)."""
+"""Initial value and least motion of the adaptive threshold [m], as suits indoor robots (KISS-ICP's defaults, 2 and 0.1 m, are for cars)."""
 _KISS_OF_RANGE, _MIN_VOXEL_M, _MAX_VOXEL_M = 0.05, 0.1, 1.0
 """Voxel of the map as a share of the first scan's median range, at least and at most [m]. Its default, a hundredth of the maximal range,
 fails indoors, where scanners reach far less than they could."""

@@ -42,7 +42,8 @@ class LidarLosses:
     """All of them."""
     matched: int
     share: float
-    """Of the time from the first scan to the last without a matched scan, 0 to 1; each loss is shorter by one period of the scans."""
+    """Share of the time without a matched scan, from the first scan to the last, 0 to 1; each loss is shorter by one period of the
+    scans."""
     longest_s: float
     """The longest time without a match [s]."""
     since_s: float
@@ -88,7 +89,7 @@ class LidarLosses:
         return f"{self.summary} ({'; '.join(found)}). The pose is by wheels and gyro there. {self.advice}" if found else ""
 
     def numbers(self) -> dict[str, Any]:
-        """As in `metrics.json`."""
+        """Numbers of the losses, as `metrics.json` has them."""
         return {
             "scans": self.scans,
             "matched": self.matched,

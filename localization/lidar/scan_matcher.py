@@ -31,14 +31,14 @@ _REACH_CELLS = 2.5
 _MAX_ASSOCIATION_M = 3.0
 """Surfaces farther from a point are not associated with it, however wide the prior is: from there Gauss-Newton does not converge."""
 _ITERATIONS, _MIN_STEP = 20, 0.1
-"""Of Gauss-Newton, at most; the last step is shorter than this [sigmas]: 0.1 mm and 0.002 deg from the minimum on real logs."""
+"""Most steps of Gauss-Newton, and length below which a step is the last [sigmas]: 0.1 mm and 0.002 deg from the minimum on real logs."""
 _CELL_OF_RANGE, _MIN_CELL_M = 0.02, 0.04
 """Voxel of a submap, as a share of the first scan's median range, and at least [m]."""
 _BLOCK = 30
 """Neighbouring beams whose residuals are summed, to measure how they err together [beams]: the residuals of real scans are correlated over
 10 to 20 beams, those of simulated rooms over 1 to 10."""
 FORGETTING = 0.98
-"""Of statistics of residuals, innovations and slip, per measurement: they are means over the last 50."""
+"""Factor per measurement of older statistics of residuals, innovations and slip: they are means over the last 50."""
 OUTLIER_SIGMAS = 5.0
 """What is farther off is an outlier: scans, wheels that slip or count wrongly, positions."""
 _OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
@@ -58,7 +58,7 @@ MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
 _SWEEP_PARTS = 8
-"""Of a sweep, over which slip within it is summed: 24 parts change no sigma of a bent scan by more than 3 %."""
+"""Parts of a sweep, over which slip within it is summed: 24 parts change no sigma of a bent scan by more than 3 %."""
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
@@ -85,7 +85,7 @@ class LidarConfig(Settings):
     key_distance_m: Positive = 0.5
     """A scan enters the submap when the robot has moved this far since the last that did [m]."""
     key_angle_rad: Positive = 0.35
-    """The same for turns [rad]."""
+    """A scan enters the submap when the robot has turned this far since the last that did [rad]."""
     key_scans: Count = 40
     """Key scans of a submap."""
     search_below: Share = 0.7
@@ -155,9 +155,9 @@ class Fit:
     n_associated: int
     """Points with a surface of the submap near them."""
     sum_squares: float
-    """Of e over the inliers."""
+    """Sum of the squared residuals e of the inliers."""
     sum_block_squares: float
-    """Of the sums of e over blocks of `_BLOCK` neighbouring inliers."""
+    """Sum of the squared sums of e over blocks of `_BLOCK` neighbouring inliers."""
 
 
 class ScanMatcher:
@@ -276,7 +276,7 @@ class ScanMatcher:
 
     @property
     def _block_variance(self) -> float:
-        """The same of sums over blocks of neighbouring beams, which contains how these err together (batch means)."""
+        """Mean square of the sums of residuals over blocks of neighbouring beams, which contains how these err together (batch means)."""
         return float(self._residuals[1] / self._residuals[2])
 
     def points(self) -> FloatArray:
@@ -291,7 +291,7 @@ class ScanMatcher:
         return align_points(self._grid, points, prior, cov, guess, guess_error)
 
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
-        """As `find_place`, in the submap."""
+        """The best pose (3,) of ``points`` in the submap, as `find_place` returns it; None where it is ambiguous."""
         assert self._grid is not None
         if self._image is None:
             self._image = draw_image(self._grid.means, self.cell)

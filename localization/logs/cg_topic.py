@@ -33,7 +33,7 @@ class CgChoice(NamedTuple):
 
 
 def choose_cg_topic(topics: Sequence[str], robot: Robot, mean_point: MeanPoint) -> CgChoice | None:
-    """Of several ``topics`` of points that of the centre of gravity: as names have it, unless their points contradict.
+    """Choose the topic of the centre of gravity among ``topics`` of points: as names have it, unless their points contradict.
 
     None for a single one whose name is of no other point.
     """

@@ -105,8 +105,8 @@ class DamagedError(Exception):
 
 
 _MAX_BUFFERED_BYTES = 512 << 20
-"""Of messages that are held to be sorted [B]. Recorders' chunks overlap by seconds (a few MB); where they overlap by more than this, the
-oldest message is yielded early, and `merge` reports those that then come too late."""
+"""Largest size of the messages that are held to be sorted [B]. Recorders' chunks overlap by seconds (a few MB); where they overlap by more
+than this, the oldest message is yielded early, and `merge` reports those that then come too late."""
 
 
 def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMessage]]) -> Iterator[RawMessage]:
@@ -127,8 +127,8 @@ def in_log_order(chunks: Iterable[Chunk], load: Callable[[Chunk], Iterable[RawMe
 
 
 MAX_DECOMPRESSED_BYTES = 256 << 20
-"""Of a chunk or of a message, decompressed [B]. Recorders make chunks of 0.8 to 16 MB, and the largest messages of robots (maps, stitched
-clouds) have 100 MB; larger ones are read only where they are not compressed."""
+"""Largest size of a chunk or of a message, decompressed [B]. Recorders make chunks of 0.8 to 16 MB, and the largest messages of robots
+(maps, stitched clouds) have 100 MB; larger ones are read only where they are not compressed."""
 _MAX_COMPRESSION_RATIO = 1000
 """Decompressed to compressed size, of more than `_UNLIMITED_RATIO_BYTES`. Sensor data compress by 2 to 10, joint states of a robot at rest
 by 100; an empty map compresses by 10,000, but has 16 MB."""

@@ -97,7 +97,7 @@ class _PointTimes:
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
         self._largest = 0.0
-        """Of the times so far, in the unit of the field: parts of a sweep never exceed 1."""
+        """Largest of the times so far, in the unit of the field: parts of a sweep never exceed 1."""
 
     def __call__(self, times: Any, good: Any, stamp: int) -> FloatArray:
         """Seconds after ``stamp`` [ns] of each of ``times`` (N,), of which ``good`` (N,) belong to points; NaN where it has none."""

@@ -59,7 +59,8 @@ _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its readin
 _MIN_SWAPS = 6
 """Changes from one publisher to the other and back, before one is left out."""
 _VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
-"""Of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size brake at up to 3 m/s^2."""
+"""Noise and largest acceleration of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size
+brake at up to 3 m/s^2."""
 _FROZEN_AFTER_RAD = 0.5
 """Turned by another wheel of the same side; these are coupled by a chain or by the ground."""
 

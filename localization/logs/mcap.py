@@ -83,7 +83,7 @@ class McapFile:
             self.warnings.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """As `Source.messages`."""
+        """The messages of these topics in order of log time."""
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
         with self._path.open("rb") as file:
 
@@ -328,7 +328,7 @@ def _entry(plain: bytes, position: int, after: int) -> Entry | None:
 
 
 def _whole_messages(run: bytes) -> list[Entry]:
-    """Of a run of message records, which were whole when the file was gone through."""
+    """Entries of a run of message records, which were whole when the file was gone through."""
     position, entries = 0, []
     while position + 9 <= len(run):
         after = position + 9 + int(struct.unpack_from("<Q", run, position + 1)[0])

@@ -40,7 +40,7 @@ _POINTS_READ = 100  # first messages of a point that may be the centre of gravit
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
 _MAX_METADATA_BYTES = 4 << 20
-"""Of metadata.yaml [B]. It has some kB for a hundred topics and 200 B for each file that a recording was split into."""
+"""Largest size of metadata.yaml [B]. It has some kB for a hundred topics and 200 B for each file that a recording was split into."""
 
 
 def open_log(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008 (frozen)
@@ -289,11 +289,11 @@ class DecompressedSource:
 
     @property
     def warnings(self) -> list[str]:
-        """As `Source.warnings`."""
+        """Warnings about what was lost so far."""
         return [*self._warnings, *self._inner.warnings]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """As `Source.messages`."""
+        """The messages of these topics in order of log time."""
         return self._inner.messages(topics)
 
 
@@ -310,11 +310,11 @@ class SplitSource:
 
     @property
     def warnings(self) -> list[str]:
-        """As `Source.warnings`."""
+        """Warnings about what was lost so far, of all parts."""
         return [*self._warnings, *chain.from_iterable(part.warnings for part in self._parts)]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """As `Source.messages`."""
+        """The messages of these topics in order of log time, part after part."""
         for part in self._parts:
             yield from part.messages(topics)
 

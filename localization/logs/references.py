@@ -88,7 +88,8 @@ def east_north(latitude: float, longitude: float) -> FloatArray:
 
 
 _UNKNOWN_SIGMA_M = 2.5
-"""Of a source without covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 % within 8 m)."""
+"""Sigma of a position by a source without covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 %
+within 8 m)."""
 _MIN_SIGMA_M = 0.01
 """Smallest sigma of a receiver, whatever its covariance [m]."""
 

@@ -70,7 +70,7 @@ class Ros1Bag:
         self.end_ns = max((c.end_ns for c in filled), default=0)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """As `Source.messages`."""
+        """The messages of these topics in order of log time."""
         wanted = {key: c for key, c in self._connections.items() if c.topic in topics}
         with self._path.open("rb") as file:
 
@@ -189,7 +189,7 @@ class Ros1Bag:
 
 class _Message(NamedTuple):
     key: int
-    """Of its connection."""
+    """Number of its connection."""
     log_ns: int
     data: bytes
 
@@ -212,7 +212,7 @@ class _Record(NamedTuple):
     op: int
     """Kind of the record."""
     fields: Fields
-    """Of its header."""
+    """Fields of its header."""
     body: bytes
     end: int
     """Position of the next record."""

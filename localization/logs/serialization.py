@@ -33,7 +33,7 @@ _MAX_FIXED_ARRAY_LENGTH = (
 )
 
 Shape = tuple[Any, ...]
-"""Of a field: ("base", name), ("message", type), ("array", shape, length) or ("sequence", shape)."""
+"""Shape of a field: ("base", name), ("message", type), ("array", shape, length) or ("sequence", shape)."""
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
 _UINT, _HEADER, _IMU = struct.Struct("<I"), struct.Struct("<iII"), struct.Struct("<104x3d72x3d72x")

@@ -98,7 +98,7 @@ class SqliteFile:
         self._rest: RecoveredSqlite | None = None
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """As `Source.messages`."""
+        """The messages of these topics in order of log time."""
         wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
         last, found = self.start_ns - 1, 0
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, wanted))}) ORDER BY timestamp"
@@ -158,7 +158,7 @@ class RecoveredSqlite:
         ]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """As `Source.messages`."""
+        """The messages of these topics in the order in which they were recorded."""
         wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
         for key, log_ns, data in self._rows():
             if key in wanted:
@@ -175,7 +175,7 @@ class RecoveredSqlite:
 
 
 class _Pages:
-    """Of a file; each can be a part of one row only, so that pages that lead back to themselves end."""
+    """Pages of a file; each can be a part of one row only, so that pages that lead back to themselves end."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

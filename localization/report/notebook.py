@@ -41,7 +41,7 @@ class Series:
     colour: str = "blue"
     marker: str = ""
     dashes: tuple[float, ...] | None = ()
-    """Of the line: () solid, None no line."""
+    """Dashes of the line: () solid, None no line."""
     sigma: ArrayLike | None = None
     """Half length of the error bars."""
     below: ArrayLike | None = None
@@ -64,7 +64,7 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     band: tuple[float, float] | None = None
-    """Of y, shaded: band of consistent values."""
+    """Lowest and highest consistent y, shaded between."""
     level: float | None = None
     """A thin horizontal line."""
     moments: Mapping[str, float] = field(default_factory=dict)

@@ -50,10 +50,10 @@ DARK_COLOURS = {
     "sky": "#9ad7ff",
     "grey": "#98a0a8",
 }
-"""The same hues, light enough for a dark page."""
+"""Colours of the series on a dark page: the same hues, lighter."""
 
 WIDTH_IN = 8.2
-"""Of all figures of a page [in]: 9 pt letters have the size of the page's small text at its full width."""
+"""Width of all figures of a page [in]: 9 pt letters have the size of the page's small text at its full width."""
 
 _KEPT = ("series-", "reference", "band")
 _PAPER = {"paper": "#ffffff", "card": "#f6f7f8", "accent": "#005a8c"}
@@ -112,7 +112,7 @@ class Bullets:
     kind: ClassVar[str] = "bullets"
     items: Sequence[ListItem]
     summary: str = ""
-    """As of a `Table`."""
+    """Title under which the list is folded away; "" to show it."""
 
     @classmethod
     def of(cls, texts: Sequence[str], summary: str = "") -> Bullets:

@@ -287,7 +287,7 @@ COLUMNS = (
     ),
     Column("longest", "s", 1, lambda result: result.run.lidar.longest_s if result.run.lidar else None, is_error=False),
 )
-"""Of accuracy tables, on pages and terminals."""
+"""Columns of accuracy tables, on pages and terminals."""
 
 _SQUARES = tuple(
     column

@@ -79,7 +79,7 @@ class PlottedRun:
         return poses if alignment is None else se2.compose(alignment, poses)
 
     def placed_points(self, points: FloatArray) -> FloatArray:
-        """The same for points (N, 2)."""
+        """Points (N, 2) of the run's world in the reference's plane where they are aligned to one, else as they are."""
         alignment = self.result.accuracy.reference_T_world if self.result.accuracy else None
         return points if alignment is None else se2.transform(alignment, points)
 
@@ -165,7 +165,7 @@ class Ellipse:
     semi_axes: tuple[float, float]
     """Larger first [m]."""
     angle: float
-    """Of the larger axis, from x [rad]."""
+    """Angle of the larger axis, from x [rad]."""
 
 
 def ellipse(pose: FloatArray, covariance: FloatArray, sigmas: float = 2.0) -> Ellipse:

@@ -59,7 +59,7 @@ _MIN_SPAN_S = 30.0
 _MIN_GAP_NS: Mapping[bool, int] = {True: 150_000_000, False: 9_000_000}
 """Least time between two events of one kind: of scans (True), and of wheels and IMU."""
 _MAX_POINTS = 1500
-"""Of a scan: with 800 scans in the window, 40 MB."""
+"""Most points of a scan that are kept: with 800 scans in the window, 40 MB."""
 _MAX_CPU_S = 300
 _LOWEST_PRIORITY = 19
 _NAME = "diagnosis"
@@ -146,7 +146,8 @@ class Health:
 
     @property
     def degeneracy(self) -> float | None:
-        """Of the last scan (`degeneracy`), computed on demand, for it takes longer than all the rest here."""
+        """Degeneracy of the last scan (`degeneracy`); None without a planar one. It is computed on demand, for it takes longer than all the
+        rest here."""
         return degeneracy(self._scan.points[:, :2]) if self._scan is not None and self._scan.is_planar else None
 
     @property
@@ -166,7 +167,7 @@ class Health:
         silent: Mapping[str, float] | None = None,
         troubles: Mapping[str, str] | None = None,
     ) -> list[Status]:
-        """Of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since the last message of
+        """Statuses of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since the last message of
         topics; ``troubles``: what cannot be written, and why."""
         of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline)]
         of_sensors += [_of_place(found)] if (found := pipeline.estimator.localization()) is not None else []

@@ -87,7 +87,7 @@ class EstimateLog:
 
     @property
     def descriptor(self) -> int:
-        """Of the file, to have it on disk before a state that counts on its rows."""
+        """Descriptor of the file, to have it on disk before a state that counts on its rows."""
         return self._file.fileno()
 
     def rows(self) -> tuple[IntArray, FloatArray]:

@@ -73,7 +73,7 @@ class Node:
         self._newest_ns = 0
         self._begin_ns: int | None = None
         self.statuses: list[Status] = []
-        """Of the last second."""
+        """Statuses that were published last, once a second."""
         self.is_paused = False
 
     @classmethod

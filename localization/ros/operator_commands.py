@@ -23,7 +23,7 @@ from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
 
 SET_POSE, INITIAL_POSE = "set_pose", "initialpose"
-"""As of robot_localization, and as of RViz and nav2."""
+"""Topics of a given pose: that of robot_localization, and that of RViz and nav2."""
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 RESET, PAUSE, TARE_PAYLOAD, PAYLOAD = "~/reset", "~/pause", "~/tare_payload", "~/payload"
 _TOPIC_TYPES = {

@@ -19,7 +19,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _POSITION_SIGMA_M = 0.02
-"""Of a payload's centre of mass, which is set by hand [m]."""
+"""Sigma of a payload's centre of mass, which is set by hand [m]."""
 
 
 @dataclass(frozen=True)

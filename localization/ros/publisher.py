@@ -106,7 +106,7 @@ class EstimatePublisher:
             self._publish_pose(estimate, stamp_ns)
 
     def publish_prediction(self, prediction: Estimate, stamp_ns: int) -> None:
-        """The same between estimates: odometry on a topic of its own, and the transforms."""
+        """Publish a prediction between estimates: odometry on a topic of its own, and the transforms."""
         self._publish_in_order(prediction, stamp_ns)
 
     def _publish_in_order(self, estimate: Estimate, stamp_ns: int, odometry: bytes | None = None) -> None:

@@ -137,7 +137,7 @@ class Session:
     ) -> None:
         self.state, self.name, self.health = state, name, Health()
         self.head = head
-        """Of the checkpoint that was resumed; empty for a new session."""
+        """Head of the checkpoint that was resumed; empty for a new session."""
         self._files, self._estimate_log, self._checkpoints, self._report = files, estimate_log, checkpoints, report
         self.troubles: dict[str, str] = {}
         """What cannot be written at present, and why."""

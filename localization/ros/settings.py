@@ -158,7 +158,7 @@ class LiveRun:
     node: NodeConfig = field(default_factory=NodeConfig)
 
     def resolve_topics(self) -> LiveRun:
-        """The same with all topics as namespace and remapping rules name them."""
+        """The run with all topics as namespace and remapping rules name them."""
         names = self.node.names
         return dataclasses.replace(self, robot=names.apply_to_robot(self.robot), topics=names.apply_to_overrides(self.topics))
 
@@ -216,7 +216,7 @@ class Parameter:
 
     name: str
     path: tuple[str, ...]
-    """Of the field in `ManagedNodeSettings`."""
+    """Path of the field in `ManagedNodeSettings`."""
     default: Value
     description: str
     constraint: str

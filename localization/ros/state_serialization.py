@@ -32,7 +32,7 @@ from localization.errors import CheckpointError
 
 PACKAGES = ("localization.", "motion_models.")
 KINDS = "biufc"
-"""Of numpy's types, those that are numbers."""
+"""Kinds of numpy's types that are numbers."""
 _PACKED_AT_LEAST = 8
 
 Json = Any
@@ -48,7 +48,7 @@ def serialize(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[byte
 
 
 def serialize_parts(value: Any, shared: Mapping[str, Any] | None = None) -> tuple[bytes, list[bytes]]:
-    """The same with the bytes array by array: who writes megabytes of them need not copy them once more."""
+    """``value`` as JSON, and the bytes of its arrays one by one: who writes megabytes of them need not copy them once more."""
     writer = _Writer(shared or {})
     root = writer.put(value)
     text = json.dumps({"root": root, "objects": writer.objects, "arrays": writer.arrays}, separators=(",", ":"), allow_nan=False)

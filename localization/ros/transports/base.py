@@ -87,12 +87,12 @@ class MonotonicTime:
     _epoch_ns: int | None = None
 
     def now_ns(self) -> int:
-        """As `Transport.now_ns`."""
+        """Time of the operating system's monotonic clock [ns]."""
         return time.monotonic_ns()
 
     @property
     def epoch_ns(self) -> int:
-        """As `Transport.epoch_ns`, read once: a wall clock that is set meanwhile moves nothing."""
+        """What turns the monotonic clock into the wall clock's time [ns], read once: a wall clock that is set meanwhile moves nothing."""
         if self._epoch_ns is None:
             self._epoch_ns = time.time_ns() - time.monotonic_ns()
         return self._epoch_ns
@@ -122,23 +122,23 @@ class SimTimeTransport:
         transport.subscribe(CLOCK, CLOCK_TYPE, is_latched=False)
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """As the wrapped transport's."""
+        """Receive ``topic`` by the wrapped transport."""
         self._transport.subscribe(topic, kind, is_latched=is_latched)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
-        """As the wrapped transport's; /clock stays."""
+        """Receive only these of the topics subscribed to, by the wrapped transport; /clock stays."""
         self._transport.restrict([*topics, CLOCK], urgent)
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
-        """As the wrapped transport's."""
+        """Open ``topic`` for `publish`, by the wrapped transport."""
         self._transport.advertise(topic, kind, is_latched=is_latched)
 
     def publish(self, topic: str, data: bytes) -> None:
-        """As the wrapped transport's."""
+        """Send a message by the wrapped transport."""
         self._transport.publish(topic, data)
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
-        """As the wrapped transport's."""
+        """Answer requests of ``kind`` by ``handler``, by the wrapped transport; False where it has no services."""
         return self._transport.offer_service(name, kind, handler)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -159,7 +159,7 @@ class SimTimeTransport:
         self._now_ns = clock.sec * 10**9 + clock.nanosec
 
     def publishers(self) -> Mapping[str, set[str]]:
-        """As the wrapped transport's, without /clock."""
+        """Types that others publish on the wrapped transport, by topic, without /clock."""
         return {topic: kinds for topic, kinds in self._transport.publishers().items() if topic != CLOCK}
 
     def now_ns(self) -> int:
@@ -172,5 +172,5 @@ class SimTimeTransport:
         return 0
 
     def close(self) -> None:
-        """As the wrapped transport's."""
+        """Leave the wrapped transport's network."""
         self._transport.close()

@@ -94,7 +94,7 @@ class DdsTransport(MonotonicTime):
         self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _latched_output())
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """As `Transport.subscribe`: transient local and reliable where ``is_latched``, else best effort."""
+        """Receive ``topic``: transient local and reliable where ``is_latched``, else best effort."""
         quality = _latched() if is_latched else _sensor_data()
         reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
@@ -103,7 +103,7 @@ class DdsTransport(MonotonicTime):
         self._publish_graph()
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
-        """As `Transport.restrict`."""
+        """Receive only these of the topics subscribed to, from now on; `take` returns at once for those that are ``urgent``."""
         for topic, _, is_new in self._readers:
             if topic not in topics:
                 self._waiting.detach(is_new)
@@ -113,12 +113,12 @@ class DdsTransport(MonotonicTime):
         self._publish_graph()
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
-        """As `Transport.advertise`: reliable, and transient local where ``is_latched``."""
+        """Open ``topic`` for `publish`: reliable, and transient local where ``is_latched``."""
         self._writers[topic] = self._writer(_dds_name(topic), kind, _latched_output() if is_latched else _reliable())
         self._publish_graph()
 
     def publish(self, topic: str, data: bytes) -> None:
-        """As `Transport.publish`; a reader that is too slow loses the message."""
+        """Send a message on a topic that was advertised; a reader that is too slow loses it."""
         _write(self._writers[topic], data)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -140,7 +140,7 @@ class DdsTransport(MonotonicTime):
         return [received for _, received in found]
 
     def publishers(self) -> Mapping[str, set[str]]:
-        """As `Transport.publishers`, by what came since the last call."""
+        """Types that others publish, by topic, among what came since the last call."""
         found: dict[str, set[str]] = {}
         for publication in self._found.read(1000):
             if publication.sample_info.instance_state != dds.InstanceState.Alive:
@@ -151,7 +151,7 @@ class DdsTransport(MonotonicTime):
         return found
 
     def close(self) -> None:
-        """As `Transport.close`."""
+        """Leave the network. No other method may be called afterwards."""
         self._readers.clear()
         self._writers.clear()
         self._topics.clear()
@@ -388,7 +388,7 @@ def _xml(general: str, peers: Sequence[str]) -> str:
 
 
 def _static_peers(environment: Mapping[str, str]) -> list[str]:
-    """Of ROS_STATIC_PEERS, which are parted by semicolons."""
+    """Addresses in ROS_STATIC_PEERS, where semicolons separate them."""
     return [peer.strip() for peer in environment.get("ROS_STATIC_PEERS", "").split(";") if peer.strip()]
 
 

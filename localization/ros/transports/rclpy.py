@@ -63,7 +63,7 @@ class RclpyTransport(MonotonicTime):
         self._services: list[Any] = []
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """As `Transport.subscribe`: transient local and reliable where ``is_latched``, else best effort."""
+        """Receive ``topic``: transient local and reliable where ``is_latched``, else best effort."""
         q = self._qos
         quality = q.QoSProfile(
             depth=_LATCHED_DEPTH if is_latched else _LATEST,
@@ -77,18 +77,18 @@ class RclpyTransport(MonotonicTime):
         self._subscriptions[topic] = self._node.create_subscription(_interface_class(kind), topic, on_message, quality, raw=True)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
-        """As `Transport.restrict`; none is urgent, for `take` waits for no batch."""
+        """Receive only these of the topics subscribed to, from now on; none is urgent, for `take` waits for no batch."""
         for topic in set(self._subscriptions) - set(topics):
             self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
-        """As `Transport.advertise`: reliable, and transient local where ``is_latched``."""
+        """Open ``topic`` for `publish`: reliable, and transient local where ``is_latched``."""
         q = self._qos
         latched = q.QoSProfile(depth=1, reliability=q.ReliabilityPolicy.RELIABLE, durability=q.DurabilityPolicy.TRANSIENT_LOCAL)
         self._writers[topic] = self._node.create_publisher(_interface_class(kind), topic, latched if is_latched else _DEPTH)
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
-        """As `Transport.offer_service`; always offered."""
+        """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; always True."""
 
         def answer(request: Any, response: Any) -> Any:
             reply = handler(getattr(request, "data", True))
@@ -100,7 +100,7 @@ class RclpyTransport(MonotonicTime):
         return True
 
     def publish(self, topic: str, data: bytes) -> None:
-        """As `Transport.publish`."""
+        """Send a message on a topic that was advertised."""
         self._writers[topic].publish(data)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -121,7 +121,7 @@ class RclpyTransport(MonotonicTime):
         return {topic: kinds for topic, kinds in found.items() if kinds}
 
     def close(self) -> None:
-        """As `Transport.close`; a node that was given lives on."""
+        """Leave the network; a node that was given lives on."""
         self.release()
         self._executor.remove_node(self._node)
         self._executor.shutdown()

@@ -58,7 +58,7 @@ class RospyTransport(MonotonicTime):
         self._writers: dict[str, tuple[Any, type[Any]]] = {}
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """As `Transport.subscribe`; a latched message comes to whoever subscribes."""
+        """Receive ``topic``; a latched message comes to whoever subscribes."""
 
         def on_message(message: Any) -> None:
             self._received.put(Received(topic, time.monotonic_ns(), message._buff))
@@ -66,17 +66,17 @@ class RospyTransport(MonotonicTime):
         self._subscribers[topic] = self._rospy.Subscriber(topic, self._bytes_type(kind), on_message, queue_size=_LATEST, tcp_nodelay=True)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
-        """As `Transport.restrict`; none is urgent, for `take` waits for no batch."""
+        """Receive only these of the topics subscribed to, from now on; none is urgent, for `take` waits for no batch."""
         for topic in set(self._subscribers) - set(topics):
             self._subscribers.pop(topic).unregister()
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
-        """As `Transport.advertise`."""
+        """Open ``topic`` for `publish`; the last message is kept for later subscribers where ``is_latched``."""
         made = self._bytes_type(kind)
         self._writers[topic] = self._rospy.Publisher(topic, made, queue_size=10, tcp_nodelay=True, latch=is_latched), made
 
     def publish(self, topic: str, data: bytes) -> None:
-        """As `Transport.publish`."""
+        """Send a message on a topic that was advertised."""
         writer, made = self._writers[topic]
         message = made()
         message._buff = data
@@ -93,11 +93,11 @@ class RospyTransport(MonotonicTime):
             return found
 
     def publishers(self) -> Mapping[str, set[str]]:
-        """As `Transport.publishers`, by the master; types are named as in ROS 2."""
+        """Types that others publish, by topic, as the master lists them; they are named as in ROS 2."""
         return {topic: {_ros2_name(kind)} for topic, kind in self._master.getPublishedTopics("/") if topic not in self._writers}
 
     def close(self) -> None:
-        """As `Transport.close`."""
+        """Shut the ROS node down. No other method may be called afterwards."""
         self._rospy.signal_shutdown("done")
 
     def _bytes_type(self, kind: str) -> type[Any]:

@@ -65,7 +65,7 @@ class ZenohTransport(MonotonicTime):
         self._discovery = self._session.liveliness().declare_subscriber(tokens, self._on_token, history=True)
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """As `Transport.subscribe`: with the history of late publishers where ``is_latched``."""
+        """Receive ``topic``: with the history of late publishers where ``is_latched``."""
         key = f"{self._domain}{topic}/{_dds_type(kind)}/*"  # any hash: that of Humble is none
 
         def on_sample(sample: Any) -> None:
@@ -85,14 +85,14 @@ class ZenohTransport(MonotonicTime):
         self._subscribers[topic] = [subscriber, self._session.liveliness().declare_token(self._token("MS", topic, kind, quality))]
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
-        """As `Transport.restrict`."""
+        """Receive only these of the topics subscribed to, from now on; `take` returns at once for those that are ``urgent``."""
         self._urgent = frozenset(urgent)
         for topic in set(self._subscribers) - set(topics):
             for declared in self._subscribers.pop(topic):
                 declared.undeclare()
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
-        """As `Transport.advertise`: with a cache of one message where ``is_latched``."""
+        """Open ``topic`` for `publish`: with a cache of one message where ``is_latched``."""
         token = self._token("MP", topic, kind, _LATCHED.format(1) if is_latched else _RELIABLE.format(_DEPTH))
         key = f"{self._domain}{topic}/{_dds_type(kind)}/{type_hash(kind)}"
         cache = ext.CacheConfig(1) if is_latched else None
@@ -100,7 +100,7 @@ class ZenohTransport(MonotonicTime):
         self._writers[topic] = _Writer(publisher, self._session.liveliness().declare_token(token), token)
 
     def publish(self, topic: str, data: bytes) -> None:
-        """As `Transport.publish`."""
+        """Send a message on a topic that was advertised."""
         self._writers[topic].put(data)
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
@@ -117,7 +117,7 @@ class ZenohTransport(MonotonicTime):
             return [received for _, received in sorted(found, key=lambda entry: entry[0])]
 
     def publishers(self) -> Mapping[str, set[str]]:
-        """As `Transport.publishers`, by the liveliness tokens of other sessions."""
+        """Types that others publish, by topic, by the liveliness tokens of other sessions."""
         found: dict[str, set[str]] = {}
         with self._lock:
             entries = list(self._published.values())
@@ -127,7 +127,7 @@ class ZenohTransport(MonotonicTime):
         return found
 
     def close(self) -> None:
-        """As `Transport.close`."""
+        """Close the session. No other method may be called afterwards."""
         self._session.close()
 
     def _drop_oldest(self) -> None:
@@ -190,7 +190,7 @@ def _dds_type(kind: str) -> str:
 
 
 def _configuration(endpoint: str) -> Any:
-    """As rmw_zenoh's default session: a peer without multicast that discovers others through the router."""
+    """Configuration as of rmw_zenoh's default session: a peer without multicast that discovers others through the router."""
     if path := os.environ.get("ZENOH_SESSION_CONFIG_URI"):
         return zenoh.Config.from_file(path)
     config = zenoh.Config()
