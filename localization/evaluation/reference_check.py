@@ -114,7 +114,8 @@ class _Comparison:
         if self.bend is not None and self.bend < _MIRRORED:
             found.append(
                 f"{name}: its path turns opposite to the sensors': its axes are mirrored, as of NED (x north, y east) or a left-handed"
-                " system. Swap x and y, or invert y and the heading."
+                " system, or the robot's left and right wheels are swapped. If the wheels are right, swap x and y, or invert y and the"
+                " heading."
             )
         elif self.turn is not None and self.turn < _MIRRORED:
             found.append(f"{name}: its headings turn opposite to the sensors', its path does not: they count clockwise. Invert them.")

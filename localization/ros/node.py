@@ -173,6 +173,8 @@ class Node:
             if now >= next_poll:
                 next_poll = now + _POLL_S
                 on_poll(self)
+        self._publish_status()  # what stays latched is the last map
+        self._publish_overview(float("inf"))
 
     def finish(self) -> int | None:
         """Write the output and the last state; returns how many estimates there were, if an output was wanted."""
