@@ -50,6 +50,6 @@ class EstimateTable:
 
 
 def trajectory(stamps_ns: IntArray, table: FloatArray) -> Trajectory:
-    """Of stamps (N,) and rows (N, 25), with covariances if all poses have one."""
+    """Trajectory of stamps (N,) and rows (N, 25), with covariances if all poses have one."""
     covariances = np.array(table[:, COV]).reshape(-1, 3, 3)
     return Trajectory(np.array(stamps_ns), np.array(table[:, POSE]), covariances if np.isfinite(covariances).all() else None)

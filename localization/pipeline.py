@@ -214,7 +214,7 @@ class Run:
 _PARAMETERS_EVERY_NS = 2_000_000_000
 """Time between two samples of the estimated parameters, in `Run.parameter_history`."""
 _EQUAL_CHARACTERS = 60
-"""Of warnings of one fault: its time and kind, up to the numbers."""
+"""Number of first characters that are equal in warnings of one fault: its time and kind, up to the numbers."""
 
 
 def warnings_of(runs: Iterable[Run]) -> list[str]:

@@ -22,7 +22,7 @@ from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 _NEWTON_STEPS = 50
-"""Of the inverse; commands that have a solution take under ten."""
+"""Most Newton steps of the inverse; commands that have a solution take under ten."""
 _CONVERGED = 1e-12
 """Error of the inverse [m/s, rad/s], over 1 + the command: rounding."""
 

@@ -26,7 +26,7 @@ from motion_models.se2 import FloatArray
 _GRID_X, _GRID_Y = 0.15, 0.05
 """Half widths of the CG grid for the polynomials, over wheelbase and track. VaultBot's arms reach 0.17 and 0.05 (Ebersole 2016)."""
 _POINTS_X, _POINTS_Y = 7, 5
-"""Of that grid: twice as many as the polynomials have degrees."""
+"""Points of the CG grid along x and y: twice as many as the polynomials have degrees."""
 _CENTER_X, _CENTER_Y = 0.10, 0.05
 """Standard deviations of the CoR at the nominal CG, over wheelbase and track: errors of CG and tracked point. VaultBot's
 rotations have their CoR 0.12 wheelbases behind its weighed CG (Ebersole 2016, 4.22)."""
@@ -170,7 +170,7 @@ class ScalingPrior(NamedTuple):
     sigma: float
     """Its standard deviation."""
     sigma_after_turning: float
-    """The same after `_CALIBRATION_TURN_S` of turning: k sqrt(yaw variance per radian / turned angle)."""
+    """Standard deviation of k after `_CALIBRATION_TURN_S` of turning: k sqrt(yaw variance per radian / turned angle)."""
     source: str
     """Source of k."""
 

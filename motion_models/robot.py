@@ -22,11 +22,11 @@ from motion_models.text_files import read_text
 Section = TypeVar("Section")
 
 _LARGEST = 1e9
-"""Of any number of a robot, in SI units; the largest that robots have are stiffnesses and inertias of 1e6."""
+"""Largest number of a robot, in SI units; the largest that robots have are stiffnesses and inertias of 1e6."""
 _LONGEST_M = 100.0
-"""Of a length of a robot [m]; the largest mining vehicles have 20."""
+"""Largest length of a robot [m]; the largest mining vehicles have 20."""
 _MOST_CHARACTERS = 1 << 20
-"""Of a robot file; the longest that is shipped has 1,200."""
+"""Most characters of a robot file; the longest that is shipped has 1,200."""
 _MOST_DOTS = 200
 """In one line of a robot file: the names of a dozen wheels with their namespaces have fewer."""
 _LARGEST_CLOCK_OFFSET_S = 10.0
@@ -60,7 +60,7 @@ class Geometry:
     left_wheel_radius_multiplier: float = 1.0
     """Rolled distance of the left wheels over `wheel_radius_m` times their angle, as in ROS's diff_drive_controller."""
     right_wheel_radius_multiplier: float = 1.0
-    """The same of the right wheels."""
+    """Rolled distance of the right wheels over `wheel_radius_m` times their angle."""
 
     @property
     def radius_multipliers(self) -> FloatArray:
@@ -125,7 +125,7 @@ class Joints:
     angle_unit_rad: float = 1.0
     """Radians per unit of the positions: 0.0174533 for degrees, 2 pi over the counts of a turn for ticks, 1 over the radius for metres."""
     rate_unit_rad_s: float = 1.0
-    """The same of the velocities: 0.10472 for revolutions per minute, 0.0174533 for degrees per second."""
+    """Radians per second per unit of the velocities: 0.10472 for revolutions per minute, 0.0174533 for degrees per second."""
     angle_range: float = 0.0
     """Range after which the positions wrap, in their own unit: 65536 for counters of 16 bits. 0: a full turn of the wheel."""
 

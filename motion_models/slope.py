@@ -18,7 +18,7 @@ class Slope:
     downhill: FloatArray
     """(..., 2) gravity along the ground over that normal to it, in the body's x and y: its length is the tangent of the tilt [-]."""
     cg_height: float
-    """Of the centre of gravity above the ground [m]."""
+    """Height of the centre of gravity above the ground [m]."""
 
     @classmethod
     def from_up(cls, up: FloatArray, cg_height: float) -> Slope:

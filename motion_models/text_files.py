@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 
 _MOST_BYTES = 64 << 20
-"""Of a robot file, URDF or SRDF [B]; the largest URDFs of humanoids have 1 MB, their meshes are other files."""
+"""Largest size of a robot file, URDF or SRDF [B]; the largest URDFs of humanoids have 1 MB, their meshes are other files."""
 
 
 def check_file(path: str | Path) -> None:

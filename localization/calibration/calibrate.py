@@ -63,7 +63,7 @@ class Calibrated:
     position_known: BoolArray
     """(M,) whether the position was measured, not only the heading."""
     heldout: HeldOut | None
-    """The same by fits without the maneuver's group; None for too few groups to leave any out."""
+    """Errors of the poses, each predicted by a fit without the maneuver's group; None for too few groups to leave any out."""
     systematic: dict[str, float]
     """Sigma by parameter that no number of maneuvers averages out: the gyro's scale, and how bodies follow their wheels."""
     noise: LearnedNoise
@@ -288,9 +288,9 @@ def _least_error(residuals: FloatArray) -> float:
 
 
 _CLOCK_SIGMA_S = 0.008
-"""Of the wheels' clock by models without inertia: a simulated Husky's is 9 ms off (`diagnose` tolerates as much)."""
+"""Sigma of the wheels' clock by models without inertia: a simulated Husky's is 9 ms off (`diagnose` tolerates as much)."""
 _FINEST_ERROR = 1e-4
-"""Of a position [m] or heading [rad]; what the best references resolve."""
+"""Smallest error of a position [m] or heading [rad]: what the best references resolve."""
 _NO_SLIP = WheelNoise(*(0.0,) * 8)
 _NO_DISTANCE = "headings alone were measured, and no distance: record a LiDAR or a reference with positions to reveal it."
 

@@ -31,7 +31,8 @@ _SURE_WAY_M, _MAX_S, _MAX_SCANS = 1.0, 60.0, 1200
 _SCANS_PER_RESULT = 10  # after that way
 _MIN_COHERENCE = 0.9
 _MAX_SLIDE_RAD = math.radians(20.0)
-"""As in the sensor check of the direction of travel: no slide of 99.9 % of the windows of three buildings is larger."""
+"""Largest angle between the ways by wheels and LiDAR that a slide explains [rad], as in the sensor check of the direction of travel: no
+slide of 99.9 % of the windows of three buildings is larger."""
 _SNAP_RAD = math.radians(4.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that."""
 _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
@@ -45,14 +46,14 @@ class LidarYaw:
     """What was found, in a sentence."""
     frame: str
     mount: Mount | None
-    """As it is used in place of the log's; None where other causes are as likely."""
+    """The mount that is used in place of the log's; None where other causes are as likely."""
     is_certain: bool = False
     """More driving would not change it."""
 
 
 @dataclass
 class _Travel:
-    """Of one LiDAR: its motion, interval by interval."""
+    """Motion of one LiDAR, interval by interval."""
 
     odometry: ScanOdometry = field(default_factory=ScanOdometry)
     begin_ns: int = 0

@@ -45,11 +45,12 @@ _RANGE_STEP_M = 0.2
 """Added to all ranges, and taken off, for the scene's derivative [m]. In a hall the derivative is 2 to 4 mm per metre, and its own noise
 3 mm at 0.05 m, 0.7 mm at 0.2 m and 0.6 mm at 0.4 m."""
 _REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.02, 0.01
-"""Of poses of a reference without covariances: about those of RTK-GPS with two antennas; motion capture is better."""
+"""Sigma of position and heading of a reference without covariances [m, rad]: about those of RTK-GPS with two antennas; motion capture is
+better."""
 _FINEST_SIGMA = 1e-4
-"""Of a position [m] or heading [rad]: what the best references resolve, whatever their covariance."""
+"""Smallest sigma of a position [m] or heading [rad]: what the best references resolve, whatever their covariance."""
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])
-"""Of a robot whose wheels stand: a micrometre and a microradian [m^2, m^2, rad^2]."""
+"""Covariance of the motion of a robot whose wheels stand: a micrometre and a microradian [m^2, m^2, rad^2]."""
 
 
 @dataclass(frozen=True)

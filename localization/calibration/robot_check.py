@@ -34,16 +34,16 @@ Verdict = Literal["ok", "contradiction", "cannot be seen"]
 _STANDING_S = 3.0
 """Before the first motion, for the gyro's bias [s]."""
 _REPLAYED_S = 75.0
-"""Of the drive that the filter is run on [s]: a minute of driving and what stands before it."""
+"""Length of the drive that the filter is run on [s]: a minute of driving and what stands before it."""
 _SAME_SCALE = 0.15
 """Relative difference of a radius from the measured one: tyres under load and slip straight ahead change it by up to 7 %, and motion from
 scan to scan errs by some percent."""
 _MIN_SCALE_INTERVALS, _MIN_LIKENESS = 12, 0.97
 """Intervals of 0.5 s, and cosine between the ways, from which on a scale is measured: of scans that slide along a corridor it is lower."""
 _MAX_YAW_DEG = 5.0
-"""Of a LiDAR against the direction of travel; robots slide by a few degrees."""
+"""Largest yaw of a LiDAR against the direction of travel [deg]; robots slide by a few degrees."""
 _MAX_TILT_RAD = math.radians(10.0)
-"""Of gravity against the IMU's mount: floors and ramps."""
+"""Largest tilt of gravity against the IMU's mount [rad]: floors and ramps."""
 _MAX_BIAS_RAD_S = 0.02
 _MAX_CLOCK_S, _MAX_CLOCK_SIGMA_S = 0.1, 0.1
 """Offset that is named, and sigma at which none can be seen [s]; drivers and radios have latencies of up to 0.1 s."""
@@ -55,7 +55,7 @@ _LAGS_S = tuple(float(lag) for lag in np.arange(-60.0, 60.5, 0.5))
 """Clock offsets of a reference that are tried [s]: GPS time is 18 s ahead."""
 _SAME_WAY, _MIN_REFERENCE_LIKENESS, _SURE_LIKENESS = 1.4, 0.7, 0.95
 _MAX_ODD_SHARE = 0.02
-"""Of a topic's messages or time."""
+"""Largest share of a topic's messages or time that may be out of order or missing."""
 _CHORD_STEPS = 10
 """Intervals (5 s) over which a reference's displacement is compared: GPS errs by decimetres from fix to fix."""
 _TURN_AND_STRAIGHT = "drive straight on for 10 s and turn in place both ways for 10 s each"
@@ -67,7 +67,7 @@ class CheckRow:
 
     quantity: str
     value: str
-    """As robot file or log have it."""
+    """Value of the quantity, as robot file or log have it."""
     second_source: str
     """What it was compared with, and what that measured."""
     verdict: Verdict
@@ -84,7 +84,7 @@ class RobotCheck:
     duration_s: float
     rows: tuple[CheckRow, ...]
     params: tuple[float, ...]
-    """Of the model `model_of`, as the log measured them."""
+    """Parameters of the model `model_of`, as the log measured them."""
     sigmas: dict[str, float]
     """By parameter."""
     scan_topic: str = ""

@@ -95,7 +95,7 @@ class Survey:
     frames: Mapping[str, str]
     """Frame of the first message of each sensor's topic."""
     mounts: Mapping[str, Mount]
-    """Of the log's fixed transforms."""
+    """Mounts by frame, of the log's fixed transforms."""
     other_wheels: str | None = None
     """Topic of a Twist or of /tf that has the wheels' motion."""
 

@@ -26,17 +26,18 @@ from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
 STEP_S = 0.5
-"""Of an interval: latencies of drivers (up to 0.1 s) are small against it."""
+"""Length of an interval [s]: latencies of drivers (up to 0.1 s) are small against it."""
 _MAX_MOVING_S, _MAX_READ_S = 120.0, 900.0
 """Time after the wheels' first motion, and in all, that is read [s]."""
 _MIN_SCAN_INTERVALS = 12
 """With a motion from scan to scan; fewer are of scans that do not match."""
 _MOVED = 0.02
-"""Of an angle or rate, in any unit that practice has: above the noise of rates at standstill."""
+"""Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
 _MAX_LIDAR_S = 60.0
-"""Of scans [s]; registering one takes some milliseconds."""
+"""Time from the wheels' first motion in which scans are used [s]; registering one takes some milliseconds."""
 _GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2, _MAX_TILT_COSINE = 20, 8.0, 12.0, 0.87
-"""As in `localization.gyro`: where the mean specific force of the first samples shows that the mount is wrong."""
+"""Number of first samples, bounds of their mean specific force, and its cosine to the mount's vertical below which the mount is wrong, as
+in `localization.gyro`."""
 _JUMP_FACTOR = 8.0
 """Increment of a position over the 97th percentile of all, from which on it is a reset or a counter that wrapped."""
 

@@ -14,16 +14,16 @@ from motion_models.robot import DIFF_DRIVE, Joints, Robot
 from motion_models.se2 import FloatArray
 
 CORRECTED = "Corrected in this run; write to the robot file:"
-"""Of sentences about what is certain, before keys of the robot file."""
+"""Words in sentences about what is certain, before keys of the robot file."""
 MAX_RATIO = 2.5
 """Factor by which wheels may be off without a wrong unit: slip, a wrong radius or track, as in the sensor checks."""
 _DEG = math.pi / 180.0
 _GYRO_IN_DEGREES = (25.0, 130.0)
 """Factor of a gyro in deg/s (57.3), with the factor of 2.3 by which wheels may be off on loose floor."""
 _SIGMA_BY_SPEED, _SIGMA_BY_TURN, _SIGMA_BY_MESSAGE = 0.1, 0.3, 0.03
-"""Of the logarithm of a unit: by a measured speed (radius), by the gyro (k, track), by positions of the same messages."""
+"""Sigma of the logarithm of a unit: by a measured speed (radius), by the gyro (k, track), by positions of the same messages."""
 _SIGMAS = 1.5
-"""Of a unit's name: beyond, a gear is as likely."""
+"""Largest distance of a measured unit from a unit with a name, in sigmas: beyond, a gear is as likely."""
 _MIN_CORRELATION = 0.9
 _MIN_INTERVALS = 12
 _FASTEST_M_S = 3.0
@@ -53,7 +53,7 @@ class _Unit:
 
     value: float
     sigma: float
-    """Of its logarithm."""
+    """Sigma of the logarithm of ``value``."""
     source: str
     by_gyro: bool
 

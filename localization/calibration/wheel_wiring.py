@@ -68,7 +68,7 @@ class WiringReport:
     """What was found, and the robot with which to go on."""
 
     robot: Robot
-    """As in the file, with what is certain corrected, and a wide covariance for what is not."""
+    """The robot of the file, with what is certain corrected, and a wide covariance for what is not."""
     findings: tuple[str, ...] = ()
     """One sentence for each contradiction."""
     keys: Mapping[str, str] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class WiringReport:
     """Wheels and another sensor contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
     that, and the gyro is not to be used."""
     correlations: Mapping[str, float] = field(default_factory=dict)
-    """Of the wheels' turn and speed with each source, as the robot file has them."""
+    """Correlation of the wheels' turn and speed with each source, as the robot file has them."""
     ratios: Mapping[str, float] = field(default_factory=dict)
     """Measured over expected motion, by what was compared."""
 
@@ -234,7 +234,7 @@ def correlation(a: FloatArray, b: FloatArray, least: float, max_bias: float) -> 
 
 
 def correlations(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> dict[str, float]:
-    """Of speed and yaw rate by the wheels with each source that moves enough."""
+    """Correlations of speed and yaw rate by the wheels with each source that moves enough."""
     mean, difference = _signed(rates, wiring)
     found: dict[str, float] = {}
     for name, turn in signals.turns.items():

@@ -31,7 +31,7 @@ class PlainConsole(Console):
     """A console that prints control characters, which could move the cursor, set the title or hide a line, as question marks."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """As `Console.render`, without control characters."""
+        """Segments of ``renderable`` as by `Console.render`, without control characters."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=_COMMANDS.sub("\N{REPLACEMENT CHARACTER}", segment.text))
 

@@ -147,7 +147,7 @@ class Compare:
 
 
 def places(out: Path) -> tuple[Path, Path]:
-    """Of the table and of the report: in the folder ``out``, or ``out`` itself and beside it."""
+    """Paths of the table and of the report: in the folder ``out``, or ``out`` itself and beside it."""
     if out.is_dir() or not out.suffix:
         return out / "table.csv", out / "report.html"
     return out, out.with_suffix(".html")

@@ -75,7 +75,7 @@ class Init:
     mass_kg: float | None = None
     """Mass of the robot [kg]."""
     wheel_separation_multiplier: float | None = None
-    """Of the robot's own driver: by how much it takes the track to be wider than it is."""
+    """Factor of the robot's own driver, by which it takes the track to be wider than it is."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     calibrate: bool = False
     """Calibrate on this log at once, and write ROBOT_calibrated.toml besides."""

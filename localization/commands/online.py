@@ -47,14 +47,14 @@ class Online(OnlineSettings):
     log: tyro.conf.Positional[Path | None] = None
     """A log to run from, instead of live topics."""
     rate: str = "1"
-    """Of the log: times as fast as it was recorded, or `max`."""
+    """Speed at which the log runs: times as fast as it was recorded, or `max`."""
     view: Literal["terminal", "rerun"] = "terminal"
     """Live picture: in the terminal, or in rerun's viewer as well (extra `viz`)."""
     view_file: Path | None = None
     """New .rrd file to record rerun's picture to, instead of opening its viewer."""
     transport: Annotated[TransportName, tyro.conf.arg(aliases=["--door"])] = "auto"
-    """Of live topics: ROS 2 by DDS itself (extra `ros2`), by rclpy, or by zenoh (extra `zenoh`, experimental); ROS 1 by rospy. `auto`:
-    rclpy where it is sourced, else DDS."""
+    """Transport of live topics: ROS 2 by DDS itself (extra `ros2`), by rclpy, or by zenoh (extra `zenoh`, experimental); ROS 1 by rospy.
+    `auto`: rclpy where it is sourced, else DDS."""
     domain: int | None = None
     """ROS 2 domain (transports dds and zenoh); by default that of ROS_DOMAIN_ID, or 0."""
     interface: str | None = None

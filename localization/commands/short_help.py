@@ -26,7 +26,7 @@ class Option:
 
     @property
     def flag(self) -> str:
-        """As it is typed."""
+        """The option or positional argument as it is typed."""
         return self.name.upper() if self.is_positional else "--" + self.name.replace("_", "-")
 
 

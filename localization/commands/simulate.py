@@ -35,7 +35,7 @@ class Simulate:
     robot: str = "vaultbot"
     """Name of a shipped robot, or path of a robot TOML file."""
     seed: int = 0
-    """Of all noise. The same seed gives the same log, byte for byte."""
+    """Seed of all noise. The same seed gives the same log, byte for byte."""
     effect: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="ID=SIZE", help=_EFFECTS)] = ()
     """Difference of the robot from its file; may be given several times."""
     config: SimulationConfig = field(default_factory=SimulationConfig)

@@ -30,13 +30,13 @@ _SLIPS: Mapping[str, float] = {
 }
 """Sigma of slips that grow with speed: their typical sizes, in their units; and of rotations that no friction model predicts."""
 _CG_SIGMA_M = 0.01
-"""Of the centre of gravity by robot files, with batteries and cables that these do not have."""
+"""Sigma of the centre of gravity by robot files [m], with batteries and cables that these do not have."""
 _LOG_STIFFNESS_SIGMA = 1.0
-"""Of the logarithm of the slip stiffness, whatever the floor: a factor of 3 either way."""
+"""Sigma of the logarithm of the slip stiffness, whatever the floor: a factor of 3 either way."""
 _STIFFNESS_EXPONENT_SIGMA = 0.5
-"""Of the power with which the stiffness grows with speed: 0 for tyres by way, 1 for contacts by rate (`friction_response`)."""
+"""Sigma of the power with which the stiffness grows with speed: 0 for tyres by way, 1 for contacts by rate (`friction_response`)."""
 _PASSING = frozenset({"gyro_bias", "slope"})
-"""Of one drive alone."""
+"""Causes of one drive alone, which the baseline does not have."""
 
 
 def estimate_baseline(drive: Drive, model: MotionModel) -> Baseline:

@@ -343,11 +343,11 @@ _CAUSES = (
 CAUSES: Mapping[str, Cause] = {cause.id: cause for cause in _CAUSES}
 """All causes that hold for the whole of a drive, by id."""
 STIFFNESS_EXPONENT = "stiffness_exponent"
-"""Of a healthy drive alone (`weigh.stiffness_exponent_cause`): how slow turns differ from fast ones."""
+"""Id of the cause of a healthy drive alone (`weigh.stiffness_exponent_cause`): how slow turns differ from fast ones."""
 
 
 _MAX_NARROWING = 0.8
-"""Of the track of a robot with casters, as a share of it."""
+"""Largest narrowing of the track of a robot with casters, as a share of it."""
 _TOLERATED_LOAD = 0.01
 """Share of the robot's mass that is tolerated as payload: over the front edge it moves the centre of gravity of the robots that come with
 skidloc by 1 to 5 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""

@@ -85,7 +85,7 @@ class DiagnosisConfig(Settings):
     moments: Count = 7
     """Number of moments at which a change of the floor is tried."""
     seed: Seed = 0
-    """Of the random numbers in tests and intervals."""
+    """Seed of the random numbers in tests and intervals."""
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ class Attribution(NamedTuple):
     cause: str
     size: float
     share: float
-    """Of the row's whitened squares."""
+    """Share of the row's whitened squares that the cause accounts for."""
     is_named: bool
     """Whether it is a finding; otherwise it is within its tolerance."""
 
@@ -152,7 +152,7 @@ class Component:
     """Along what a part follows that no cause has, where that makes the row unexplained."""
 
     def with_status(self, status: RowStatus, attributions: tuple[Attribution, ...]) -> Component:
-        """The same row, attributed."""
+        """The row with this status and these attributions."""
         return dataclasses.replace(self, status=status, attributions=attributions)
 
     def to_dict(self) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def model_error_log_odds(predictor: DrivePredictor, linearization: Linearization
 
 
 def _twice_log_evidence(y: FloatArray, columns: FloatArray) -> float:
-    """Of ``y`` (n,) ~ N(0, A A^T + 1) with ``columns`` A (n, k), but for what does not depend on A."""
+    """Twice the log evidence of ``y`` (n,) ~ N(0, A A^T + 1) with ``columns`` A (n, k), but for what does not depend on A."""
     factor = np.linalg.cholesky(columns.T @ columns + np.eye(columns.shape[1]))
     half = np.linalg.solve(factor, columns.T @ y)
     return float(half @ half) - 2.0 * float(np.log(np.diagonal(factor)).sum())

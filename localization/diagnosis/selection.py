@@ -341,7 +341,7 @@ def _cost(linearization: Linearization, sizes: dict[Cause, float], rows: FloatAr
 
 
 def _regression_of(linearization: Linearization, rows: FloatArray, signatures: FloatArray) -> Regression:
-    """Of other ``rows`` (M, 6) and ``signatures`` (M, 6, p) in the same noise."""
+    """Regression of other ``rows`` (M, 6) and ``signatures`` (M, 6, p) in the same noise."""
     return make_regression(rows, signatures, linearization.nuisances, linearization.noise, linearization.causes, linearization.tolerance)
 
 

@@ -62,7 +62,7 @@ PRIOR_SIGMAS: Mapping[str, float] = {
 
 Scrub cannot be negative: its prior is cut there (see `_truncated`)."""
 _SLIP_STIFFNESS_SIGMA = 0.3
-"""Of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
+"""Sigma of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
 _MAX_PRIOR_SIGMAS = 4.0
 """Beyond it a size is held: steps of Gauss-Newton may be too long for the friction model."""
 _SYSTEMATIC_SIGMAS_M = (0.0015, 0.003)
@@ -331,7 +331,7 @@ def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredict
 
 
 def _noise_ratio(predictor: DrivePredictor, linearization: Linearization) -> float:
-    """Of x, y and yaw, the median over the windows."""
+    """Measured noise over that of the covariances: median of x, y and yaw over the windows; 1 where there is none."""
     claimed = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2))
     known = np.isfinite(linearization.rows[:, :3]) & (claimed > 0.0) & np.isfinite(claimed)
     return float(np.median((linearization.noise.sigmas[:, :3] / np.where(known, claimed, 1.0))[known])) if known.any() else 1.0

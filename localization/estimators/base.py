@@ -167,7 +167,8 @@ class Estimator(ABC):
 _SLIP_LASTS_S = 1.0
 """Noise of the wheels is that of slip that lasts, not of single steps: over a shorter step it is the twist's noise over this time."""
 _TWIST_FLOOR = np.diag([3e-3, 3e-3, 2e-3]) ** 2
-"""Of every twist [m^2/s^2, m^2/s^2, rad^2/s^2]: a robot whose wheels stand rocks on its tyres by 1 mm/s and 1 mrad/s (simulated)."""
+"""Covariance added to every twist [m^2/s^2, m^2/s^2, rad^2/s^2]: a robot whose wheels stand rocks on its tyres by 1 mm/s and 1 mrad/s
+(simulated)."""
 CHANGE_SHARE = 0.5
 """Sigma of the change of the twist within a step, by wheel rates that are means over their own interval."""
 

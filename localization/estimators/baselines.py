@@ -32,7 +32,7 @@ class DeadReckoning(Estimator):
         self._pose, self._cov, self._by_cg = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 2))
 
     def step(self, step: Step) -> Estimate:
-        """As `Estimator.step`."""
+        """The pose by the wheels at the end of the step, with its covariance."""
         motion = step.predicted
         A = se2.adjoint(se2.inverse(motion.delta))
         self._pose = se2.compose(self._pose, motion.delta)
@@ -65,7 +65,7 @@ class LidarOdometry(Estimator):
         self._n_scans = 0
 
     def step(self, step: Step) -> Estimate:
-        """As `Estimator.step`."""
+        """The pose by KISS-ICP at the end of the step, without covariance."""
         if step.scan is not None:
             frame, c = step.scan.frame_id, self._config
             mount = self._used.setdefault(frame, self._mounts.get(frame, Mount()))
@@ -83,9 +83,9 @@ class LidarOdometry(Estimator):
         return Estimate(step.end_ns, self._pose, None, self._twist, None)
 
     def counts(self) -> Mapping[str, int]:
-        """As `Estimator.counts`."""
+        """Number of scans so far, as "scans"."""
         return {"scans": self._n_scans}
 
     def map_points(self) -> Points2:
-        """As `Estimator.map_points`."""
+        """(M, 2) points of KISS-ICP's map in the world [m]."""
         return NO_POINTS if self._kiss is None else self._kiss.point_cloud()[:, :2]

@@ -39,8 +39,8 @@ _MAX_NUMBER = 1e12
 _MIN_INFORMATION = 30.0
 """Information about the factor on the wheels' noise, at least: that of ten scans."""
 _MAX_NOISE_SCALE = 20.0
-"""As of `calibrate`. The least is 1: slip lasts, and what fits the innovation of one scan is too small for the sum of many (ACES with a
-least scale of 1/4 for each axis: 0.099 -> 0.138 m)."""
+"""Largest factor on the wheels' noise, as of `calibrate`. The least is 1: slip lasts, and what fits the innovation of one scan is too small
+for the sum of many (ACES with a least scale of 1/4 for each axis: 0.099 -> 0.138 m)."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class FilterConfig(Settings):
     standstill_m2_per_s: float = 1e-6
     """Variance of the position while no wheel moves, per second: a push, a slope [m^2/s]."""
     standstill_rad2_per_s: float = 1e-6
-    """The same for the yaw [rad^2/s]."""
+    """Variance of the yaw while no wheel moves, per second: a push, a slope [rad^2/s]."""
 
 
 class Filter:

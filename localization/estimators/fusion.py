@@ -33,9 +33,10 @@ _PRIOR_SCANS = 0.2
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
 
 _MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
-"""Of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2, rad^2]."""
+"""Covariance of the pose of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2,
+rad^2]."""
 _MIN_CLOCK_OFFSET_S = 0.05
-"""Of a warning: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
+"""Smallest offset of the wheels' clock with a warning [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
 
 
 class EkfFusion(Estimator):
@@ -170,7 +171,7 @@ class EkfFusion(Estimator):
 
     @property
     def gyro_calibration(self) -> GyroCalibration | None:
-        """As `Estimator.gyro_calibration`."""
+        """Bias and scale of the gyro by the filter; None where it was not used in the last step."""
         ekf = self.filter
         if ekf.turn_innovation is None:
             return None
@@ -178,11 +179,11 @@ class EkfFusion(Estimator):
 
     @property
     def residuals(self) -> Residuals:
-        """As `Estimator.residuals`."""
+        """Residuals of the last step."""
         return Residuals(self.filter.turn_innovation, self._file_delta)
 
     def learned_parameters(self) -> Sequence[LearnedParameter]:
-        """As `Estimator.learned_parameters`."""
+        """The motion model's parameters that are corrected, against the robot file."""
         ekf, nominal = self.filter, dict(zip(self.model.param_names, self.model.nominal, strict=True))
         sigmas, priors = np.sqrt(np.diagonal(ekf.P)[PARAMS:]), self.corrections.sigmas
         return [
@@ -193,7 +194,7 @@ class EkfFusion(Estimator):
         ]
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """As `Estimator.parameters`."""
+        """Mean and sigma of what the filter estimated besides the pose, by name."""
         ekf, found = self.filter, {}
         sigmas = np.sqrt(np.diagonal(ekf.P))
         if self._has_gyro:
@@ -209,7 +210,7 @@ class EkfFusion(Estimator):
         return found
 
     def counts(self) -> Mapping[str, int]:
-        """As `Estimator.counts`."""
+        """Number of occurrences by name: scans, matched, searched, and those of lost scans by cause."""
         return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
 
     def warnings(self) -> list[str]:
@@ -225,7 +226,7 @@ class EkfFusion(Estimator):
         ]
 
     def map_points(self) -> Points2:
-        """As `Estimator.map_points`."""
+        """(M, 2) points of the map in the world [m]; none without a LiDAR."""
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
 
 

@@ -59,7 +59,7 @@ class GraphConfig(Settings):
     keyframe_distance_m: Positive = 1.0
     """A keyframe follows when the robot has moved this far [m]."""
     keyframe_angle_rad: Positive = 0.5
-    """The same for turns [rad]."""
+    """A keyframe follows when the robot has turned this far [rad]."""
     antenna_x_m: Signed = 0.0
     """Where the antenna of `--positions` sits, ahead of the body's origin [m]; estimated within half a metre."""
     antenna_y_m: Signed = 0.0
@@ -273,7 +273,7 @@ class GraphFusion(Estimator):
         return Trajectory(filtered.stamps_ns, *through_nodes(odom, np.array(self._covs_since).reshape(-1, 3, 3), nodes, poses, covs))
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """As `Estimator.parameters`."""
+        """Mean and sigma of what was estimated besides the pose, by name: by the filter, and radius and lever arm by the graph."""
         found = dict(self.odometry.parameters())
         if self.odometry.wheel_radius_sigma:
             mean, cov = self.graph.corrections()
@@ -284,14 +284,15 @@ class GraphFusion(Estimator):
         return found
 
     def counts(self) -> Mapping[str, int]:
-        """As `Estimator.counts`."""
+        """Number of occurrences by name: those of the filter, keyframes, loops and positions."""
         found = {**self.odometry.counts(), "keyframes": self.graph.count}
         if self.lost is not None:
             found["loops"] = self.n_loops
         return {**found, "positions": self.n_positions} if self.n_positions else found
 
     def warnings(self) -> list[str]:
-        """As `EkfFusion.warnings`, and positions that could not be used, or contradict the other sensors."""
+        """Problems of the measurements so far: those of the filter, and positions that could not be used, or contradict the other
+        sensors."""
         found, n = [*self.odometry.warnings(), *([self._failure] if self._failure else [])], len(self._positions) + len(self._waiting)
         if n and not self.n_positions:
             found.append(
@@ -307,7 +308,7 @@ class GraphFusion(Estimator):
         return found
 
     def keyframe_map(self) -> KeyframeMap | None:
-        """As `Estimator.keyframe_map`."""
+        """Keyframes as they can be saved; None before the first. Poses are smoothed after `finish`."""
         keys, edges = self._loops.keyframes, [between for update in self.graph.updates for between in update.betweens]
         if not keys:
             return None
@@ -326,7 +327,7 @@ class GraphFusion(Estimator):
         )
 
     def occupancy(self) -> Grid | None:
-        """As `Estimator.occupancy`."""
+        """The map as a grid with free space, in the frame of the poses; None without points."""
         keys = self._loops.keyframes
         if not any(len(key.points) for key in keys):
             return None

@@ -134,7 +134,7 @@ class MapFusion(Estimator):
         self.run_deferred()
 
     def localization(self) -> Mapping[str, Any]:
-        """As `Estimator.localization`."""
+        """State, probability and places in the saved map so far, as JSON holds them."""
         places = [] if self.localizer.state == "localized" else self.localizer.hypotheses[:_LISTED_PLACES]
         return {
             "state": self.localizer.state,
@@ -147,15 +147,15 @@ class MapFusion(Estimator):
         }
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """As `Estimator.parameters`."""
+        """Mean and sigma of what the filter estimated besides the pose, by name."""
         return self.odometry.parameters()
 
     def counts(self) -> Mapping[str, int]:
-        """As `Estimator.counts`."""
+        """Number of occurrences by name, as the filter counts them."""
         return self.odometry.counts()
 
     def warnings(self) -> list[str]:
-        """As `EkfFusion.warnings`, and for how long the place in the map was not known."""
+        """Problems of the measurements so far: those of the filter, and for how long the place in the map was not known."""
         found, total = list(self.odometry.warnings()), sum(self._seconds.values())
         state, unknown = self.localizer.state, self._seconds["lost"]
         if self._first_s is None and self._has_key:

@@ -14,7 +14,8 @@ from localization.maps.keyframe_map import KeyframeMap
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 """Grey values of map_server and nav2."""
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
-"""Of (255 - grey) / 255, for readers of the image. map_server's 0.196, and not nav2's 0.25: by that, 205 (0.1961) would be read as free."""
+"""Thresholds of (255 - grey) / 255, for readers of the image. map_server's 0.196, and not nav2's 0.25: by that, 205 (0.1961) would be read
+as free."""
 
 
 def exports(grid: Grid, mapped: KeyframeMap) -> dict[str, bytes]:

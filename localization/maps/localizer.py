@@ -55,7 +55,7 @@ it is found again where the map goes on."""
 _INITIAL_KEYFRAMES = 10
 """Keyframes after which a given pose that no scan confirms is dropped."""
 INITIAL_COV = np.diag([0.5, 0.5, 0.26]) ** 2
-"""Of a pose that a person gives [m^2, m^2, rad^2]: the default of RViz's tool for /initialpose."""
+"""Covariance of a pose that a person gives [m^2, m^2, rad^2]: the default of RViz's tool for /initialpose."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,12 +22,12 @@ from localization.maps.keyframe_map import KeyframeMap
 from localization.output import whole_file
 
 VERSION = 1
-"""Of the format. It grows when a reader of the version before could not use the file."""
+"""Version of the format. It grows when a reader of the version before could not use the file."""
 _FORMAT, _HEADER = "skidmap", "skidmap.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of all members: the earliest that a zip can hold."""
 _MAX_BYTES = 1 << 31
-"""Of all arrays when unpacked: 2 GiB are 250 million points."""
+"""Largest size of all arrays when unpacked [B]: 2 GiB are 250 million points."""
 _MAX_HEADER_BYTES = 1 << 24
 _DAMAGE = (
     zipfile.BadZipFile,

@@ -21,7 +21,7 @@ from motion_models.compiled import kernel, subroutine
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 CELL_M = 0.1
-"""Of the search's image and of the grid that divides space into walls, free and unknown [m]."""
+"""Cell of the search's image and of the grid that divides space into walls, free and unknown [m]."""
 _SURFACE_CELL_M = 0.08
 """Voxel of the surfaces that scans are aligned with [m]."""
 _CERTAINLY_FREE = 0.125
@@ -41,7 +41,7 @@ _MAX_PLACES = 12
 _NEAR = math.exp(-0.5 * 1.5**2)
 """Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
 _ALIGN_COV = np.diag([0.1, 0.1, 0.03]) ** 2
-"""Of a searched pose, from which scans are aligned [m^2, m^2, rad^2]."""
+"""Covariance of a searched pose, from which scans are aligned [m^2, m^2, rad^2]."""
 
 
 @dataclass(frozen=True, eq=False)

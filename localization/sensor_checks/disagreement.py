@@ -26,7 +26,7 @@ _MAX_SQUARE, _MAX_MEAN_SQUARE = 25.0, 10.0
 """Mean over 5 s of the squared distance between the wheels' motion and the estimate's, in sigmas, each at most 5 sigma; 3 is expected.
 1.4 % of the time of CSAIL and 3.9 % of fr079 are above, none of ACES and simulated laps."""
 _SCAN_NOISE = np.diag([0.02, 0.02, 0.01]) ** 2
-"""Of the motion from scan to scan [m^2, m^2, rad^2]."""
+"""Covariance of the motion from scan to scan [m^2, m^2, rad^2]."""
 _NS = 1e-9
 
 
@@ -80,9 +80,9 @@ class _Episode(NamedTuple):
     begin_s: float
     end_s: float
     difference: FloatArray
-    """(3,) of the motion by the wheels from that by the estimate."""
+    """(3,) difference of the motion by the wheels from that by the estimate [m, m, rad]."""
     mean_square: float
-    """Of the last 5 s, in sigmas."""
+    """Mean squared distance of both motions over the last 5 s, in sigmas."""
 
     @property
     def seconds(self) -> float:
@@ -107,7 +107,7 @@ class MotionDistance:
 
     @property
     def difference(self) -> FloatArray | None:
-        """Of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
+        """Difference of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
         return None if self._motions is None else se2.log(se2.between(self._motions[1], self._motions[0]))
 
     def add(self, step: Step, delta: FloatArray, nis: float | None) -> None:

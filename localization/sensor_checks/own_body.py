@@ -19,9 +19,9 @@ LIDAR_OWN_BODY = Fault(
 )
 
 _MIN_OWN_SHARE = 0.05
-"""Of a scan's points, from where on they are reported."""
+"""Share of a scan's points on the robot itself, from where on they are reported."""
 _MIN_BODY_SHARE = 0.01
-"""The same, from where on they are left out."""
+"""Share of a scan's points on the robot itself, from where on they are left out."""
 _BODY_BEARINGS = 360
 _MAX_BODY_RANGE_M = 1.0
 """Parts of a robot of 1 m are nearer to its LiDAR."""

@@ -18,7 +18,7 @@ from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray, Points2, Pose2
 
 _BEARINGS = 180
-"""Of 2 deg: each has a beam of any scanner in use, however its beams lie to the bins."""
+"""Number of bearings of a profile, each 2 deg wide: each has a beam of any scanner in use, however its beams lie to the bins."""
 _BIN_RAD = 2.0 * np.pi / _BEARINGS
 _MIN_BEARINGS = 30
 """Filled bearings of a profile, of `_BEARINGS`; fewer leave the turn ambiguous."""
@@ -31,7 +31,7 @@ _FIRST_SCALE_M, _LAST_SCALE_M = 0.5, 0.05
 """Scale of the robust loss (Cauchy), annealed [m]."""
 _INLIER_M, _MIN_INLIERS = 0.1, 0.5
 _MAX_DISTANCE_M = 1.0
-"""Of a point from its associated one."""
+"""Largest distance of a point from its associated one, along each axis [m]."""
 _MIN_STRUCTURE = 0.05
 """Smallest eigenvalue of the mean of n n^T over the normals; rooms have 0.3 and more, corridors at most 0.011 (measured)."""
 _DAMPING = 1e-3

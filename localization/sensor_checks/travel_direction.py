@@ -26,7 +26,7 @@ _MAX_SLIDE_RAD = math.radians(20.0)
 """Directions that no slide explains are compared over seconds: 99.9 % of the windows of CSAIL, fr079 and ACES are below 17 deg. Windows
 of 3 s would take a time for a turned LiDAR in which the wheels of fr079 count backwards as forwards (6 s, ATE .13 -> .18 m)."""
 _MIN_TRAVEL_M = 0.05
-"""Of wheels and LiDAR in a bin, for its direction to count."""
+"""Least way by the wheels, and by the LiDAR, in a bin whose direction counts [m]."""
 _MIN_TRAVEL_BINS = 6
 _MAX_CURVATURE_RAD_M = 0.6
 """Sharper turns slide sideways."""

@@ -39,8 +39,8 @@ _NAMED_WITHIN_S = 10.0
 _BIN_S = 0.25
 _WINDOWS_S = (2.0, 10.0, 60.0)
 _MAX_SIGMAS = 4.5
-"""Of the sum of innovations over a window: 7e-6 by chance, one of 60 hours. Simulated drives of six robots have at most 4.0, the Husky
-outdoors 1.0; gyros with a range of 20 deg/s or a jump of the bias, and encoders that lose 30 % have 4.3 and more."""
+"""Largest sum of innovations over a window, in sigmas: 7e-6 by chance, one of 60 hours. Simulated drives of six robots have at most 4.0,
+the Husky outdoors 1.0; gyros with a range of 20 deg/s or a jump of the bias, and encoders that lose 30 % have 4.3 and more."""
 _FLOOR_RAD = 0.01
 """Turn of a standing robot that no model has: tyres that relax, someone who leans on it [rad]."""
 _MIN_LEARNED_SIGMAS = 4.0
@@ -53,7 +53,7 @@ _TURNING = ("k_0", "wheel_separation_multiplier", "rotation_scale")
 _MATCHED_S = 2.0
 """Scans that were matched so recently hold the pose, whatever wheels and gyro do [s]."""
 _MAX_CLIPPED_SIGMAS = 3.0
-"""The same where the gyro's rates end at a value."""
+"""Largest sum of innovations over a window, in sigmas, where the gyro's rates end at a value."""
 _OTHER = {"left": "right", "right": "left"}
 _REPEATED_RAD_S, _MIN_REPEATED_S, _MIN_CLIPPED_RAD_S = 1e-9, 0.5, 0.05
 """Rates that are equal to the last digit, for so long, and far from zero, are the end of the gyro's range."""
@@ -99,7 +99,7 @@ class TurnConsistency:
         self._has_moved = False
         self._matched_s = -math.inf
         self._begin: tuple[float, Pose2, Pose2] | None = None
-        """Of the present episode: its time [s], and both poses (3,) there."""
+        """Beginning of the present episode: its time [s], and both poses (3,) there."""
 
         self._reported: dict[Fault, _Reported] = {}
 

@@ -53,7 +53,8 @@ _MIN_RATE_RAD_S = 0.001
 """Root mean square of the slower turn rate, from where on signs are compared: none of 65 windows of the Husky outdoors, straight or not,
 has a correlation below -0.3."""
 _MIN_EXCITED_RAD_S = 0.03
-"""The same for the scale: above it all windows have correlations of 0.8 and more (Husky outdoors, 32 windows; simulated laps)."""
+"""Root mean square of the slower turn rate, from where on the scale is compared [rad/s]: above it all windows have correlations of 0.8 and
+more (Husky outdoors, 32 windows; simulated laps)."""
 _MIN_T = 4.0
 """Student's t of a correlation that is no chance."""
 _OPPOSITE_CORRELATION, _EQUAL_CORRELATION = -0.6, 0.6

@@ -31,7 +31,7 @@ class Chassis(NamedTuple):
     scrub: float
     warp: float
     height: float
-    """Of the CG above the floor [m]."""
+    """Height of the CG above the floor [m]."""
     gravity: float
     """Normal to the floor [m/s^2]."""
     creep: float

@@ -101,7 +101,7 @@ class Pursuit:
 
     @property
     def length(self) -> float:
-        """Of the route [m]."""
+        """Length of the route [m]."""
         return float(self._along[-1])
 
     def command(self, pose: FloatArray) -> FloatArray | None:

@@ -69,9 +69,9 @@ class GpsConfig(Settings):
     drift_s: Positive = 60.0
     """Its correlation time [s]."""
     latitude_deg: Annotated[float, Allowed("from -89 to 89", lambda value: abs(value) <= 89.0)] = 30.2888
-    """Of the world's origin [deg]."""
+    """Latitude of the world's origin [deg]."""
     longitude_deg: Signed = -97.7354
-    """Of the world's origin [deg]."""
+    """Longitude of the world's origin [deg]."""
 
 
 _MEAN_SPELL_S = 0.3  # of an encoder's loss of counts

@@ -22,7 +22,7 @@ _YAW = ("yaw_rad2_per_rad", "yaw_rad2_per_m", "floor_rad2_per_s")
 _MIN_POSES = 20
 """Measured poses below which a variance is not learned: its relative error is sqrt(2 / n)."""
 _FACTOR_BOUNDS = (0.05, 20.0)
-"""Of a variance against the robot file's. Calibrated Huskies on floor and snow differ by 10 (`WheelNoise`)."""
+"""Bounds of the factor of a variance against the robot file's. Calibrated Huskies on floor and snow differ by 10 (`WheelNoise`)."""
 _QUANTILE, _CHI_SQUARE = 0.75, 1.3233
 """Quantile of the normalized squared errors that is matched, and its value for one degree of freedom: a quarter of the errors may be wrong
 matches. Of fr079's positions by scan matching a tenth is beyond four sigma, and the median is that of the usual noise."""
@@ -135,9 +135,9 @@ class LearnedNoise:
     """Factors by which the variances of a robot's wheel noise explain the errors; 1 where too little was measured."""
 
     yaw: float
-    """Of `yaw_rad2_per_rad`, `yaw_rad2_per_m` and `floor_rad2_per_s`."""
+    """Factor of `yaw_rad2_per_rad`, `yaw_rad2_per_m` and `floor_rad2_per_s`."""
     position: float
-    """Of the longitudinal and lateral ones, and of `floor_m2_per_s`."""
+    """Factor of the longitudinal and lateral variances, and of `floor_m2_per_s`."""
 
     def scaled(self, noise: WheelNoise) -> WheelNoise:
         """``noise`` with its variances multiplied, to three digits: a variance is known no better."""

@@ -23,7 +23,7 @@ from motion_models.se2 import FloatArray
 Loss = Literal["linear", "huber", "cauchy"]
 
 _STEPS = 60
-"""Of Levenberg-Marquardt; fits of real logs take under 20."""
+"""Most steps of Levenberg-Marquardt; fits of real logs take under 20."""
 _LEAST_MOTION = (0.05, 0.05)  # m, rad; below, encoders' resolution and the reference's noise are as large
 _UNMEASURED = 1e6  # m^2 or rad^2
 _SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0

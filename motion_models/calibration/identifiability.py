@@ -74,7 +74,7 @@ def weaknesses(
 
 
 def _sparse(rows: FloatArray) -> FloatArray:
-    """The same row space (m, c) by Gauss-Jordan elimination: each unobservable parameter gets a row of its own."""
+    """Rows (m, c) of the same space as ``rows``, by Gauss-Jordan elimination: each unobservable parameter gets a row of its own."""
     rows = rows.copy()
     for i in range(len(rows)):
         row, column = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])

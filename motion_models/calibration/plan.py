@@ -37,14 +37,14 @@ FREE_OF_TURNS: Mapping[str, tuple[str, ...]] = {
     "full_linear": ("wz_left", "wz_right"),
     "friction": ("mu_ratio",),
 }
-"""The same where only headings are measured, as by a gyro."""
+"""Parameters fitted where only headings are measured, as by a gyro."""
 FREE_OF_ROTATIONS: Mapping[str, tuple[str, ...]] = {
     "diff_drive": ("wheel_separation_multiplier",),
     "icr": ("y_icr_left", "x_icr", "y_icr_right"),
     "full_linear": ("wz_left", "vy_left", "vx_left", "wz_right", "vx_right", "vy_right"),
     "friction": ("tracked_x", "warp", "track_width", "scrub"),
 }
-"""The same for a table of rotations in place."""
+"""Parameters fitted to a table of rotations in place."""
 
 _SIZES = {"k_1": 1.0, "wheel_radius_scale": 0.05}
 """What counts as large where the nominal value is small only because the robot is symmetric; see `FitConfig.sizes`."""

@@ -72,7 +72,7 @@ class Delayed(NamedTuple):
 
 
 class HasTwist(Protocol):
-    """As much of a `MotionModel` as a prediction asks for."""
+    """The part of a `MotionModel` that a prediction needs."""
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""
@@ -119,7 +119,7 @@ def predict(
 
 
 def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The same motions of a point elsewhere on the body: lidar_T_body * motion * body_T_lidar."""
+    """Motions of a point elsewhere on the body: lidar_T_body * motion * body_T_lidar."""
     of_lidar = se2.compose(se2.compose(se2.inverse(body_T_lidar), poses), body_T_lidar)
     d = se2.adjoint(se2.inverse(body_T_lidar)) @ d
     by_mount = np.eye(3) - se2.adjoint(se2.inverse(of_lidar))  # right perturbation of the mount

@@ -131,7 +131,7 @@ class Regression:
 
     @property
     def standard_error(self) -> float:
-        """Of one observation about the fit."""
+        """Standard error of one observation about the fit."""
         return math.sqrt(self.residual_ss / self.residual_df)
 
     @property

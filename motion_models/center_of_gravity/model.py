@@ -81,7 +81,7 @@ class CgModel:
     weighed_poses: FloatArray
     """(b, 3, 4) rotations and translations of the bodies at the weighing, or (0, 3, 4)."""
     mass: float
-    """Of the whole robot with its payload [kg]."""
+    """Mass of the whole robot with its payload [kg]."""
 
     def cg(self, positions: FloatArray) -> FloatArray:
         """(..., 2) centre of gravity in the base's frame [m]."""
@@ -178,7 +178,7 @@ class _Posed(NamedTuple):
     cg: FloatArray
     """(2,) [m]"""
     mass: float
-    """Of all bodies [kg]."""
+    """Mass of all bodies [kg]."""
 
 
 @kernel

@@ -65,7 +65,7 @@ class CgEstimate:
     covariance: FloatArray
     """(2, 2) [m^2]."""
     mass: float
-    """Of the whole robot [kg]."""
+    """Mass of the whole robot [kg]."""
 
     def margin(self, wheelbase: float, track_width: float) -> float:
         """How far it lies inside the rectangle of the wheels' contacts [m]; below 0 the robot tips over."""

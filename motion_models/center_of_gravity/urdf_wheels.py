@@ -84,7 +84,7 @@ class WheelGeometry:
     wheelbase_m: float
     """Between the outermost axles; with one, from there to the casters."""
     mass_kg: float
-    """Of all links; NaN where what is fixed to the body has none."""
+    """Mass of all links [kg]; NaN where what is fixed to the body has none."""
     positions: Mapping[str, tuple[float, float]]
     """x, y of each wheel's contact in the body frame [m]."""
     cg: tuple[float, float] = (math.nan, math.nan)
@@ -92,7 +92,7 @@ class WheelGeometry:
     arms_kg: float = 0.0
     """Mass of links that move and are no wheels, which are not in ``cg``."""
     controllers: tuple[ControllerValues, ...] = ()
-    """Of <plugin> and <ros2_control>."""
+    """Values of controllers in <plugin> and <ros2_control>."""
     has_shapes: bool = True
     """Whether the wheels' cylinders or spheres give radius and contacts; else both are of joints alone."""
     radii: tuple[float, ...] = ()

@@ -24,7 +24,7 @@ from motion_models.se2 import FloatArray
 
 _THESIS_GYRATION_SQUARED = (0.43**2 + 0.27**2) / 12.0  # m^2; Appendix A's I / m
 _CLOSURE_STEPS = 12
-"""Of Newton's method for the loads, linear but for lifting wheels: each lifts once at most."""
+"""Most steps of Newton's method for the loads, linear but for lifting wheels: each lifts once at most."""
 
 
 class _Body(NamedTuple):

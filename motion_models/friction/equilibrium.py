@@ -45,7 +45,7 @@ class Loads(NamedTuple):
     slope_x: float = 0.0
     """Gravity along the ground ahead, over mu times that normal to it: the pull of a slope in units of friction's."""
     slope_y: float = 0.0
-    """The same to the left."""
+    """Gravity along the ground to the left, over mu times that normal to it."""
 
 
 class Balance(NamedTuple):
@@ -72,7 +72,7 @@ class Balance(NamedTuple):
 
 
 COLUMNS = 20
-"""Of `sensitivities`; the last three, from `_VX` on, are the balance's own derivatives by vx, vy, wz."""
+"""Number of columns of `sensitivities`; the last three, from `_VX` on, are the balance's own derivatives by vx, vy, wz."""
 _PULL, _SLOPE, _VX = 12, 15, 17
 MAX_EVALUATIONS = 30
 """Evaluations of the balance from one start before another way is tried."""

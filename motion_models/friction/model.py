@@ -60,7 +60,7 @@ _BALANCED = 1e-9
 _ENCLOSING = 40
 """Steps of up to 0.4 rad towards the goal: more than a whole turn."""
 _CLOSING = 100
-"""Of Chandrupatla's method, at worst halves: down to rounding from any interval."""
+"""Most steps of Chandrupatla's method, at worst halves: down to rounding from any interval."""
 _CLOSE_ANGLE = 1e-14
 """Rounding of an angle [rad]."""
 _MIN_STEP = 1e-3
