@@ -121,7 +121,7 @@ class Joints:
     right: tuple[str, ...] = ("front_right_wheel", "rear_right_wheel")
     """Wheels of the right side."""
     reversed: tuple[str, ...] = ()
-    """Those of both whose angles and rates are negative when the robot drives forward: motors mounted in mirror image."""
+    """Wheels of both sides whose angles and rates are negative when the robot drives forward: motors mounted in mirror image."""
     angle_unit_rad: float = 1.0
     """Radians per unit of the positions: 0.0174533 for degrees, 2 pi over the counts of a turn for ticks, 1 over the radius for metres."""
     rate_unit_rad_s: float = 1.0

@@ -57,7 +57,7 @@ class Calibrated:
     """(M, 3) predicted poses relative to the measured ones, by the robot file's own numbers [m, m, rad]; clock and mount that were fitted
     and that the robot file will not have are taken off, as in the errors of the fit."""
     inside: FloatArray
-    """(M, 3) the same by the fit, of the maneuvers that it was fitted to."""
+    """(M, 3) predicted poses relative to the measured ones by the fit [m, m, rad], of the maneuvers that it was fitted to."""
     group: IntArray
     """(M,) group of each."""
     position_known: BoolArray

@@ -58,7 +58,7 @@ class WheelSides:
     left: tuple[str, ...]
     right: tuple[str, ...]
     reversed: tuple[str, ...]
-    """Those of both whose rates are negative when driving forward."""
+    """Wheels of both sides whose rates are negative when driving forward."""
 
 
 @dataclass(frozen=True)

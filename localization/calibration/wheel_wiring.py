@@ -304,7 +304,7 @@ def _alternatives(signals: WheelSignals, base: Wiring) -> list[Wiring]:
 
 
 def _best(signals: WheelSignals, rates: FloatArray, wirings: Sequence[Wiring]) -> list[Wiring]:
-    """Those of the fewest changes with which every source agrees."""
+    """Wirings of the fewest changes with which every source agrees."""
     fitting = []
     for wiring in wirings:
         measured = correlations(signals, rates, wiring)

@@ -121,7 +121,7 @@ class Online(OnlineSettings):
         return seconds
 
     def _rest(self, events: Iterator[Event], done: int) -> Iterator[Event]:
-        """Those after the first ``done``. Raises `CheckpointError` where there are not so many."""
+        """Events after the first ``done``. Raises `CheckpointError` where there are not so many."""
         found = sum(1 for _ in islice(events, done))
         if found < done:
             raise CheckpointError(f"the state in '{self.state}' is of {done} events where the log has {found}. Remove it to start anew.")

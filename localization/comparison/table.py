@@ -60,7 +60,7 @@ class ResultTable:
             self._rows[_name(row)] = row
 
     def rows(self, jobs: Sequence[Job]) -> list[Row]:
-        """Those of ``jobs``, in their order, whatever the order in which they ended."""
+        """Rows of ``jobs``, in their order, whatever the order in which they ended."""
         names = [_name_of(job, trial) for job in jobs for trial in job.trials]
         return [self._rows[name] for name in names if name in self._rows]
 

@@ -119,7 +119,7 @@ def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = 
 
 
 def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Baseline | None = None) -> DiagnosisResult:
-    """The same, with what pictures, patches and other methods start from."""
+    """Diagnosis as by `diagnose`, with what pictures, patches and other methods start from."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)

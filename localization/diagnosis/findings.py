@@ -376,8 +376,8 @@ def unit_of(name: str) -> str:
 
 
 def correctable_findings(d: Diagnosis) -> list[Finding]:
-    """Those that a robot is corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing whose
-    size depends on one of these."""
+    """Findings that a robot is corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing
+    whose size depends on one of these."""
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
     contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
     contested |= {f.cause for f in estimated if not f.is_plausible}

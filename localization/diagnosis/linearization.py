@@ -204,7 +204,7 @@ class Linearization:
     rows: FloatArray
     """(M, 6) at the hypothesis."""
     linear: FloatArray
-    """(M, 6) the same, moved back to the robot file by the signatures."""
+    """(M, 6) discrepancies, moved back from the hypothesis to the robot file by the signatures."""
     signatures: FloatArray
     """(M, 6, p)"""
     nuisances: FloatArray

@@ -47,9 +47,9 @@ ESTIMATORS = ("odometry", "lidar", "ekf", "graph")
 LOCALIZER = "map"
 """The estimator that needs a saved map: the filter localized in it."""
 ESTIMATORS_WITH_CORRECTIONS = ("ekf", "graph", LOCALIZER)
-"""Those that correct the motion model on the way."""
+"""Estimators that correct the motion model on the way."""
 ESTIMATORS_WITH_MAP = ("graph", LOCALIZER)
-"""Those whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
+"""Estimators whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
 
 
 def check_estimator(name: str, has_lidar: bool, has_map: bool = False, no_wheels: str = "") -> None:

@@ -128,7 +128,7 @@ class Estimator(ABC):
 
     @property
     def residuals(self) -> Residuals | None:
-        """Those of the last step; None where measurements are not fused."""
+        """Residuals of the last step; None where measurements are not fused."""
         return None
 
     def learned_parameters(self) -> Sequence[LearnedParameter]:

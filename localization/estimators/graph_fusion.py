@@ -63,7 +63,7 @@ class GraphConfig(Settings):
     antenna_x_m: Signed = 0.0
     """Where the antenna of `--positions` sits, ahead of the body's origin [m]; estimated within half a metre."""
     antenna_y_m: Signed = 0.0
-    """The same, to its left [m]."""
+    """Where the antenna of `--positions` sits, to the left of the body's origin [m]; estimated within half a metre."""
 
 
 class GraphFusion(Estimator):

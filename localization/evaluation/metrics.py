@@ -107,7 +107,7 @@ class Accuracy:
     n_reference: int = 0
     """Usable samples (or relations) of the reference."""
     n_matched: int = 0
-    """Those that were scored."""
+    """Samples (or relations) of the reference that were scored."""
     n_dropped: int = 0
     """Samples that were not usable: not finite or of a repeated stamp."""
     overlap: float = 0.0

@@ -145,7 +145,7 @@ class LoopDetector:
 
 
 def _within_reach(place: Points2, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> FloatArray:
-    """Those of ``place`` (N, 2) where `search` with the same arguments can put ``points`` (M, 2): no larger image is needed."""
+    """Points of ``place`` (N, 2) where `search` with the same arguments can put ``points`` (M, 2): no larger image is needed."""
     moved = se2.transform(prior, points)
     half = np.minimum(3.0 * np.sqrt([np.trace(cov[:2, :2]), np.trace(cov[:2, :2]), cov[2, 2]]), limit)
     swept = half[:2] + half[2] * np.hypot(points[:, 0], points[:, 1]).max()

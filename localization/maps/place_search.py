@@ -56,7 +56,7 @@ class Place:
     in_free: float
     """Share of the points that lie in space that is free in the map; the others are where the map is unknown."""
     contradicting: float
-    """The same, of space that is free for certain (`_CERTAINLY_FREE`)."""
+    """Share of the points that lie in space that is free for certain (`_CERTAINLY_FREE`)."""
 
     @property
     def residual_variance(self) -> float:

@@ -330,7 +330,7 @@ def accuracy_tables(runs: Sequence[PlottedRun], best: PlottedRun | None, near: S
 
 
 def with_values(columns: Sequence[Column], results: Sequence[Result]) -> list[Column]:
-    """Those of ``columns`` in which any of ``results`` has a value."""
+    """The ``columns`` in which any of ``results`` has a value."""
     return [c for c in columns if any(c.value(result) is not None for result in results)]
 
 

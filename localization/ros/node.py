@@ -226,7 +226,7 @@ class Node:
 
     @property
     def topics(self) -> list[str]:
-        """Those in use."""
+        """Names of the topics in use."""
         return [source.topic for source in self._sources.used()]
 
     def rates(self) -> dict[str, float]:

@@ -28,7 +28,7 @@ class CovarianceInflation:
         self.ongoing: FloatArray | None = None
         """(3,) difference of a disagreement that lasts, of wheels and scans."""
         self.ongoing_turn: FloatArray | None = None
-        """(3,) the same of wheels and gyro."""
+        """(3,) difference of a disagreement that lasts, of wheels and gyro."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""

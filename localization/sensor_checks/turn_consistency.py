@@ -215,7 +215,7 @@ class _Window(NamedTuple):
 
     @classmethod
     def of(cls, bins: Sequence[_Bin], seconds: float) -> _Window | None:
-        """Those of the last ``seconds`` [s]; None where there are not enough."""
+        """Window of the last ``seconds`` [s]; None where there are not enough."""
         inside = [b for b in bins if b.end_s > bins[-1].end_s - seconds]
         if sum(b.seconds for b in inside) < 0.9 * seconds:
             return None

@@ -327,7 +327,7 @@ def _turns(joint: Joint) -> bool:
 
 
 def _on_ground(wheels: list[_Wheel], driven: Sequence[_Wheel]) -> list[_Wheel]:
-    """Those whose lowest point is below the lowest axle of those ``driven``: no flywheels, spare wheels, steering wheels and heads."""
+    """Wheels whose lowest point is below the lowest axle of those ``driven``: no flywheels, spare wheels, steering wheels and heads."""
     if not driven:
         return wheels
     assumed = 0.3 * _extent(wheel.position[1] for wheel in driven)  # radius of a wheel whose mesh alone is known
