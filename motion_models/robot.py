@@ -73,11 +73,11 @@ class Clock:
     """Offsets of the sensors' clocks: what happened at t is stamped t + offset. Stamps are corrected by them when messages are decoded."""
 
     wheel_time_offset_s: float = 0.0
-    """By how much the wheels' stamps are late."""
+    """By how much the wheels' stamps are late [s]."""
     lidar_time_offset_s: float = 0.0
-    """By how much the LiDAR's stamps are late."""
+    """By how much the LiDAR's stamps are late [s]."""
     gyro_time_offset_s: float = 0.0
-    """By how much the IMU's stamps are late."""
+    """By how much the IMU's stamps are late [s]."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any
 from motion_models.calibration.plan import MEANING
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.registry import MODELS
-from motion_models.robot import DRIVES, MODEL_OPTIONS, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
+from motion_models.robot import DRIVES, MODEL_OPTIONS, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -32,6 +32,7 @@ _SECTIONS: tuple[tuple[str, type[Any]], ...] = (
     ("mounts.FRAME", Mount),
     ("wheel_noise", WheelNoise),
     ("gyro_noise", GyroNoise),
+    ("clock", Clock),
     ("arms", Arms),
 )
 _HEAD = """# Robot files
