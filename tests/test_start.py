@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
-import pytest
-
-from skidloc.start import clash, main
+from skidloc.start import clash
 
 
-def test_start_beside_a_foreign_localization_names_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_start_beside_a_foreign_localization_names_it(tmp_path: Path) -> None:
     info = tmp_path / "localization-0.1.7.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: localization\nVersion: 0.1.7\n")
     (info / "RECORD").write_text("localization/__init__.py,,\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    assert main() == 2
-    assert "pip uninstall localization" in capsys.readouterr().err
+    code = f"import sys; sys.path.append({str(tmp_path)!r}); from skidloc.start import main; sys.exit(main())"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ended.returncode == 2
+    assert "pip uninstall localization" in ended.stderr
 
 
 def test_start_alone_finds_no_clash() -> None:

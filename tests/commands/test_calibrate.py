@@ -242,6 +242,7 @@ def in_place(cg: tuple[float, float]) -> tuple[float, float]:
     return float(wz * g.track_width_m / (4.0 * g.wheel_radius_m)), float(-vy / wz)
 
 
+@pytest.mark.extended
 def test_calibrate_by_reference_fits_the_change_with_the_cg(tmp_path: Path) -> None:
     cgs = [(x, 0.0) for x in (-0.06, -0.03, 0.0, 0.03, 0.06, 0.09)]
     wheels, cg, poses = drive(cgs)
@@ -384,6 +385,7 @@ def test_calibrate_of_several_tables_lists_each(tmp_path: Path, capsys: pytest.C
     assert "snow.csv" in printed
 
 
+@pytest.mark.extended
 def test_calibrate_of_drive_husky_windows_is_near_the_study(tmp_path: Path) -> None:
     """The DRIVE data set as a table: as well as the study that knows the data set, within 5 %."""
     path = tmp_path / "drive.csv"
@@ -541,6 +543,7 @@ def test_calibrate_with_bad_options_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert list(tmp_path.iterdir()) == [there]
 
 
+@pytest.mark.extended
 def test_calibrate_writes_the_clock_that_its_errors_are_without(tmp_path: Path) -> None:
     """Wheels stamped 90 ms early: calibrated again, the robot file has the errors that were promised for it."""
     log, first, second = (

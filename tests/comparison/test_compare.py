@@ -260,6 +260,7 @@ def test_compare_file_that_is_no_table_is_not_overwritten(tmp_path, capsys):
         assert "is no table of a comparison" in capsys.readouterr().err
 
 
+@pytest.mark.extended
 def test_compare_parquet_equals_csv_and_is_continued(table, tmp_path, asked):
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra 'parquet' is not installed")
     out = tmp_path / "table.parquet"

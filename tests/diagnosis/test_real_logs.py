@@ -61,6 +61,7 @@ def test_diagnose_84_runs_with_thesis_law_names_force_law() -> None:
     assert found.findings[0].gain.low > 0.5
 
 
+@pytest.mark.extended
 def test_diagnose_84_runs_with_isotropic_law_keeps_it() -> None:
     found = runs("isotropic")
     assert "lateral_force_law" not in {f.cause for f in found.findings} | {name for f in found.findings for name, _ in f.aliases}

@@ -176,6 +176,7 @@ def test_fused_log_same_estimates_give_same_bytes_and_one_file(tmp_path: Path) -
     assert [f.name for f in first.parent.iterdir()] == ["run.1.mcap"]
 
 
+@pytest.mark.extended
 def test_fused_log_ten_times_longer_uses_no_more_memory(tmp_path: Path) -> None:
     """Five times the estimates, made one at a time: more memory by less than a tenth of what the messages take."""
 

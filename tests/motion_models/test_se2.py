@@ -211,6 +211,7 @@ def test_se2_functions_leave_inputs_unchanged(a, b):
     assert np.array_equal(b, before[1])
 
 
+@pytest.mark.extended
 def test_jit_cache_of_parallel_processes_can_be_loaded(tmp_path):
     """Without a lock, two in three such starts end with a crash, and so does every later one."""
     shutil.copy(se2.__file__, tmp_path / "se2.py")

@@ -152,6 +152,7 @@ def test_node_that_is_killed_resumes_and_answers_every_scan(followed):
     assert len(live) >= 0.9 * len(followed.stamps)
 
 
+@pytest.mark.extended
 def test_node_listens_to_this_machine_only(followed):
     assert followed.addresses
     assert all("%lo:" in address or address.startswith("127.0.0.1") for address in followed.addresses)

@@ -89,6 +89,7 @@ def _wheels(count: int, first_ns: int = 0, period_ns: int = 20_000_000) -> list[
     return [WheelSample(first_ns + i * period_ns, np.zeros(2), np.zeros(2)) for i in range(count)]
 
 
+@pytest.mark.extended
 def test_doctor_tyres_differ_reports_remedy(tmp_path: Path) -> None:
     robot = load_robot("husky_a200")
     sensors = SensorConfig(scanner=ScannerConfig(rate_hz=5.0, beams=121))
@@ -170,6 +171,7 @@ def test_doctor_unexplained_drive_gets_no_remedy(tmp_path: Path) -> None:
     assert " set " not in status.message
 
 
+@pytest.mark.extended
 def test_doctor_process_receives_thinned_events() -> None:
     doctor = Doctor(ROBOT, "icr", {}, period_s=60.0, run=_echo)
     points = np.ones((40_000, 3))

@@ -147,6 +147,7 @@ def test_online_stopped_by_sigterm_leaves_its_last_state(replayed, tmp_path, cap
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
 
 
+@pytest.mark.extended
 def test_online_stopped_without_a_state_writes_its_estimates(replayed, tmp_path):
     out, estimate_log = tmp_path / "a.tum", tmp_path / ".a.tum.part"
     options = ("--robot", "vaultbot", "--rate", "2", "--out", out)

@@ -72,6 +72,7 @@ def end(process):
 
 
 @with_ros
+@pytest.mark.extended
 def test_rospy_node_follows_a_played_bag(ros, tmp_path):
     bag = tmp_path / "drive.bag"
     write_simulation(bag, Simulation(DRIVE, ROBOT, 0, {}, SimulationConfig()))

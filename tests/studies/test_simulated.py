@@ -32,6 +32,7 @@ def test_rotations_by_scan_matching_reproduce_the_regressions(measured):
     assert np.abs(z).max() < 3.0
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("simulated_grid")
 def test_rotations_by_scan_matching_are_within_their_sigmas(measured):
     """Against the vehicle at constant rates: what is left is measurement. 68 values of each: the RMS of z is 1 to within 0.3 or smaller."""
@@ -62,6 +63,7 @@ def test_skid_steer_on_hard_turns_wins_as_in_the_thesis(drives):
         assert drives[trajectory].wins("simulated") >= 6
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("simulated_controllers")
 def test_skid_steer_on_gentle_arcs_does_not_win(drives):
     for trajectory in ("arc_1", "arc_2", "arc_4"):
