@@ -17,6 +17,8 @@ from motion_models.errors import SkidlocError
 
 HUSKY = Path(__file__).parent / "data" / "husky-outdoor-gps" / "test1.bag"
 
+pytestmark = pytest.mark.xdist_group("api")
+
 
 @pytest.fixture(scope="module")
 def log() -> skidloc.RobotLog:

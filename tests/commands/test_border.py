@@ -94,6 +94,7 @@ def test_writers_cover_each_command() -> None:
     assert {arguments[0] for arguments in WRITERS.values()} == set(COMMANDS)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("writer", WRITERS)
 @pytest.mark.parametrize("size", [0, 3000])
 def test_full_disk_is_a_message_and_leaves_no_file(

@@ -124,6 +124,7 @@ def shifted_slope(bag: Path) -> tuple[float, float]:
     return misfit(best)[1], float(best)
 
 
+@pytest.mark.extended
 def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = run(
         tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml"

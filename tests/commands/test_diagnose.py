@@ -92,6 +92,7 @@ def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float]
     assert errors["after"] < 0.6 * errors["before"]
 
 
+@pytest.mark.extended
 def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """diff_drive has no parameter for either: the file's [geometry] and [clock] hold them for every model."""
     log = bag(tmp_path / "drive.mcap", {"wheel_radius_difference": 0.04, "wheel_time_offset": 0.06}, 1, "husky_a200")

@@ -178,6 +178,7 @@ def test_diagnose_nonlinear_cause_has_its_size(diagnosed: Diagnosed) -> None:
     assert len(found.findings) == 1
 
 
+@pytest.mark.extended
 def test_diagnose_wet_patch_is_unexplained(diagnosed: Diagnosed) -> None:
     found = diagnosed({}, 433, route="slippery_patch")
     assert found.verdict == "unexplained"

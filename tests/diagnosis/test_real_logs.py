@@ -53,6 +53,7 @@ def runs(contact: str) -> Diagnosis:
     return diagnose(drive, make_model("friction", robot))
 
 
+@pytest.mark.extended
 def test_diagnose_84_runs_with_thesis_law_names_force_law() -> None:
     found = runs("thesis")
     assert found.windows == 84

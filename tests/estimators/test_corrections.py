@@ -285,6 +285,7 @@ def consistency():
     return np.array([[r[0] for r in level] for level in found]), np.array([[r[1] for r in level] for level in found]), found[0][0][2]
 
 
+@pytest.mark.xdist_group("corrections_nees")
 @pytest.mark.parametrize("level", range(len(LEVELS)))
 def test_corrections_nees_at_each_noise_level_is_in_band(consistency, level):
     """Twelve means of pose, parameters and all: the band holds all of them together with 95 %."""

@@ -491,6 +491,7 @@ PARTS = {
 }
 
 
+@pytest.mark.xdist_group("filter_worlds")
 @pytest.mark.parametrize("part", PARTS)
 def test_filter_nees_is_in_band(worlds, part):
     """Every part of the state, at the end of 15 s, over independent seeds; 99.8 % band, so that seven of them hold together."""
@@ -502,6 +503,7 @@ def test_filter_nees_is_in_band(worlds, part):
     assert np.mean(np.array(values) < chi2.ppf(0.95, len(of))) > 0.85
 
 
+@pytest.mark.xdist_group("filter_worlds")
 def test_filter_nis_is_in_band(worlds):
     lidar, gyro = (np.concatenate([w[i] for w in worlds]) for i in (2, 3))
     for values, dof in ((lidar, 3), (gyro, 1)):
@@ -510,6 +512,7 @@ def test_filter_nis_is_in_band(worlds):
     assert np.mean(lidar > chi2.ppf(0.95, 3)) == pytest.approx(0.05, abs=0.012)
 
 
+@pytest.mark.xdist_group("filter_worlds")
 def test_filter_estimates_calibration_states(worlds):
     """What began at sigma is known several times better; the clock's sign is part of its error above."""
     for index, sigma, share in (
@@ -522,6 +525,7 @@ def test_filter_estimates_calibration_states(worlds):
         assert np.mean([math.sqrt(P[index, index]) for _, P, *_ in worlds]) < share * sigma
 
 
+@pytest.mark.xdist_group("filter_worlds")
 def test_filter_innovations_are_white(worlds):
     rhos = [lag1_whiteness(w[4], np.broadcast_to(np.cov(w[4].T), (len(w[4]), 3, 3))).lag1 for w in worlds]
     n = len(worlds[0][4])

@@ -119,6 +119,7 @@ def test_doctor_few_windows_without_messages_reports_the_loss(tmp_path: Path) ->
     assert "check the driver of the wheels and the network" in status.message
 
 
+@pytest.mark.extended
 def test_doctor_clock_names_its_alias_in_the_message(tmp_path: Path) -> None:
     """Without a gyro, wheels that are early are a LiDAR that is late."""
     robot = load_robot("husky_a200")
