@@ -450,7 +450,7 @@ def _choose_geometry(
         x, y = urdf.cg
         reason = f"the URDF's <inertial>s, from the middle of the wheels, +- {TYPICAL.com_m:g} m"
         draft.choose("cg_x_m", [(None if is_tipping(urdf) else x, reason)])
-        draft.choose("cg_y_m", [(None if urdf.cg_doubt_m else y, reason)])
+        draft.choose("cg_y_m", [(None if urdf.cg_off_middle_m else y, reason)])
     _choose_radius(draft, given.wheel_radius_m, _described(urdf, controllers, "wheel_radius_m"), fit, of_log)
     _choose_track(draft, given.track_width_m, urdf, controllers, fit)
     for name in ("wheel_radius_m", "track_width_m"):

@@ -113,9 +113,9 @@ def _check_body_frame(found: Findings, urdf: WheelGeometry) -> None:
 
 
 def _check_center_of_gravity(found: Findings, urdf: WheelGeometry) -> None:
-    """Doubt masses off the middle of symmetric wheels, or outside of the wheels."""
+    """Name masses off the middle of symmetric wheels, or outside of the wheels."""
     ahead, aside = urdf.cg
-    if urdf.cg_doubt_m > 0.0:
+    if urdf.cg_off_middle_m > 0.0:
         found.contradictions.append(
             Contradiction(
                 "centre of gravity, y", "the URDF's <inertial>s", f"{aside:+.3f} m", "cannot measure it; wheels are symmetric: 0 m"

@@ -75,13 +75,13 @@ class Cg:
         else:
             estimate, static, steps = self._with_arms(robot, weighed)
             source += steps
-        doubt = 0.0 if weighed is not None or self.urdf is None else _doubt(self.urdf, self.base_link)
-        if doubt:
-            estimate = CgEstimate(estimate.position, estimate.covariance + np.diag([0.0, doubt**2]), estimate.mass)
+        off_middle = 0.0 if weighed is not None or self.urdf is None else _off_middle(self.urdf, self.base_link)
+        if off_middle:
+            estimate = CgEstimate(estimate.position, estimate.covariance + np.diag([0.0, off_middle**2]), estimate.mass)
             print_line(
                 console,
-                f"! {self.urdf}: its masses have the body {100.0 * doubt:.0f} cm off the middle of a symmetric robot: check its <inertial> "
-                "(axes swapped?), or weigh it; +- of y is as large.",
+                f"! {self.urdf}: its masses have the body {100.0 * off_middle:.0f} cm off the middle of a symmetric robot: check its "
+                "<inertial> (axes swapped?), or weigh it; +- of y is as large.",
             )
         require_support(estimate.position, g.wheelbase_m, g.track_width_m)
         numbers = self._numbers(robot, estimate, weighed, static, source)
@@ -202,10 +202,10 @@ def _by_cg(model: SkidSteer, cg: FloatArray) -> FloatArray:
     return np.array([[k_1 + 2 * k_2 * x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
 
 
-def _doubt(urdf: Path, base_link: str) -> float:
+def _off_middle(urdf: Path, base_link: str) -> float:
     """By how much the masses of a URDF are beside the middle of its symmetric wheels [m]; 0 where they are not, or wheels are not known."""
     try:
-        return wheel_geometry(read_text(urdf), str(urdf), base_link).cg_doubt_m
+        return wheel_geometry(read_text(urdf), str(urdf), base_link).cg_off_middle_m
     except RobotError:
         return 0.0
 

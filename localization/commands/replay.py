@@ -153,6 +153,13 @@ class Replay:
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
         )
+        self._write(head, results, reference)
+        if self.save_map is not None:
+            save_map(self.save_map, saved_map(runs, head, mounts, dataclasses.asdict(self.config)))
+        self._print(console, head, results, reference)
+
+    def _write(self, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
+        """The folder of results, and the copy of its metrics. Raises `OutputError`."""
         metrics = self._metrics(head, results)
         with new_folder(self.out) as folder:
             write_json(folder / "metrics.json", metrics)
@@ -164,9 +171,6 @@ class Replay:
             overview_png(folder / "overview.png", head, results, reference)
         if self.json is not None:
             write_json(self.json, metrics)
-        if self.save_map is not None:
-            save_map(self.save_map, saved_map(runs, head, mounts, dataclasses.asdict(self.config)))
-        self._print(console, head, results, reference)
 
     def _estimators(self, log: Log) -> list[str]:
         has_lidar, is_default = log.sources.lidar is not None, self.estimator == type(self).estimator

@@ -230,6 +230,32 @@ class EkfFusion(Estimator):
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
 
 
+class FilteredOdometry(Estimator):
+    """An estimator of poses in a map, whose odometry and learned states are those of an `EkfFusion`."""
+
+    odometry: EkfFusion
+
+    @property
+    def clock_offset_s(self) -> float:
+        """Estimated offset of the wheels' clock [s]."""
+        return self.odometry.clock_offset_s
+
+    @property
+    def params(self) -> FloatArray:
+        """Parameters of the motion model with their corrections."""
+        return self.odometry.params
+
+    @property
+    def gyro_calibration(self) -> GyroCalibration | None:
+        """See `EkfFusion.gyro_calibration`."""
+        return self.odometry.gyro_calibration
+
+    @property
+    def lost(self) -> LostScans | None:
+        """See `EkfFusion.lost`."""
+        return self.odometry.lost
+
+
 class _SlipChanges:
     """How much of the wheels' noise is white, along each axis, by the slip of successive scans.
 

@@ -15,12 +15,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate, Estimator, GyroCalibration, LearnedParameter, Residuals
+from localization.estimators.base import Estimate, LearnedParameter, Residuals
 from localization.estimators.filter import KEY, PARAMS, RADIUS, START
-from localization.estimators.fusion import EkfFusion
+from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.events import PositionSample, Step
-from localization.lidar import OUTLIER_SIGMAS, LidarConfig, LostScans
+from localization.lidar import OUTLIER_SIGMAS, LidarConfig
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
@@ -66,7 +66,7 @@ class GraphConfig(Settings):
     """Where the antenna of `--positions` sits, to the left of the body's origin [m]; estimated within half a metre."""
 
 
-class GraphFusion(Estimator):
+class GraphFusion(FilteredOdometry):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
@@ -90,26 +90,6 @@ class GraphFusion(Estimator):
         self._waiting: list[PositionSample] = []
         self._is_aligned, self._failure = False, ""
         self.n_loops = self.n_positions = self._n_late = 0
-
-    @property
-    def clock_offset_s(self) -> float:
-        """Estimated offset of the wheels' clock [s]."""
-        return self.odometry.clock_offset_s
-
-    @property
-    def params(self) -> FloatArray:
-        """Parameters of the motion model with their corrections."""
-        return self.odometry.params
-
-    @property
-    def gyro_calibration(self) -> GyroCalibration | None:
-        """See `EkfFusion.gyro_calibration`."""
-        return self.odometry.gyro_calibration
-
-    @property
-    def lost(self) -> LostScans | None:
-        """See `EkfFusion.lost`."""
-        return self.odometry.lost
 
     @property
     def residuals(self) -> Residuals:

@@ -12,16 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from localization.estimators.base import Estimate, Estimator, GyroCalibration
+from localization.estimators.base import Estimate, Estimator
 from localization.estimators.filter import KEY, START
-from localization.estimators.fusion import EkfFusion
+from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.events import Step
-from localization.lidar import LostScans
 from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, Points2, Pose2
 
 _KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
 """A keyframe follows when the robot has moved this far: scans of less are nearly the same evidence."""
@@ -37,7 +36,7 @@ class PriorMap:
     """(3,) ``map_T_body`` [m, m, rad]; None for anywhere."""
 
 
-class MapFusion(Estimator):
+class MapFusion(FilteredOdometry):
     """`EkfFusion` with a `Localizer` behind it."""
 
     def __init__(self, odometry: Estimator, prior: PriorMap) -> None:
@@ -49,26 +48,6 @@ class MapFusion(Estimator):
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
         self._first_s: float | None = None
         self._n_losses = 0
-
-    @property
-    def clock_offset_s(self) -> float:
-        """Estimated offset of the wheels' clock [s]."""
-        return self.odometry.clock_offset_s
-
-    @property
-    def params(self) -> FloatArray:
-        """Parameters of the motion model with their corrections."""
-        return self.odometry.params
-
-    @property
-    def gyro_calibration(self) -> GyroCalibration | None:
-        """See `EkfFusion.gyro_calibration`."""
-        return self.odometry.gyro_calibration
-
-    @property
-    def lost(self) -> LostScans | None:
-        """See `EkfFusion.lost`."""
-        return self.odometry.lost
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""

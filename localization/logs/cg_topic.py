@@ -49,7 +49,7 @@ def choose_cg_topic(topics: Sequence[str], robot: Robot, mean_point: MeanPoint) 
     near = _nearest(possible, points, robot)
     if len(named) == 1 and (near in (None, named[0]) or _distance(points[named[0]], robot) <= _MAX_DISTANCE_M):
         second = "its points lie between the wheels" if near is None else "the robot file's is near"
-        return _used(named[0], topics, f"its name says so and {second}")
+        return _used(named[0], topics, f"by its name, and {second}")
     if not named and near is not None:
         return _used(near, topics, "the robot file's is near")
     if not named and len(possible) == 1:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.report.page import Explorer
 from localization.report.runs import PlottedRun, run_with_map, thin_series, timeline
+from localization.trajectory import IntArray
 from motion_models.se2 import FloatArray
 
 _MOST_POINTS = 3_200
@@ -38,7 +39,7 @@ def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
     most = max(_MOST_POINTS // max(len(runs), 1), 100)
     drawn = run_with_map(runs)
     points = drawn.placed_points(drawn.result.run.map_points) if drawn is not None else np.empty((0, 2))
-    points = points[:: max(-(-len(points) // _MOST_MAP_POINTS), 1)]
+    points = points[_evenly(len(points), _MOST_MAP_POINTS)]
     track = reference if isinstance(reference, ReferenceTrack) else None
     return {
         "runs": [_run(run, start_ns, most) for run in runs if len(run.result.run.trajectory)],
@@ -52,7 +53,7 @@ def _run(run: PlottedRun, start_ns: int, most: int) -> dict[str, Any]:
     trajectory = run.result.run.trajectory
     t = np.asarray((trajectory.stamps_ns - start_ns) * 1e-9, dtype=np.float64)
     poses = run.placed(trajectory.poses)
-    keep = np.unique(np.linspace(0, len(poses) - 1, min(most, len(poses))).astype(int))
+    keep = _evenly(len(poses), most)
     way = np.r_[0.0, np.cumsum(np.hypot(*np.diff(trajectory.poses[:, :2], axis=0).T))]
     sigma = None if trajectory.covariances is None else np.sqrt(np.trace(trajectory.covariances[:, :2, :2], axis1=1, axis2=2))
     return {
@@ -126,18 +127,23 @@ def _lost(run: PlottedRun, t: FloatArray) -> list[list[float | None]]:
 
 def _history(rows: FloatArray, start_ns: int) -> dict[str, list[float | None]]:
     """Mean and sigma over time of one estimated parameter; three digits of its final sigma."""
-    rows = rows[:: max(-(-len(rows) // _MOST_MEANS), 1)]
+    rows = rows[_evenly(len(rows), _MOST_MEANS)]
     digits = int(np.clip(2.0 - np.floor(np.log10(max(float(rows[-1, 2]), 1e-9))), 0, 9))
     return {"t": _numbers(rows[:, 0] - start_ns * 1e-9, 2), "mean": _numbers(rows[:, 1], digits), "sigma": _numbers(rows[:, 2], digits)}
 
 
 def _reference(track: ReferenceTrack, start_ns: int) -> dict[str, Any]:
-    keep = np.unique(np.linspace(0, len(track.stamps_ns) - 1, min(_MOST_POINTS // 2, len(track.stamps_ns))).astype(int))
+    keep = _evenly(len(track.stamps_ns), _MOST_POINTS // 2)
     return {
         "t": _numbers((track.stamps_ns[keep] - start_ns) * 1e-9, 2),
         "x": _numbers(track.positions[keep, 0], _MILLIMETRES),
         "y": _numbers(track.positions[keep, 1], _MILLIMETRES),
     }
+
+
+def _evenly(count: int, most: int) -> IntArray:
+    """Indices of at most ``most`` of ``count`` rows, the first and the last among them."""
+    return np.linspace(0, max(count - 1, 0), min(most, count)).astype(np.int64)
 
 
 def _numbers(values: ArrayLike, digits: int) -> list[float | None]:

@@ -52,7 +52,7 @@ _SAME_RADIUS = 1.1
 _ROLLERS = 3
 """Least number of turning joints behind a wheel that are its rollers, not a wheel behind its suspension."""
 _OFF_MIDDLE = 0.05
-"""Distance of a centre of gravity from the middle over the track from which it is doubted: a battery on one side reaches 0.03."""
+"""Distance of a centre of gravity from the middle over the track from which its masses are named: a battery on one side reaches 0.03."""
 _FULL_TURN = 6.2
 """Range [rad] from which a joint turns without end: 3.14 to each side is meant so."""
 _LONGEST_M = 20.0
@@ -119,8 +119,8 @@ class WheelGeometry:
         return (min(x) + max(x)) / 2.0, (min(y) + max(y)) / 2.0
 
     @property
-    def cg_doubt_m(self) -> float:
-        """Distance of the centre of gravity from the middle of symmetric wheels where its masses are doubted, else 0."""
+    def cg_off_middle_m(self) -> float:
+        """Distance of the centre of gravity from the middle of symmetric wheels where the masses are named as uncertain, else 0."""
         ys = sorted(y for _, y in self.positions.values())
         is_symmetric = bool(ys) and all(abs(a + b - ys[0] - ys[-1]) < _SAME_M for a, b in zip(ys, reversed(ys), strict=True))
         return abs(self.cg[1]) if is_symmetric and abs(self.cg[1]) > _OFF_MIDDLE * self.track_width_m else 0.0

@@ -126,7 +126,7 @@ class FrictionModel:
         return self._solved(_twist, wheels, cg, params).twist
 
     def twist_on_slope(self, wheels: FloatArray, cg: FloatArray, params: FloatArray, slope: Slope) -> SlopeTwist:
-        """`twist` on tilted ground: gravity's part along the ground pulls at the CG, and the loads are those of the CG's projection along
+        """`twist` on tilted ground: gravity's part along the ground acts at the CG, and the loads are those of the CG's projection along
         gravity. Without a tilt it is `twist`.
 
         Raises what `twist` does, `CgError` for a slope on which the robot tips over, `ModelError` for one that friction does not hold.

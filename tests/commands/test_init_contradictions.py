@@ -51,7 +51,7 @@ def test_init_with_an_inverted_side_names_it_and_fits_the_radius(tmp_path: Path,
     assert "the right side (front_right_wheel, rear_right_wheel) is inverted" in capsys.readouterr().out
 
 
-def test_init_with_a_cg_beside_a_symmetric_robot_doubts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_init_with_a_cg_beside_a_symmetric_robot_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     init(tmp_path, BASE_LOG, "--urdf", str(CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"))
     printed = capsys.readouterr().out
     assert load_robot(tmp_path / "r.toml").geometry.cg_y_m == 0.0

@@ -40,7 +40,7 @@ def test_cg_topic_of_mass_and_rotation_is_that_of_mass(tmp_path: Path) -> None:
     log = log_of(tmp_path, {"/VB_com": (0.03, 0.01), "/VB_cor": (0.01, 0.0)}, husky(0.0))
     assert chosen(log) == "/VB_com"
     assert len([event for event in log.events() if isinstance(event, CgSample)]) == 10
-    assert any(note.startswith("/VB_com is used as center of gravity, and not /VB_cor: its name says so") for note in log.warnings())
+    assert any(note.startswith("/VB_com is used as center of gravity, and not /VB_cor: by its name") for note in log.warnings())
 
 
 @pytest.mark.parametrize(
