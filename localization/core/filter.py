@@ -1,0 +1,177 @@
+"""The error-state Kalman filter: the only code that writes the covariance of a `State`. A state in, a new state out.
+
+Each function is one equation of the textbook (Barfoot, "State Estimation for Robotics", 2017, ch. 3; Särkkä, "Bayesian Filtering and
+Smoothing", 2013, ch. 4) on the errors of all variables, whatever their groups are. What a step or a sensor means is in
+`localization.core.measurements`, as Jacobians by the names of variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from filterpy.kalman import predict
+
+from localization.core.state import Group, Layout, State
+from localization.errors import EstimatorError
+from motion_models.se2 import FloatArray
+
+_MAX_NUMBER = 1e12
+"""No state or covariance of a robot on Earth is larger, in SI units."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transition:
+    """How means and errors change: e' = F e + w, cov(w) = Q. What is not named stays as it is, without noise."""
+
+    means: Mapping[str, FloatArray] = field(default_factory=dict)
+    """New means of the variables that move."""
+    jacobians: Mapping[tuple[str, str], FloatArray] = field(default_factory=dict)
+    """Blocks (k, m) of F: derivative of the new error of the first variable by the old error of the second. Where none is given, F is
+    the identity."""
+    noise: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Blocks (k, k) on the diagonal of Q."""
+    what: str = "a transition"
+    """What moves the state, for messages."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A linearized measurement: residual = sum of H_i e_i + n over the variables i, cov(n) = R."""
+
+    residual: FloatArray
+    """(m,) what is measured less what the means predict."""
+    jacobians: Mapping[str, FloatArray]
+    """H_i (m, k) by the name of the variable."""
+    R: FloatArray
+    """(m, m) covariance of the sensor's noise."""
+    relative: tuple[str, str] | None = None
+    """Variable whose error relative to that of a second one is measured, where the second is considered: the gain of the first then
+    minimises the covariance of the difference (`update`)."""
+    what: str = "a measurement"
+    """What was measured, for messages."""
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What an update found, and with which gain it was applied."""
+
+    residual: FloatArray
+    """(m,)"""
+    S: FloatArray
+    """(m, m) its covariance, H P H^T + R."""
+    H: FloatArray
+    """(m, n)"""
+    K: FloatArray
+    """(n, m); zero for considered variables."""
+
+    @cached_property
+    def nis(self) -> float:
+        """Normalised innovation squared, residual^T S^-1 residual: chi-square with m degrees of freedom."""
+        return float(self.residual @ np.linalg.solve(self.S, self.residual))
+
+
+def propagate(state: State, transition: Transition) -> State:
+    """The state after ``transition``: P' = F P F^T + Q. Raises `EstimatorError` for numbers that would spoil the state for good."""
+    n, rows = len(state.P), state.layout.rows
+    F, Q = np.eye(n), np.zeros((n, n))
+    for (to, by), block in transition.jacobians.items():
+        F[rows[to], rows[by]] = block
+    for name, block in transition.noise.items():
+        Q[rows[name], rows[name]] = block
+    _, P = predict(np.zeros(n), state.P, F=F, Q=Q)  # F @ P @ F.T + Q
+    _check(transition.what, *transition.means.values(), P)
+    return State(state.layout, {**state.means, **transition.means}, P)
+
+
+def update(state: State, measurement: Measurement, considered: Collection[str] = ()) -> tuple[State, Innovation]:
+    """The state after ``measurement``, and the innovation. Raises `EstimatorError` for numbers that would spoil the state for good.
+
+        S = H P H^T + R      K = P H^T S^-1      e = K residual      P' = (I - K H) P (I - K H)^T + K R K^T
+
+    ``considered`` variables keep their means: their rows of K are zero, and their covariance and correlations count (Schmidt 1966,
+    consider states). Joseph's form is the covariance for any gain, and each row of K has an aim of its own: K_i = P_i H^T S^-1 minimises
+    E (e_i - K_i y)^2 for innovation y, whatever the other rows are.
+
+    Of a measurement that is `Measurement.relative`, of a variable a against a considered b, the rows of a minimise the covariance of the
+    difference: E |e_a - e_b - K y|^2 is least at K = (P_a - P_b) H^T S^-1, the difference of both optimal gains. With its own optimal gain,
+    a pose that is better known than the submap around it would stay off the submap, and later scans be matched from a wide prior.
+    """
+    P, R, residual, rows = state.P, measurement.R, measurement.residual, state.layout.rows
+    H = np.zeros((len(residual), len(P)))
+    for name, block in measurement.jacobians.items():
+        H[:, rows[name]] = block
+    S = H @ P @ H.T + R
+    _check(measurement.what, residual, S)
+    K = np.asarray(np.linalg.solve(S, H @ P).T, dtype=float)  # P H^T S^-1
+    if measurement.relative is not None:
+        a, b = measurement.relative
+        K[rows[a]] -= K[rows[b]]
+    for name in considered:
+        K[rows[name]] = 0.0
+    A = np.eye(len(P)) - K @ H
+    P = A @ P @ A.T + K @ R @ K.T
+    P = 0.5 * (P + P.T)
+    _check(measurement.what, P)
+    return State(state.layout, _retract(state, K @ residual, considered), P), Innovation(residual, S, H, K)
+
+
+def _retract(state: State, error: FloatArray, considered: Collection[str]) -> dict[str, FloatArray]:
+    """Means moved by the estimated ``error`` (n,): mean * exp(error)."""
+    means = dict(state.means)
+    for name, group in state.layout.groups.items():
+        if name not in considered:
+            means[name] = group.compose(means[name], group.exp(error[state.layout.rows[name]]))
+    return means
+
+
+def clone(state: State, source: str, name: str) -> State:
+    """The state with a copy ``name`` of the variable ``source`` as it is now (stochastic cloning, Roumeliotis & Burdick 2002).
+
+    An older variable ``name`` is marginalized, and the copy takes its place.
+    """
+    order, layout = list(state.layout.groups), state.layout
+    if name not in state:
+        order, layout = [*order, name], Layout({**layout.groups, name: layout.groups[source]})
+    copied = state.layout.indices([source if one == name else one for one in order])
+    return State(layout, {**state.means, name: state[source]}, state.P[np.ix_(copied, copied)])
+
+
+def augment(state: State, name: str, group: Group, mean: FloatArray, cov: FloatArray) -> State:
+    """The state with another variable ``name``, whose error is independent of the others, with covariance ``cov`` (k, k)."""
+    n = len(state.P)
+    P = np.zeros((n + group.dim, n + group.dim))
+    P[:n, :n], P[n:, n:] = state.P, cov
+    return State(Layout({**state.layout.groups, name: group}), {**state.means, name: mean}, P)
+
+
+def marginalize(state: State, name: str) -> State:
+    """The state without the variable ``name``: the marginal distribution of the others."""
+    groups = {other: group for other, group in state.layout.groups.items() if other != name}
+    return State(Layout(groups), {other: state[other] for other in groups}, state.cov(*groups))
+
+
+def inflate(state: State, name: str, cov: FloatArray) -> State:
+    """The state whose variable ``name`` is off by an independent error more, with covariance ``cov`` (k, k)."""
+    P, rows = state.P.copy(), state.layout.rows[name]
+    P[rows, rows] += cov
+    return State(state.layout, state.means, P)
+
+
+def set_marginal(state: State, name: str, mean: FloatArray, cov: FloatArray) -> State:
+    """The state with ``mean`` and ``cov`` (k, k) of the variable ``name`` by another estimator, which has used these measurements too:
+    correlations with the other variables are dropped."""
+    P, rows = state.P.copy(), state.layout.rows[name]
+    P[rows, :] = P[:, rows] = 0.0
+    P[rows, rows] = cov
+    return State(state.layout, {**state.means, name: mean}, P)
+
+
+def _check(what: str, *arrays: FloatArray) -> None:
+    for array in arrays:
+        if not (np.abs(array) < _MAX_NUMBER).all():
+            raise EstimatorError(
+                f"{what} has numbers that are not finite, or too large to compute with. Check that sensor's messages in the log."
+            )

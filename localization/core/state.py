@@ -1,0 +1,153 @@
+"""State of an estimator: named variables, each an element of a group, and one covariance of the errors of all.
+
+The mean of a variable lives in its group, and its error in the tangent space (Solà 2017, "Quaternion kinematics for the error-state Kalman
+filter"), with right perturbations: true value = mean * exp(error). The group is an attribute of the variable: SE(2), SE(3) or a vector
+space. Nothing here changes a state: `localization.core.filter` makes new ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+IntArray = NDArray[np.int64]
+
+_MIN_VARIANCE = 1e-14
+"""Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
+
+
+class Group(Protocol):
+    """A Lie group, by the arrays that stand for its elements."""
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the tangent space."""
+
+    def compose(self, a: FloatArray, b: FloatArray, /) -> FloatArray:
+        """The product a * b."""
+
+    def inverse(self, a: FloatArray, /) -> FloatArray:
+        """The element with compose(a, inverse(a)) = identity."""
+
+    def exp(self, tangent: FloatArray, /) -> FloatArray:
+        """Element of a tangent vector (dim,)."""
+
+    def log(self, a: FloatArray, /) -> FloatArray:
+        """Tangent vector (dim,) of an element."""
+
+    def adjoint(self, a: FloatArray, /) -> FloatArray:
+        """Matrix (dim, dim) with a * exp(t) = exp(Ad t) * a."""
+
+
+@dataclass(frozen=True)
+class PlanarPose:
+    """SE(2): poses x, y, yaw (`motion_models.se2`)."""
+
+    dim = 3
+    compose = staticmethod(se2.compose)
+    inverse = staticmethod(se2.inverse)
+    exp = staticmethod(se2.exp)
+    log = staticmethod(se2.log)
+    adjoint = staticmethod(se2.adjoint)
+
+
+@dataclass(frozen=True)
+class Vector:
+    """The vector space of ``dim`` numbers: sums for products."""
+
+    dim: int
+
+    def compose(self, a: FloatArray, b: FloatArray, /) -> FloatArray:
+        """The sum."""
+        return a + b
+
+    def inverse(self, a: FloatArray, /) -> FloatArray:
+        """The negative."""
+        return -a
+
+    def exp(self, tangent: FloatArray, /) -> FloatArray:
+        """``tangent`` itself."""
+        return tangent
+
+    def log(self, a: FloatArray, /) -> FloatArray:
+        """``a`` itself."""
+        return a
+
+    def adjoint(self, a: FloatArray, /) -> FloatArray:
+        """The identity."""
+        return np.eye(self.dim)
+
+
+SE2 = PlanarPose()
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Names and groups of a state's variables, in the order of their rows in the covariance."""
+
+    groups: Mapping[str, Group]
+
+    @cached_property
+    def rows(self) -> Mapping[str, slice]:
+        """Rows of each variable."""
+        ends = np.cumsum([group.dim for group in self.groups.values()]).tolist()
+        return {name: slice(end - group.dim, end) for (name, group), end in zip(self.groups.items(), ends, strict=True)}
+
+    def indices(self, names: Sequence[str]) -> IntArray:
+        """(k,) rows of the variables ``names``, one after another."""
+        return np.concatenate([np.arange(self.rows[name].start, self.rows[name].stop) for name in names])
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Means by name, and the covariance of their errors."""
+
+    layout: Layout
+    means: Mapping[str, FloatArray]
+    P: FloatArray
+    """(n, n) covariance of the errors of all variables, in the order of ``layout``."""
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.means
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Mean of the variable ``name``."""
+        return self.means[name]
+
+    def cov(self, *names: str) -> FloatArray:
+        """Joint covariance (k, k) of the errors of the variables ``names``."""
+        if len(names) == 1:
+            return self.cross_cov(names[0], names[0]).copy()
+        indices = self.layout.indices(names)
+        return self.P[np.ix_(indices, indices)]
+
+    def cross_cov(self, one: str, other: str) -> FloatArray:
+        """Covariance (k, m) of the errors of ``one`` variable with those of the ``other``."""
+        return self.P[self.layout.rows[one], self.layout.rows[other]]
+
+    def difference_cov(self, one: str, other: str) -> FloatArray:
+        """Covariance (k, k) of e_one - e_other, for errors in one tangent space."""
+        cross = self.cross_cov(one, other)
+        return clip_eigenvalues(self.cov(one) + self.cov(other) - cross - cross.T)
+
+    def between(self, start: str, end: str) -> tuple[FloatArray, FloatArray]:
+        """``start``^-1 ``end`` of two variables of one group, and the covariance (k, k) of its right perturbation, to first order."""
+        group = self.layout.groups[end]
+        delta = group.compose(group.inverse(self[start]), self[end])
+        A = group.adjoint(group.inverse(delta))
+        cross = self.cross_cov(end, start) @ A.T
+        return delta, clip_eigenvalues(self.cov(end) - cross - cross.T + A @ self.cov(start) @ A.T)
+
+
+def clip_eigenvalues(cov: FloatArray) -> FloatArray:
+    """``cov`` (n, n), a difference of large covariances, with eigenvalues of at least `_MIN_VARIANCE`: rounding leaves negative ones."""
+    values, vectors = np.linalg.eigh(0.5 * (cov + cov.T))
+    return np.asarray((vectors * np.maximum(values, _MIN_VARIANCE)) @ vectors.T, dtype=float)
