@@ -11,7 +11,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from localization.calibration.dead_reckoning import check_reference
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
+from localization.calibration.wheel_signals import read_signals
 from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig, cut
 from localization.errors import EvaluationError
@@ -170,6 +172,7 @@ def _track(log: Log, reference: str | None) -> ReferenceTrack:
     found = load_reference(log, name)
     if not isinstance(found, ReferenceTrack):
         raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory with headings (TUM) or a topic.")
+    check_reference(log, read_signals(log), found)
     return found
 
 

@@ -11,18 +11,21 @@ from typing import Literal
 
 import numpy as np
 
+from localization.calibration.dead_reckoning import dead_reckon, forward_rate
 from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
 from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, draft_robot, finish_robot, survey_log
-from localization.calibration.wheel_signals import STEP_S, LidarMotion, WheelSignals, lidar_motion, read_signals
+from localization.calibration.wheel_signals import LidarMotion, WheelSignals, lidar_motion, read_signals
 from localization.calibration.wheel_units import CORRECTED, expected_scaling
 from localization.calibration.wheel_wiring import WiringReport, open_checked
 from localization.errors import LogError
+from localization.evaluation.reference_check import compare_reference
 from localization.evaluation.reference_files import load_reference
-from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.references import Relations
 from localization.events import Event, ImuSample
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
 from localization.pipeline import Run, Trial, replay, warnings_of
+from localization.trajectory import Trajectory
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma
 from motion_models.registry import make_model
@@ -51,14 +54,10 @@ _SIGMAS = 3.0
 _MIN_TURNING_RAD_S = 0.05
 _MIN_SPEED_M_S, _MAX_TURN_RAD_S, _MIN_TRAVEL_INTERVALS, _MIN_COHERENCE = 0.05, 0.1, 6, 0.9
 _GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 20, 8.0, 12.0
-_LAGS_S = tuple(float(lag) for lag in np.arange(-60.0, 60.5, 0.5))
-"""Clock offsets of a reference that are tried [s]: GPS time is 18 s ahead."""
-_SAME_WAY, _MIN_REFERENCE_LIKENESS, _SURE_LIKENESS = 1.4, 0.7, 0.95
 _MAX_ODD_SHARE = 0.02
 """Largest share of a topic's messages or time that may be out of order or missing."""
-_CHORD_STEPS = 10
-"""Intervals (5 s) over which a reference's displacement is compared: GPS errs by decimetres from fix to fix."""
 _TURN_AND_STRAIGHT = "drive straight on for 10 s and turn in place both ways for 10 s each"
+_DRIVE_WITH_REFERENCE = "drive for 20 s or more within the reference's time and beyond its noise, at changing speeds."
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,11 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     if signals is not None:
         rows += [*_scale_rows(log, wiring, signals, motion), *_lidar_rows(log, signals, motion, mounts)]
     run = _replayed(log, mounts, "ekf", signals)
-    rows += [*_filter_rows(log, run), *_imu_rows(log), *_reference_rows(log, signals, reference)]
+    rows += [
+        *_filter_rows(log, run),
+        *_imu_rows(log),
+        _reference_row(log, [] if signals is None else [dead_reckon(log, signals)], reference),
+    ]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
     model = make_model(model_of(log.robot), log.robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
@@ -216,7 +219,7 @@ def _by_lidar(log: Log, signals: WheelSignals, motion: LidarMotion | None) -> di
     if motion is None:
         return {}
     if signals.joints:
-        rates, left = np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates), signals.left
+        rates, left = signals.joint_rates, signals.left
         turn = rates[:, left:].mean(axis=1) - rates[:, :left].mean(axis=1)
     else:
         assert log.sources.wheels is not None
@@ -260,7 +263,7 @@ def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: L
     radius = log.robot.geometry.wheel_radius_m if signals.joints else log.robot.driver.wheel_radius_m
     ratios = {name: value for name, value in wiring.ratios.items() if " by the speed of " in name}
     if motion is not None and not ratios:
-        wheels = np.abs(_forward(log, signals)) * (radius if signals.joints else 1.0)
+        wheels = np.abs(forward_rate(log, signals)) * (radius if signals.joints else 1.0)
         way = np.hypot(motion.speed, motion.side)
         both = np.isfinite(wheels) & (way > _MIN_SPEED_M_S) & (wheels > _MIN_SPEED_M_S) & (np.abs(motion.turn) < _MAX_TURN_RAD_S)
         if both.sum() >= _MIN_SCALE_INTERVALS and _cosine(way[both], wheels[both]) >= _MIN_LIKENESS:
@@ -288,7 +291,7 @@ def _lidar_rows(log: Log, signals: WheelSignals, motion: LidarMotion | None, mou
     if mount is None:
         return [CheckRow(name, f"frame '{frame}' unknown", "", "cannot be seen", f"publish it on /tf_static, or write [mounts.{frame}].")]
     value = f"{frame}: yaw {math.degrees(mount.yaw):.0f} deg"
-    forward = _forward(log, signals)
+    forward = forward_rate(log, signals)
     direction = None if motion is None else _direction(motion, forward)
     yaw = check_lidar_yaw(log)
     if direction is None and yaw is None:
@@ -301,14 +304,6 @@ def _lidar_rows(log: Log, signals: WheelSignals, motion: LidarMotion | None, mou
         return [CheckRow(name, value, second, "contradiction", yaw.text)]
     advice = "" if abs(degrees) <= _MAX_YAW_DEG else f"if the robot did not slide, turn its yaw by {-degrees:+.0f} deg."
     return [CheckRow(name, value, second, "contradiction" if advice else "ok", advice)]
-
-
-def _forward(log: Log, signals: WheelSignals) -> FloatArray:
-    """Speed (n,) by the wheels, up to its scale."""
-    if signals.joints:
-        return np.asarray(np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates).mean(axis=1))
-    assert log.sources.wheels is not None
-    return signals.speeds[log.sources.wheels.topic]
 
 
 def _direction(motion: LidarMotion, forward: FloatArray) -> float | None:
@@ -383,71 +378,20 @@ def _imu_rows(log: Log) -> list[CheckRow]:
     return [CheckRow("axes of IMU", value, second, "contradiction", f"{what}: correct roll and pitch of '{frame}' in /tf_static.")]
 
 
-def _reference_rows(log: Log, signals: WheelSignals | None, given: str | None) -> list[CheckRow]:
-    """Way and turn of the reference over those of wheels and gyro."""
+def _reference_row(log: Log, tracks: Sequence[Trajectory], given: str | None) -> CheckRow:
+    """Clock, scale and axes of the reference by the motion of the sensors."""
     topic = given or log.reference_topic
     if topic is None:
-        return [CheckRow("reference", "none", "", "cannot be seen", "none is needed; with one (mocap, GPS, map) errors can be measured.")]
+        return CheckRow("reference", "none", "", "cannot be seen", "none is needed; with one (mocap, GPS, map) errors can be measured.")
     found = load_reference(log, topic)
     if isinstance(found, Relations):
-        return [CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")]
-    if signals is None or len(found.stamps_ns) < _CHORD_STEPS:
-        return [CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", "its poses are too few.")]
-    wheels = _dead_reckoned(log, signals)
-    compared = {lag: _compare(found, signals, wheels, lag) for lag in (0.0, *_LAGS_S)}
-    now = compared[0.0]
-    best = max((lag for lag, one in compared.items() if one is not None), key=lambda lag: _likeness(compared[lag]), default=0.0)
-    if now is None and _likeness(compared[best]) < _SURE_LIKENESS:
-        return [CheckRow("reference", topic, "no common motion", "cannot be seen", "another time, or the robot hardly moves in it.")]
-    second = "no common motion" if now is None else f"way {now[0]:.4g} times the wheels', likeness of turns {now[1]:.2f}"
-    if now is not None and 1.0 / _SAME_WAY <= now[0] <= _SAME_WAY and now[1] > _MIN_REFERENCE_LIKENESS:
-        return [CheckRow("reference", topic, second, "ok")]
-    if now is not None and now[1] > _MIN_REFERENCE_LIKENESS:
-        advice = f"its lengths are {now[0]:.4g} times the wheels': another unit (1000: millimetres), or a wrong wheel radius."
-    elif _likeness(compared[best]) >= _SURE_LIKENESS:
-        advice = (
-            f"its stamps are about {abs(best):.1f} s {'late' if best > 0.0 else 'early'} (18 s: GPS time): moved so, it fits the sensors."
-        )
-    else:
-        advice = "its stamps, axes or run are others."
-    return [CheckRow("reference", topic, second, "contradiction", advice)]
-
-
-def _likeness(one: tuple[float, float] | None) -> float:
-    return -1.0 if one is None else one[1]
-
-
-def _compare(track: ReferenceTrack, signals: WheelSignals, wheels: FloatArray, lag_s: float) -> tuple[float, float] | None:
-    """Way of a reference, whose stamps are late by ``lag_s``, over that of ``wheels`` (n + 1, 2) [m], and the cosine between the turns from
-    one displacement to the next; None where they share too little motion."""
-    known = np.isfinite(track.positions).all(axis=1)
-    t, (x, y) = (track.stamps_ns[known] - signals.first_ns) * 1e-9 - lag_s, track.positions[known].T
-    edges = signals.start_s + STEP_S * np.arange(len(wheels))
-    inside = (edges >= t[0]) & (edges <= t[-1]) if len(t) else np.zeros(len(edges), dtype=bool)
-    use = inside[:-_CHORD_STEPS] & inside[_CHORD_STEPS:]
-    if use.sum() <= 2 * _CHORD_STEPS:
-        return None
-    paths = np.interp(edges, t, x) + 1j * np.interp(edges, t, y), wheels @ [1.0, 1.0j]
-    ours, theirs = ((path[_CHORD_STEPS:] - path[:-_CHORD_STEPS])[use] for path in reversed(paths))
-    if float(np.abs(ours).max()) < 1.0 or not theirs.any():
-        return None
-    turns = [chord[_CHORD_STEPS:] * np.conj(chord[:-_CHORD_STEPS]) for chord in (ours, theirs)]
-    likeness = float(np.real(np.vdot(turns[0], turns[1]))) / max(float(np.linalg.norm(turns[0]) * np.linalg.norm(turns[1])), 1e-12)
-    return float(np.abs(theirs).sum() / np.abs(ours).sum()), likeness
-
-
-def _dead_reckoned(log: Log, signals: WheelSignals) -> FloatArray:
-    """Positions (n + 1, 2) at the edges of the intervals, by wheels and the best yaw rate [m]."""
-    speed = np.nan_to_num(_forward(log, signals)) * (log.robot.geometry.wheel_radius_m if signals.joints else 1.0)
-    turns = next((signals.turns[name] for name in ("gyro", *signals.turns) if name in signals.turns), None)
-    if turns is None:
-        rates, left = np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates), signals.left
-        scale = expected_scaling(log.robot) * log.robot.geometry.wheel_radius_m / log.robot.geometry.track_width_m
-        turns = scale * (rates[:, left:].mean(axis=1) - rates[:, :left].mean(axis=1))
-    yaw = np.cumsum(np.nan_to_num(turns)) * STEP_S
-    steps = speed * STEP_S * np.exp(1j * yaw)
-    path = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.stack([path.real, path.imag], axis=1)
+        return CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")
+    compared = compare_reference(tracks, found)
+    if compared is None:
+        return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)
+    second = f"speed and turns of the sensors: correlation {compared.unshifted:.2f}, way {compared.scale:.4g} times theirs"
+    advice = " ".join(text.removeprefix(f"{found.source}: ") for text in compared.sentences(found.source, found.has_times))
+    return CheckRow("reference", topic, second, "contradiction" if advice else "ok", advice)
 
 
 def _draft_rows(draft: Draft, is_known: bool) -> list[CheckRow]:

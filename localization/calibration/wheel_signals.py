@@ -65,6 +65,11 @@ class WheelSignals:
     first_ns: int = 0
     start_s: float = 0.0
 
+    @property
+    def joint_rates(self) -> FloatArray:
+        """(n, joints) by the velocities, else by the positions [rad/s by the robot file]."""
+        return np.where(np.isfinite(self.rates), self.rates, self.angle_rates)
+
 
 @dataclass(frozen=True)
 class _Tagged:

@@ -133,7 +133,7 @@ def _with_unknown_signs(robot: Robot) -> Robot:
 
 def _wiring_of(log: Log, signals: WheelSignals) -> tuple[WheelSignals, WiringReport]:
     base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
-    rates = wheel_rates(signals)
+    rates = signals.joint_rates
     if not (signals.turns or signals.speeds) or not _is_accepted(signals, rates, base):
         signals = with_lidar(log, signals)
     measured = correlations(signals, rates, base)
@@ -202,11 +202,6 @@ def with_lidar(log: Log, signals: WheelSignals) -> WheelSignals:
     if motion is None:
         return signals
     return replace(signals, speeds={**signals.speeds, "LiDAR": motion.speed}, turns={**signals.turns, "LiDAR": motion.turn})
-
-
-def wheel_rates(signals: WheelSignals) -> FloatArray:
-    """(n, joints) by the velocities, else by the positions."""
-    return np.where(np.isfinite(signals.rates), signals.rates, signals.angle_rates)
 
 
 def _signed(rates: FloatArray, wiring: Wiring) -> tuple[FloatArray, FloatArray]:
@@ -355,7 +350,7 @@ def _certain(log: Log, signals: WheelSignals, wiring: Wiring, measured: Mapping[
         robot = replace(robot, imu=replace(robot.imu, rate_unit_rad_s=-robot.imu.rate_unit_rad_s))
         keys["imu.rate_unit_rad_s"] = f"{robot.imu.rate_unit_rad_s:g}"
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
-    after = correlations(signals, wheel_rates(signals), wiring)
+    after = correlations(signals, signals.joint_rates, wiring)
     entries = "; ".join(f"{key} = {value}" for key, value in keys.items())
     text = (
         f"{wheels}: {wiring.text}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"

@@ -60,10 +60,16 @@ class _Motion:
 
 def reference_contradictions(trajectories: Sequence[Trajectory], reference: ReferenceTrack) -> tuple[str, ...]:
     """Sentences on what of ``reference`` contradicts the sensors: clock, scale, axes, run; none where nothing does, or too little moves."""
+    found = compare_reference(trajectories, reference)
+    return () if found is None else found.sentences(reference.source, reference.has_times)
+
+
+def compare_reference(trajectories: Sequence[Trajectory], reference: ReferenceTrack) -> ReferenceComparison | None:
+    """The comparison with that of the ``trajectories`` that agrees best; None where the motion is too small, too even or too noisy."""
     usable = [t for t in trajectories if len(t) > 2 and t.distance(0.05) > _MIN_WAY_M]
     if not usable or len(reference.stamps_ns) < 10:
-        return ()
-    best: _Comparison | None = None
+        return None
+    best: ReferenceComparison | None = None
     for chord_s in _CHORDS_S:
         for trajectory in usable:
             found = _compare(trajectory, reference, chord_s)
@@ -71,12 +77,12 @@ def reference_contradictions(trajectories: Sequence[Trajectory], reference: Refe
                 best = found
         if best is not None and best.likeness > _ALIKE:
             break
-    return () if best is None else best.sentences(reference)
+    return best
 
 
 @dataclass(frozen=True)
-class _Comparison:
-    """At the offset of the clocks where motions are most alike."""
+class ReferenceComparison:
+    """Motion of a reference against that of the sensors, at the offset of the clocks where they are most alike."""
 
     offset_s: float
     likeness: float
@@ -92,8 +98,9 @@ class _Comparison:
     turn: float | None
     """Correlation of the turns of the headings, -1 to 1; None where one of both has none, or hardly turns."""
 
-    def sentences(self, reference: ReferenceTrack) -> tuple[str, ...]:
-        name, found = reference.source, []
+    def sentences(self, name: str, has_times: bool = True) -> tuple[str, ...]:
+        """What contradicts the sensors, of a reference of this ``name``; its clock only where it ``has_times`` of its own."""
+        found = []
         if self.sigmas < _MIN_SIGMAS:
             if self.unshifted >= _UNLIKE:
                 return ()
@@ -102,7 +109,7 @@ class _Comparison:
                 f" {self.likeness:.2f} at best): it is of another run or another robot, or its clock is not set.",
             )
         is_clear = 1.0 - self.unshifted > 2.0 * (1.0 - self.likeness) + 0.01
-        if reference.has_times and abs(self.offset_s) >= _MIN_OFFSET_S and is_clear:
+        if has_times and abs(self.offset_s) >= _MIN_OFFSET_S and is_clear:
             leap = next((words for leap, words in _LEAPS_S if abs(abs(self.offset_s) - leap) < 0.25), "")
             way, undo = ("ahead of", "Subtract") if self.offset_s > 0 else ("behind", "Add")
             found.append(
@@ -132,7 +139,7 @@ class _Comparison:
         )
 
 
-def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) -> _Comparison | None:
+def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) -> ReferenceComparison | None:
     """None where the motion is too small or too even to be compared, or one of them too noisy."""
     start = int(trajectory.stamps_ns[0])
     grid = np.arange(0.0, (int(trajectory.stamps_ns[-1]) - start) * 1e-9, _STEP_S)
@@ -159,7 +166,7 @@ def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) 
         return None
     bends = _rms(sensors.bends[use]) > _MIN_TURN_RAD * float(np.mean(sensors.lengths[use] ** 2))
     turns = sensors.turns is not None and _rms(sensors.turns[use]) > _MIN_TURN_RAD
-    return _Comparison(
+    return ReferenceComparison(
         (best + _peak(scores, best) - n_offset) * _STEP_S,
         float(scores[best]),
         float(scores[n_offset]),

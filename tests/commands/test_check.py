@@ -12,6 +12,7 @@ import pytest
 from localization.cli import main
 from localization.logs import open_log
 from motion_models.robot import load_robot
+from tests.helpers.extended import cases
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, drive
 
 
@@ -77,12 +78,38 @@ def test_check_without_gyro_has_no_sentence_about_it(tmp_path: Path) -> None:
     assert open_log(CASES / "base-log" / "log.mcap", load_robot(ROBOT_TOML)).sources.imu is not None
 
 
-@pytest.mark.parametrize(("scale", "late_s", "text"), [(1000.0, 0.0, "1000: millimetres"), (1.0, 18.0, "about 18.0 s late")])
-def test_check_of_reference_names_its_unit_and_clock(tmp_path: Path, scale: float, late_s: float, text: str) -> None:
+def spoiled_reference(path: Path, scale: float = 1.0, late_s: float = 0.0, mirror: float = 1.0) -> Path:
+    """The reference of the base log in another unit, on another clock, or left-handed."""
     rows = np.loadtxt(CASES / "base-log" / "reference.tum")
-    rows[:, 1:3] *= scale
+    rows[:, 1:3] *= [scale, scale * mirror]
+    rows[:, 6] *= mirror
     rows[:, 0] += late_s
-    np.savetxt(tmp_path / "reference.tum", rows, fmt="%.9f")
-    options = ("--robot", str(ROBOT_TOML), "--reference", str(tmp_path / "reference.tum"))
+    np.savetxt(path, rows, fmt="%.9f")
+    return path
+
+
+SPOILED = cases(
+    [("scale is 1000", {"scale": 1000.0}), ("18.0 s ahead of", {"late_s": 18.0}), ("mirrored", {"mirror": -1.0})],
+    usual=["18.0 s ahead of"],
+)
+
+
+@pytest.mark.parametrize(("text", "change"), SPOILED)
+def test_check_of_reference_names_its_unit_and_clock(tmp_path: Path, text: str, change: dict[str, float]) -> None:
+    reference = spoiled_reference(tmp_path / "reference.tum", **change)
+    options = ("--robot", str(ROBOT_TOML), "--reference", str(reference))
     found = check(tmp_path, CASES / "base-log" / "log.mcap", *options)
     assert [text in row["advice"] for row in found["rows"] if row["quantity"] == "reference"] == [True]
+
+
+@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+@pytest.mark.parametrize(("text", "change"), SPOILED)
+def test_spoiled_reference_is_named_and_nothing_is_fitted_to_it(
+    tmp_path: Path, command: str, text: str, change: dict[str, float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    reference = spoiled_reference(tmp_path / "reference.tum", **change)
+    out = tmp_path / "out.toml"
+    args = [command, str(CASES / "base-log" / "log.mcap"), "--robot", str(ROBOT_TOML), "--reference", str(reference), "--out", str(out)]
+    assert main(args) == 2
+    assert text in capsys.readouterr().err
+    assert not out.exists()
