@@ -13,10 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from localization.events import ImuSample
+from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray
@@ -63,6 +65,8 @@ _AXES_ERROR = 3e-3
 """Relative error of a gyro's scale and axes [-]."""
 _BIAS_WALK = 1e-4
 """[rad/s/sqrt(s)]"""
+_BUFFER = 64
+"""Samples for which there is room at first."""
 
 
 @dataclass(frozen=True)
@@ -81,21 +85,49 @@ class Tilt:
         return np.asarray(self.before + shares[:, None] * (self.after - self.before))
 
 
+class _Imu(NamedTuple):
+    """The IMU and where it sits, as compiled loops take them."""
+
+    rotation: FloatArray
+    """(3, 3) from its axes into the body's."""
+    place: FloatArray
+    """(3,) in the body [m]."""
+    scale: float
+    """Of its forces; 0 until known."""
+    radius: float
+    """Of the wheels [m]."""
+    white: float
+    """Of its gyro [rad/sqrt(s)]."""
+
+
+class _Sums(NamedTuple):
+    """What is propagated from step to step, in place."""
+
+    state: FloatArray
+    """(7,) vertical, biases, variance of the noise."""
+    cov: FloatArray
+    """(6, 6)"""
+    window: FloatArray
+    """(7,) sum of the forces, velocity at its begin, both turned into the body as it is now; length [s]."""
+    velocity: FloatArray
+    """(3,) of the IMU at the end, where wheels do not slip [m/s]."""
+    wheels: FloatArray
+    """(4,) way [m] and turn [rad] in the window, turn by the wheels as difference of the sides' angles, and its agreement with the gyro."""
+
+
 class AttitudeFilter:
     """`insert` each sample of the IMU, `advance` to the end of each step."""
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], wheel_radius_m: float) -> None:
-        self._noise, self._mounts, self._radius = noise, mounts, wheel_radius_m
+        self._mounts = mounts
         self._frame: str | None = None
-        self._samples: list[tuple[int, FloatArray, FloatArray]] = []
+        self._stamps, self._samples, self._n = np.empty(_BUFFER, np.int64), np.empty((_BUFFER, 6)), 0
+        self._imu = _Imu(np.eye(3), np.zeros(3), 0.0, wheel_radius_m, noise.white_rad_per_sqrt_s)
         self._first: list[FloatArray] = []
-        self._scale, self._problem = 0.0, ""  # of the force, 0 until known; why there is no attitude
+        self._problem = ""  # why there is no attitude
         self._is_unusable = False
-        self._turn_by_wheels = self._agreement = 0.0
-        self._last_ns = 0
-        self._window = np.zeros(7)  # sum of the forces, velocity at its begin, both turned into the body as it is now; length [s]
-        self._is_explained, self._way, self._turn = False, 0.0, 0.0
-        self._state, self._cov = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.zeros((6, 6))  # vertical, biases, noise's variance
+        self._last_ns, self._is_explained = 0, False
+        self._sums = _Sums(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.zeros((6, 6)), np.zeros(7), np.zeros(3), np.zeros(4))
         self._split, self._split_cov = np.zeros(4), np.diag([_MOUNT_SIGMA**2] * 2 + [_GROUND_SIGMA**2] * 2)
         self._has_started, self._tilts = False, False
         self._downhill = np.zeros(2)
@@ -113,7 +145,7 @@ class AttitudeFilter:
     @property
     def up(self) -> FloatArray:
         """(3,) the vertical in body axes; the body's z axis where it is not known."""
-        return self._state[:3].copy() if self._has_started else np.array([0.0, 0.0, 1.0])
+        return self._sums.state[:3].copy() if self._has_started else np.array([0.0, 0.0, 1.0])
 
     @property
     def ground_up(self) -> FloatArray:
@@ -126,19 +158,19 @@ class AttitudeFilter:
     @property
     def tilt_variances(self) -> tuple[float, float]:
         """Variances of roll and pitch [rad^2]: by the attitude, and by the mount, which stays."""
-        return 0.5 * float(self._cov[0, 0] + self._cov[1, 1]) + _ACCELEROMETER_RAD**2, 0.5 * float(
+        return 0.5 * float(self._sums.cov[0, 0] + self._sums.cov[1, 1]) + _ACCELEROMETER_RAD**2, 0.5 * float(
             self._split_cov[0, 0] + self._split_cov[1, 1]
         )
 
     @property
     def cov(self) -> FloatArray:
         """(6, 6) of the small rotation of the vertical about the body's axes [rad], then of the gyro's biases [rad/s]."""
-        return self._cov.copy()
+        return self._sums.cov.copy()
 
     @property
     def gyro_bias(self) -> FloatArray:
         """(3,) in body axes [rad/s]; what is about the vertical is not observable by gravity."""
-        return self._state[3:6].copy()
+        return self._sums.state[3:6].copy()
 
     @property
     def mount_error(self) -> FloatArray:
@@ -149,16 +181,17 @@ class AttitudeFilter:
         """Take the next sample of the first IMU whose mount is known."""
         if self._frame is None and sample.frame_id in self._mounts:
             self._frame = sample.frame_id
-            self._rotation = self._mounts[sample.frame_id].rotation()
-            mount = self._mounts[sample.frame_id]
-            self._place = np.array([mount.x, mount.y, mount.z])
         if sample.frame_id != self._frame or self._problem or self._is_unusable:
             return
-        if not self._scale:
+        if not self._imu.scale:
             self._first.append(sample.linear_acceleration)
             if len(self._first) == _FIRST_SAMPLES:
                 self._check_force()
-        self._samples.append((sample.stamp_ns, sample.angular_velocity, sample.linear_acceleration))
+        n = self._n
+        if n == len(self._stamps):
+            self._stamps, self._samples = np.concatenate([self._stamps] * 2), np.concatenate([self._samples] * 2)
+        self._stamps[n], self._samples[n, :3], self._samples[n, 3:] = sample.stamp_ns, sample.angular_velocity, sample.linear_acceleration
+        self._n = n + 1
 
     def _check_force(self) -> None:
         """Units and sign of the accelerometer, by the mean of the first samples."""
@@ -166,9 +199,9 @@ class AttitudeFilter:
         size = float(np.linalg.norm(mean))
         named = f"the accelerometer of IMU '{self._frame}'"
         if _IN_M_S2[0] < size < _IN_M_S2[1]:
-            self._scale = 1.0
+            self._set_scale(1.0)
         elif _IN_G[0] < size < _IN_G[1]:
-            self._scale = GRAVITY
+            self._set_scale(GRAVITY)
         elif not size:  # no accelerometer
             self._is_unusable = True
         elif size < _NO_GRAVITY:
@@ -176,72 +209,66 @@ class AttitudeFilter:
         else:
             self._problem = f"{named} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g. Slopes are not modelled."
         if self._problem or self._is_unusable:
-            self._samples = []
+            self._n = 0
+
+    def _set_scale(self, scale: float) -> None:
+        mount = self._mounts[self._frame or ""]
+        rotation, place = np.ascontiguousarray(mount.rotation()), np.array([mount.x, mount.y, mount.z])
+        self._imu = self._imu._replace(rotation=rotation, place=place, scale=scale)
 
     def advance(self, end_ns: int, dt_s: FloatArray, rates: FloatArray) -> Tilt | None:
         """Advance to ``end_ns``; wheels rolled at ``rates`` (n, 2) [rad/s] for ``dt_s`` (n,) [s] each, n = 0 where that is not known.
 
         The tilt since the last call, where the ground tilts; else None.
         """
-        n = next((i for i, sample in enumerate(self._samples) if sample[0] > end_ns), len(self._samples))
-        taken, self._samples = self._samples[:n], self._samples[n:]
-        if not taken or not self._scale or self._problem:
+        if not self._n or self._problem:
             return None
-        dt = (taken[-1][0] - self._last_ns) * _NS
-        self._last_ns = taken[-1][0]
-        rate = self._rotation @ np.mean([w for _, w, _ in taken], axis=0)
-        force = self._scale * (self._rotation @ np.mean([f for _, _, f in taken], axis=0))
-        velocity = None
-        if len(rates):  # of the IMU, where wheels do not slip; what they do remains unexplained
-            velocity = np.cross(rate, self._place)
-            velocity[0] += 0.5 * self._radius * float(rates[-1, 0] + rates[-1, 1])
+        wheels = np.ascontiguousarray(dt_s), np.ascontiguousarray(rates)
+        before, left = self._n, self._last_ns
+        self._n, self._last_ns, dt = _advance(self._imu, self._sums, self._stamps, self._samples, self._n, left, end_ns, wheels)
+        if self._n == before or not self._imu.scale:
+            return None
+        has_wheels = len(rates) > 0
         if not 0.0 < dt < _MAX_GAP_S:
             self._has_started = False
-            self._restart(velocity)
+            self._restart(has_wheels)
             return None
-        _rotate(self._state, self._cov, self._window, rate, force, dt, self._noise.white_rad_per_sqrt_s)
-        self._is_explained &= velocity is not None
-        self._way += abs(0.5 * self._radius * float(dt_s @ (rates[:, 0] + rates[:, 1])))
-        by_wheels = float(dt_s @ (rates[:, 1] - rates[:, 0]))
-        self._turn_by_wheels += abs(by_wheels)
-        self._agreement += by_wheels * float(rate[2])
-        self._turn += float(rate[2]) * dt
-        if self._window[6] >= (_WINDOW_S if self._has_started else _FIRST_WINDOW_S):
-            self._measure(velocity)
+        self._is_explained &= has_wheels
+        if self._sums.window[6] >= (_WINDOW_S if self._has_started else _FIRST_WINDOW_S):
+            self._measure(has_wheels)
         return self._tilt() if self._has_started else None
 
-    def _restart(self, velocity: FloatArray | None) -> None:
-        """Begin a window, over which forces are summed, at the IMU's ``velocity`` (3,) [m/s]."""
-        self._window[:] = 0.0
-        self._is_explained = velocity is not None
-        if velocity is not None:
-            self._window[3:6] = velocity
-        self._way = self._turn = 0.0
+    def _restart(self, has_wheels: bool) -> None:
+        """Begin a window, over which forces are summed, at the IMU's velocity where ``has_wheels``."""
+        self._sums.window[:], self._is_explained = 0.0, has_wheels
+        if has_wheels:
+            self._sums.window[3:6] = self._sums.velocity
+        self._sums.wheels[:2] = 0.0
 
-    def _measure(self, velocity: FloatArray | None) -> None:
+    def _measure(self, has_wheels: bool) -> None:
         """Update by gravity: the window's mean force, less what changed the velocity."""
-        force, first, seconds = self._window[:3], self._window[3:6], float(self._window[6])
-        is_explained = self._is_explained and velocity is not None
-        gravity = (force - (velocity - first) if is_explained and velocity is not None else force) / seconds
+        state, cov, window, velocity, (way, turn, _, _) = self._sums
+        is_explained = self._is_explained and has_wheels
+        gravity = (window[:3] - (velocity - window[3:6]) if is_explained else window[:3]) / window[6]
         if not self._has_started:
             self._start(gravity)
         else:
-            _update_vertical(self._state, self._cov, gravity, _EXPLAINED if is_explained else _UNEXPLAINED)
-            _separate(self._split, self._split_cov, self._state, self._cov, self._turn, self._way)
+            _update_vertical(state, cov, gravity, _EXPLAINED if is_explained else _UNEXPLAINED)
+            _separate(self._split, self._split_cov, state, cov, float(turn), float(way))
             ground, cov = self._split[2:], self._split_cov[2:, 2:]
             if not self._tilts and np.hypot(ground[0], ground[1]) > _LEVEL:
                 self._tilts = bool(ground @ np.linalg.solve(cov, ground) > _CERTAIN**2)
-        self._restart(velocity)
+        self._restart(has_wheels)
 
     def _start(self, gravity: FloatArray) -> None:
         """The first vertical."""
         up = gravity / max(float(np.linalg.norm(gravity)), 1e-9)
         if not self._is_above(float(up[2])):
             return
-        is_still = self._is_explained and not self._way and not self._turn_by_wheels
+        is_still = self._is_explained and not self._sums.wheels[0] and not self._sums.wheels[2]
         sigma = _START_SIGMA if is_still else _MOVING_SIGMA
-        self._state[:] = [*up, *self._state[3:6], 0.01 if is_still else 0.1]
-        self._cov = np.diag([sigma**2] * 3 + [_BIAS_SIGMA**2] * 3)
+        self._sums.state[:] = [*up, *self._sums.state[3:6], 0.01 if is_still else 0.1]
+        self._sums.cov[:] = np.diag([sigma**2] * 3 + [_BIAS_SIGMA**2] * 3)
         self._split_cov[2:] = self._split_cov[:, 2:] = 0.0
         self._split_cov[2, 2] = self._split_cov[3, 3] = _GROUND_SIGMA**2
         self._has_started, self._downhill = True, -up[:2] / up[2]
@@ -255,19 +282,20 @@ class AttitudeFilter:
         if up_z > -least:
             angle = math.degrees(math.acos(min(max(up_z, -1.0), 1.0)))
             self._problem = f"{named} by {angle:.0f} deg: slopes are not modelled. Correct the mount's roll and pitch."
-        elif self._turn_by_wheels > _MIN_TURN_RAD:
-            if self._agreement > 0.0:  # the gyro agrees with the mount: this driver publishes gravity, not specific force
-                self._scale = -self._scale
+        elif self._sums.wheels[2] > _MIN_TURN_RAD:
+            if self._sums.wheels[3] > 0.0:  # the gyro agrees with the mount: this driver publishes gravity, not specific force
+                self._set_scale(-self._imu.scale)
             else:
                 self._problem = f"{named}, it hangs upside down: slopes are not modelled. Correct the mount's roll or pitch."
         return False
 
     def _tilt(self) -> Tilt | None:
         """The tilt by the mount's error and the vertical as they are now."""
-        before, self._downhill = self._downhill, -self._state[:2] / max(self._state[2], _MIN_UP)
+        state = self._sums.state
+        before, self._downhill = self._downhill, -state[:2] / max(state[2], _MIN_UP)
         if not self._tilts:
             return None
-        error, P = self._split[:2], self._cov
+        error, P = self._split[:2], self._sums.cov
         now = self._downhill - error
         own = np.array([[P[1, 1], -P[0, 1]], [-P[0, 1], P[0, 0]]]) + _ACCELEROMETER_RAD**2 * np.eye(2)
         return Tilt(before - error, now, own + self._split_cov[:2, :2] + _SLOPE_EFFECT**2 * np.outer(now, now))
@@ -276,14 +304,82 @@ class AttitudeFilter:
         """Problems of the accelerometer, and their remedy."""
         if self._problem:
             return [self._problem]
-        if self._scale == GRAVITY:
+        if self._imu.scale == GRAVITY:
             return [f"the accelerometer of IMU '{self._frame}' is in g, not m/s^2: it was scaled by {GRAVITY}."]
-        if self._scale < 0.0:
+        if self._imu.scale < 0.0:
             return [f"the accelerometer of IMU '{self._frame}' publishes gravity, not specific force: its sign was turned."]
         return []
 
 
 @kernel
+def _advance(
+    imu: _Imu,
+    sums: _Sums,
+    stamps: IntArray,
+    samples: FloatArray,
+    n: int,
+    last_ns: int,
+    end_ns: int,
+    wheels: tuple[FloatArray, FloatArray],
+) -> tuple[int, int, float]:
+    """Advance by the mean of those of the first ``n`` samples, of the times ``stamps``, that are not after ``end_ns``; they are removed.
+
+    How many are left, the stamp of the last one that was used, and the time since ``last_ns`` [s]. ``wheels``: intervals (m,) and rates
+    (m, 2). Where the time is none or too long for a gap, nothing but the velocity is propagated; while the scale is unknown, nothing.
+    """
+    used = 0
+    while used < n and stamps[used] <= end_ns:
+        used += 1
+    if not used:
+        return n, last_ns, 0.0
+    dt = 0.0
+    if imu.scale:
+        dt = (stamps[used - 1] - last_ns) * _NS
+        last_ns = stamps[used - 1]
+        _add_mean(imu, sums, samples[:used], dt, wheels)
+    for i in range(used, n):
+        stamps[i - used] = stamps[i]
+        samples[i - used] = samples[i]
+    return n - used, last_ns, dt
+
+
+@subroutine
+def _add_mean(imu: _Imu, sums: _Sums, samples: FloatArray, dt: float, wheels: tuple[FloatArray, FloatArray]) -> None:
+    """Rotate by the mean of ``samples`` (n, 6), which acts for ``dt``, and add the motion of the wheels."""
+    rate, force, mean = np.zeros(3), np.zeros(3), np.zeros(6)
+    for i in range(len(samples)):
+        for j in range(6):
+            mean[j] += samples[i, j] / len(samples)
+    for i in range(3):
+        for j in range(3):
+            rate[i] += imu.rotation[i, j] * mean[j]
+            force[i] += imu.scale * imu.rotation[i, j] * mean[3 + j]
+    _sum_wheels(imu, sums, rate, dt, wheels[0], wheels[1])
+    if 0.0 < dt < _MAX_GAP_S:
+        _rotate(sums.state, sums.cov, sums.window, rate, force, dt, imu.white)
+
+
+@subroutine
+def _sum_wheels(imu: _Imu, sums: _Sums, rate: FloatArray, dt: float, dt_s: FloatArray, rates: FloatArray) -> None:
+    """The IMU's velocity at the end, and the wheels' way and turns."""
+    m, place = len(dt_s), imu.place
+    if m:
+        sums.velocity[0] = rate[1] * place[2] - rate[2] * place[1] + 0.5 * imu.radius * (rates[m - 1, 0] + rates[m - 1, 1])
+        sums.velocity[1] = rate[2] * place[0] - rate[0] * place[2]
+        sums.velocity[2] = rate[0] * place[1] - rate[1] * place[0]
+    if not 0.0 < dt < _MAX_GAP_S:
+        return
+    way, turn = 0.0, 0.0
+    for i in range(m):
+        way += dt_s[i] * (rates[i, 0] + rates[i, 1])
+        turn += dt_s[i] * (rates[i, 1] - rates[i, 0])
+    sums.wheels[0] += abs(0.5 * imu.radius * way)
+    sums.wheels[1] += rate[2] * dt
+    sums.wheels[2] += abs(turn)
+    sums.wheels[3] += turn * rate[2]
+
+
+@subroutine
 def _rotate(state: FloatArray, cov: FloatArray, window: FloatArray, rate: FloatArray, force: FloatArray, dt: float, white: float) -> None:
     """Rotate the vertical, and what the window has summed, into the body as it turns at ``rate`` (3,) for ``dt``; add ``force`` (3,)."""
     turn, half = np.empty((3, 3)), np.empty((3, 3))
