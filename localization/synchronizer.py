@@ -19,8 +19,7 @@ from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
-from motion_models.friction.slope_effect import SLIDING_MODELS, SlopeEffect
-from motion_models.online_calibration import CorrectedWheels
+from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import Cov3, FloatArray, Twist2
@@ -103,10 +102,9 @@ class Synchronizer:
         self.params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity)
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
-        inner = model.inner if isinstance(model, CorrectedWheels) else model
         self.attitude: AttitudeFilter | None = None
         """The vertical; None for models of robots that do not skid, and where `StepConfig.slopes` is off."""
-        if self.config.slopes and inner.name in SLIDING_MODELS:
+        if self.config.slopes and model.traits.is_level:
             self.attitude = AttitudeFilter(robot.gyro_noise, mounts, robot.geometry.wheel_radius_m)
             self._slope_effect = SlopeEffect.from_robot(robot)
         self.frames = LidarFrames(mounts)

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from motion_models.preintegration import preintegrate
     from motion_models.prior import SkidPrior, geometric_scaling, prior_notes, skid_prior
     from motion_models.registry import MODELS, make_model
-    from motion_models.robot import Robot, load_robot, parse_robot, robot_names
-    from motion_models.robot_file import robot_toml
+    from motion_models.robot import Robot
+    from motion_models.robot_file import load_robot, parse_robot, robot_names, robot_toml
     from motion_models.skid_steer import SkidSteer, thesis_coefficients
     from motion_models.slope import Slope, SlopeTwist
 
@@ -137,8 +137,8 @@ _MODULES = {
     "motion_models.preintegration": "preintegrate",
     "motion_models.prior": "SkidPrior geometric_scaling prior_notes skid_prior",
     "motion_models.registry": "MODELS make_model",
-    "motion_models.robot": "Robot load_robot parse_robot robot_names",
-    "motion_models.robot_file": "robot_toml",
+    "motion_models.robot": "Robot",
+    "motion_models.robot_file": "load_robot parse_robot robot_names robot_toml",
     "motion_models.skid_steer": "SkidSteer thesis_coefficients",
     "motion_models.slope": "Slope SlopeTwist",
 }

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from motion_models.param import Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -60,12 +61,25 @@ class Motion:
     """(3, 2) change of ``delta`` (right perturbation) by a CG error that is the same over all of it."""
 
 
+class FieldPrior(NamedTuple):
+    """Corrections of all parameters of a model at once, which another centre of gravity makes necessary."""
+
+    cov: FloatArray
+    """(k, k) prior covariance of the parameters."""
+    spread: FloatArray
+    """(k, k) part of it that drifts with floor and load; what remains is the misfit of the model, which is constant."""
+
+
 class MotionModel(Protocol):
-    """From wheel rates and centre of gravity to a body twist. A frozen dataclass; add it to `motion_models.registry`."""
+    """From wheel rates and centre of gravity to a body twist. A frozen dataclass that inherits from `ModelBase`."""
 
     @property
     def name(self) -> str:
         """Id of the model, as on the command line and in robot files."""
+
+    @property
+    def params(self) -> tuple[Param, ...]:
+        """The k parameters."""
 
     @property
     def param_names(self) -> tuple[str, ...]:
@@ -74,6 +88,16 @@ class MotionModel(Protocol):
     @property
     def nominal(self) -> FloatArray:
         """(k,) the robot's own values of the parameters."""
+
+    @property
+    def traits(self) -> Traits:
+        """What estimators and robot files have to be given about the model beside its parameters."""
+
+    def with_correction_params(self) -> MotionModel:
+        """The model with the parameters that its corrections need beside its own."""
+
+    def field_prior(self) -> FieldPrior | None:
+        """Prior of the form ``cg_field`` of corrections, where that corrects all parameters; None where it is that of their table."""
 
     @classmethod
     def from_robot(cls, robot: Robot) -> MotionModel:
@@ -84,3 +108,72 @@ class MotionModel(Protocol):
 
     def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
         """Wheel rates (..., 2) [rad/s] for a wanted ``command`` (..., 2): vx [m/s] and wz [rad/s]; vy cannot be commanded."""
+
+
+class ModelBase:
+    """Base of motion models: what follows from the table of parameters, and the defaults of what a model need not have."""
+
+    params: ClassVar[tuple[Param, ...]]
+    """The k parameters."""
+    param_names: ClassVar[tuple[str, ...]]
+    """Names of ``params``, by `__init_subclass__`."""
+    traits: ClassVar[Traits] = Traits()
+
+    def __init_subclass__(cls) -> None:
+        """Names of the parameters, once for the class."""
+        cls.param_names = tuple(p.name for p in cls.params)
+
+    def with_correction_params(self: MotionModel) -> MotionModel:
+        """See `MotionModel.with_correction_params`: itself."""
+        return self
+
+    def field_prior(self) -> FieldPrior | None:
+        """See `MotionModel.field_prior`: none."""
+        return None
+
+
+@dataclass(frozen=True)
+class ModelWrapper:
+    """A model that is ``inner`` but for what a subclass changes."""
+
+    inner: MotionModel
+
+    @property
+    def name(self) -> str:
+        """Name of the inner model."""
+        return self.inner.name
+
+    @property
+    def params(self) -> tuple[Param, ...]:
+        """The k parameters."""
+        return self.inner.params
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names of the k parameters."""
+        return tuple(p.name for p in self.params)
+
+    @property
+    def traits(self) -> Traits:
+        """Those of the inner model."""
+        return self.inner.traits
+
+    def with_correction_params(self: MotionModel) -> MotionModel:
+        """See `MotionModel.with_correction_params`: itself."""
+        return self
+
+    def field_prior(self) -> FieldPrior | None:
+        """See `MotionModel.field_prior`."""
+        return self.inner.field_prior()
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> MotionModel:
+        """Raises `NotImplementedError`: it wraps a model, which a robot file does not name."""
+        raise NotImplementedError(f"wrap the model of {robot.name}: {cls.__name__}(make_model(name, robot)).")
+
+
+def prior_sigmas(model: MotionModel) -> FloatArray:
+    """(k,) standard deviations of the parameters of a robot without a calibration, by its geometry (`motion_models.prior`); 0 for those
+    of a calibration, and where the model has no such prior."""
+    own = getattr(model, "sigmas", None)
+    return np.zeros(len(model.param_names)) if own is None else np.asarray(own, dtype=np.float64)

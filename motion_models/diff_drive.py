@@ -7,14 +7,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import Twist
+from motion_models.base import ModelBase, Twist
 from motion_models.compiled import kernel
+from motion_models.param import TURNING_SIGMA, Free, Param
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 
 @dataclass(frozen=True)
-class DiffDrive:
+class DiffDrive(ModelBase):
     """Ebersole 2016, eqs. 1.4-1.8: no sideways motion, and a track widened by the wheel separation multiplier.
 
     Parameters: the wheels' radius [m] and the multiplier [-].
@@ -25,7 +26,14 @@ class DiffDrive:
     nominal: FloatArray
     """(2,) wheel radius [m], wheel separation multiplier [-]."""
     name: ClassVar[str] = "diff_drive"
-    param_names: ClassVar[tuple[str, ...]] = ("wheel_radius", "wheel_separation_multiplier")
+    params: ClassVar[tuple[Param, ...]] = (
+        Param("wheel_radius", "m", "how far the robot drives per radian of its wheels", free=Free(logs=2)),
+        Param(
+            "wheel_separation_multiplier",
+            *("1", "track that the robot turns by, over the real one", TURNING_SIGMA, "wheel_separation_multiplier"),
+            free=Free(logs=1, turns=1, rotations=1),
+        ),
+    )
 
     @classmethod
     def from_robot(cls, robot: Robot) -> DiffDrive:

@@ -14,9 +14,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import Twist
+from motion_models.base import ModelBase, Twist
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
+from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Direction, Free, Param, Traits
 from motion_models.prior import slip_at_speed
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
@@ -25,10 +26,25 @@ _NEWTON_STEPS = 50
 """Most Newton steps of the inverse; commands that have a solution take under ten."""
 _CONVERGED = 1e-12
 """Error of the inverse [m/s, rad/s], over 1 + the command: rounding."""
+_LATERAL_SLIP_S, _ROTATION_SLIP_S_PER_M = 0.05, 0.01
+"""Prior sigmas where there is none of the robot's own (`motion_models.prior.slip_at_speed`: 0.02 to 0.09 s, and under 0.01 s/m)."""
+_DIRECTIONS = (
+    # both columns by one factor: separate ones would turn a robot that drives straight, as a gyro bias does
+    Direction(
+        "rotation_scale",
+        *("1", "yaw rate of given wheel rates, relative", TURNING_SIGMA),
+        {"wz_left": ("wz_left", 1.0), "wz_right": ("wz_right", 1.0)},
+    ),
+    Direction(
+        "x_cr",
+        *("m", "centre of rotation ahead of the middle", CENTRE_X_SIGMA_M),
+        {"vy_left": ("wz_left", -1.0), "vy_right": ("wz_right", -1.0)},
+    ),
+)
 
 
 @dataclass(frozen=True)
-class FullLinear:
+class FullLinear(ModelBase):
     """A 3x2 matrix from wheel rates to twist, then six optional terms, all 0 unless the robot's file or a fit sets them.
 
     u = vx_left q_l + vx_right q_r     b = vy_left q_l + vy_right q_r     w = wz_left q_l + wz_right q_r
@@ -51,11 +67,21 @@ class FullLinear:
     sigmas: FloatArray = field(default_factory=lambda: np.zeros(12))
     """(12,) standard deviations of terms of which only the size is known, from the robot's geometry (`motion_models.prior`); else 0."""
     name: ClassVar[str] = "full_linear"
-    param_names: ClassVar[tuple[str, ...]] = (
-        *("vx_left", "vx_right", "vy_left", "vy_right", "wz_left", "wz_right"),
-        *("lateral_slip_speed", "longitudinal_slip_turning", "longitudinal_slip_curvature"),
-        *("rotation_slip_speed", "rotation_slip_rate", "rotation_slip_curvature"),
+    params: ClassVar[tuple[Param, ...]] = (
+        Param("vx_left", "m/rad", "forward motion by the left wheels", free=Free(logs=2, rotations=3)),
+        Param("vx_right", "m/rad", "forward motion by the right wheels", free=Free(logs=6, rotations=5), mirror=("vx_left", 1.0)),
+        Param("vy_left", "m/rad", "sideways motion by the left wheels", free=Free(logs=3, rotations=2)),
+        Param("vy_right", "m/rad", "sideways motion by the right wheels", free=Free(logs=7, rotations=6), mirror=("vy_left", -1.0)),
+        Param("wz_left", "rad/rad", "turning by the left wheels", free=Free(logs=1, turns=1, rotations=1)),
+        Param("wz_right", "rad/rad", "turning by the right wheels", free=Free(logs=5, turns=2, rotations=4), mirror=("wz_left", -1.0)),
+        Param("lateral_slip_speed", "s", "sideways speed v wz times this", _LATERAL_SLIP_S, forms=()),
+        Param("longitudinal_slip_turning", "s", "share of the forward speed lost per yaw rate"),
+        Param("longitudinal_slip_curvature", "1", "forward speed lost to turning, at its most", free=Free(logs=4)),
+        Param("rotation_slip_speed", "s/m", "share of the yaw rate lost per speed", _ROTATION_SLIP_S_PER_M, forms=()),
+        Param("rotation_slip_rate", "s", "share of the yaw rate lost per yaw rate"),
+        Param("rotation_slip_curvature", "1", "share of the yaw rate lost in straight driving, against turning in place"),
     )
+    traits: ClassVar[Traits] = Traits(directions=_DIRECTIONS)
 
     @classmethod
     def from_robot(cls, robot: Robot) -> FullLinear:

@@ -13,15 +13,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import Twist
+from motion_models.base import ModelBase, Twist
 from motion_models.compiled import kernel
+from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
 
 
 @dataclass(frozen=True)
-class Icr:
+class Icr(ModelBase):
     """Five parameters: the three ICRs in the body frame [m], and the effectiveness alpha of each side: tread speed over r q [-].
 
     At its own ICR a side's tread does not slip lengthwise, so the body moves there as the tread does:
@@ -39,7 +40,23 @@ class Icr:
     sigmas: FloatArray = field(default_factory=lambda: np.zeros(5))
     """(5,) standard deviations of those that come from the robot's geometry (`motion_models.prior`); 0 for those of a calibration."""
     name: ClassVar[str] = "icr"
-    param_names: ClassVar[tuple[str, ...]] = ("y_icr_left", "y_icr_right", "x_icr", "alpha_left", "alpha_right")
+    params: ClassVar[tuple[Param, ...]] = (
+        Param(
+            "y_icr_left",
+            *("m", "where the left treads do not slip lengthwise, left of the middle", TURNING_SIGMA, "y_icr_left"),
+            free=Free(logs=1, turns=1, rotations=1),
+        ),
+        Param(
+            "y_icr_right",
+            *("m", "where the right treads do not slip lengthwise, left of the middle (negative)", TURNING_SIGMA, "y_icr_left"),
+            free=Free(logs=5, turns=2, rotations=3),
+            mirror=("y_icr_left", -1.0),
+        ),
+        Param("x_icr", "m", "centre of rotation ahead of the middle", CENTRE_X_SIGMA_M, free=Free(logs=2, rotations=2)),
+        Param("alpha_left", "1", "effectiveness: tread speed of the left side over that of its wheels", free=Free(logs=3)),
+        Param("alpha_right", "1", "effectiveness of the right side", free=Free(logs=4), mirror=("alpha_left", 1.0)),
+    )
+    traits: ClassVar[Traits] = Traits(is_level=True)
 
     @classmethod
     def from_robot(cls, robot: Robot) -> Icr:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import ModelError
 from motion_models.friction import FrictionModel
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
+from motion_models.param import Param, Traits
 from motion_models.robot import Robot
 from motion_models.skid_steer import SkidSteer
 
@@ -18,6 +21,16 @@ MODELS: dict[str, type[MotionModel]] = {
     FullLinear.name: FullLinear,
     FrictionModel.name: FrictionModel,
 }
+
+
+def params_of(model: str) -> tuple[Param, ...]:
+    """Parameters of the motion model ``model``."""
+    return cast(tuple[Param, ...], MODELS[model].params)  # of the class, where the interface has a property
+
+
+def traits_of(model: str) -> Traits:
+    """Traits of the motion model ``model``."""
+    return cast(Traits, MODELS[model].traits)
 
 
 def make_model(name: str, robot: Robot) -> MotionModel:

@@ -1,4 +1,4 @@
-"""Robot files (TOML): how a robot is written as one, and the reference of all their keys.
+"""Robot files (TOML): how a robot is read from one and written as one, and the reference of all their keys.
 
 python -m motion_models.robot_file > motion_models/robots/README.md
 """
@@ -7,21 +7,38 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import difflib
 import inspect
 import json
 import os
 import re
 import textwrap
+import tomllib
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from motion_models.calibration.plan import MEANING
 from motion_models.center_of_gravity.parts import Arms
-from motion_models.registry import MODELS
-from motion_models.robot import DRIVES, MODEL_OPTIONS, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
+from motion_models.errors import RobotError
+from motion_models.registry import MODELS, params_of, traits_of
+from motion_models.robot import DRIVES, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
+from motion_models.text_files import read_text
+
+Section = TypeVar("Section")
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_LARGEST = 1e9
+"""Largest number of a robot, in SI units; the largest that robots have are stiffnesses and inertias of 1e6."""
+_LONGEST_M = 100.0
+"""Largest length of a robot [m]; the largest mining vehicles have 20."""
+_MOST_CHARACTERS = 1 << 20
+"""Most characters of a robot file; the longest that is shipped has 1,200."""
+_MOST_DOTS = 200
+"""In one line of a robot file: the names of a dozen wheels with their namespaces have fewer."""
+_LARGEST_CLOCK_OFFSET_S = 10.0
+"""Beyond it clocks are not synchronized, and no offset is constant [s]."""
+_LONGEST_SHOWN = 60  # characters of what a user wrote, in a message
 
 _SECTIONS: tuple[tuple[str, type[Any]], ...] = (
     ("geometry", Geometry),
@@ -43,6 +60,217 @@ Lengths are in metres, angles in radians, masses in kilograms; unknown keys are 
 
 This page is generated from the dataclasses (`python -m motion_models.robot_file`), and a test compares both.
 """
+
+
+def robot_names() -> list[str]:
+    """Names of the robots that are shipped."""
+    return sorted(f.name.removesuffix(".toml") for f in (resources.files(__package__) / "robots").iterdir() if f.name.endswith(".toml"))
+
+
+def load_robot(robot: str | Path) -> Robot:
+    """The robot of a shipped name (`robot_names`) or of a path to a TOML file. Raises `RobotError`.
+
+    >>> robot = load_robot("vaultbot")
+    >>> robot.geometry.track_width_m, robot.driver.wheel_separation_multiplier
+    (0.56, 1.875)
+    """
+    path = Path(robot)
+    if path.suffix == ".toml":
+        try:
+            text = read_text(path)
+        except OSError as error:
+            raise RobotError(f"robot file '{path}' cannot be read: {error.strerror}.") from error
+        except UnicodeDecodeError as error:
+            raise RobotError(f"robot file '{path}' is not text (byte {error.start} is not UTF-8).") from error
+        return parse_robot(text, source=str(path), folder=path.parent.absolute())
+    if str(robot) not in robot_names():
+        raise RobotError(f"no robot '{robot}'; shipped are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
+    text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")
+    return parse_robot(text, source=f"{robot}.toml")
+
+
+def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
+    """The robot of a TOML text; ``source`` names it in errors, ``folder`` is where paths in it start. Raises `RobotError`."""
+    _refuse_long_keys(text, source)
+    try:
+        data = tomllib.loads(text)
+    except ValueError as error:  # what the parser raises, and for a number of thousands of digits
+        raise RobotError(f"{source}: not valid TOML: {error}.") from error
+    except RecursionError as error:
+        raise RobotError(f"{source}: not valid TOML: its brackets are nested too deeply.") from error
+    known = {f.name for f in dataclasses.fields(Robot)} - {"folder", "options"}
+    _refuse_unknown(data, known, source)
+    if not isinstance(data.get("name"), str):
+        raise RobotError(f'{source}: needs a line name = "...".')
+    drive = data.get("drive", DRIVES[0])
+    if drive not in DRIVES:
+        raise RobotError(f"{source}: drive is {drive!r}; there are {', '.join(DRIVES)}.")
+    geometry = _section(Geometry, data, "geometry", source)
+    for name in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg"):
+        if not getattr(geometry, name) > 0:
+            raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be positive.")
+    for name in ("left_wheel_radius_multiplier", "right_wheel_radius_multiplier"):
+        if not 0.1 < getattr(geometry, name) < 10.0:
+            raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be near 1.")
+    for name, value in dataclasses.asdict(geometry).items():
+        if name.endswith("_m") and abs(value) > _LONGEST_M:
+            raise RobotError(f"{source}: geometry.{name} is {value:g}; it must be in metres, and at most {_LONGEST_M:g}.")
+    driver = _section(Driver, data, "driver", source) if "driver" in data else Driver(geometry.wheel_radius_m, geometry.track_width_m)
+    if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
+        raise RobotError(f"{source}: every number of [driver] must be positive.")
+    mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table_of(data, "mounts", source).items()}
+    models, options = _models(_table_of(data, "models", source), source)
+    return Robot(
+        name=data["name"],
+        geometry=geometry,
+        driver=driver,
+        drive=drive,
+        topics=_section(Topics, data, "topics", source),
+        joints=_joints(data, source),
+        imu=_imu(data, source),
+        mounts=mounts,
+        wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
+        gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
+        clock=_clock(data, source),
+        models=models,
+        options=options,
+        arms=_arms(data, source) if "arms" in data else None,
+        folder=folder,
+    )
+
+
+def _refuse_long_keys(text: str, source: str) -> None:
+    """Raises `RobotError` for lines with so many dots that they can only be a key of as many parts, or a file too long for a robot's.
+
+    The parser stores each beginning of a dotted key: a key of 20,000 parts takes 2.5 GB.
+    """
+    if len(text) > _MOST_CHARACTERS:
+        raise RobotError(f"{source}: has {len(text)} characters; a robot file has at most {_MOST_CHARACTERS}.")
+    for number, line in enumerate(text.splitlines(), 1):
+        dots = line.count(".")
+        if dots > _MOST_DOTS and not line.lstrip().startswith("#"):
+            raise RobotError(f"{source}: line {number} has {dots} dots; names of robot files have at most three.")
+
+
+def _joints(data: Mapping[str, Any], source: str) -> Joints:
+    joints = _section(Joints, data, "joints", source)
+    if shared := sorted(set(joints.left) & set(joints.right)):
+        raise RobotError(f"{source}: joints.left and joints.right both hold {', '.join(shared)}; a wheel is on one side.")
+    unknown = sorted({*joints.reversed} - {*joints.left, *joints.right})
+    if unknown:
+        raise RobotError(f"{source}: joints.reversed names {', '.join(unknown)}, which is neither in joints.left nor in joints.right.")
+    if min(joints.angle_unit_rad, joints.rate_unit_rad_s) <= 0.0 or joints.angle_range < 0.0:
+        raise RobotError(f"{source}: units of [joints] must be positive; wheels that count backwards are named in joints.reversed.")
+    return joints
+
+
+def _imu(data: Mapping[str, Any], source: str) -> Imu:
+    imu = _section(Imu, data, "imu", source)
+    if imu.rate_unit_rad_s == 0.0:
+        raise RobotError(f"{source}: imu.rate_unit_rad_s is 0; it is 1 for rad/s and 0.0174533 for degrees per second.")
+    return imu
+
+
+def _clock(data: Mapping[str, Any], source: str) -> Clock:
+    clock = _section(Clock, data, "clock", source)
+    for entry, value in dataclasses.asdict(clock).items():
+        if abs(value) > _LARGEST_CLOCK_OFFSET_S:
+            raise RobotError(
+                f"{source}: clock.{entry} is {value:g} s; it must be at most {_LARGEST_CLOCK_OFFSET_S:g}. Synchronize the clocks."
+            )
+    return clock
+
+
+def _noise(kind: type[Section], data: Mapping[str, Any], name: str, source: str) -> Section:
+    noise = _section(kind, data, name, source)
+    for entry, value in dataclasses.asdict(noise).items():  # type: ignore[call-overload]
+        if value < 0.0:
+            raise RobotError(f"{source}: {name}.{entry} is {value:g}; it must not be below 0.")
+    return noise
+
+
+def _models(tables: Mapping[str, Any], source: str) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, str | bool]]]:
+    """Coefficients and choices of each model."""
+    _refuse_unknown(tables, set(MODELS), f"{source}, [models]")
+    models: dict[str, dict[str, float]] = {}
+    options: dict[str, dict[str, str | bool]] = {}
+    for model in tables:
+        table, choices = _table_of(tables, model, source), traits_of(model).options
+        _refuse_unknown(table, {*(p.name for p in params_of(model)), *choices}, f"{source}, [models.{model}]")
+        models[model] = {name: _number(value, f"models.{model}.{name}", source) for name, value in table.items() if name not in choices}
+        for name in table.keys() & choices:
+            if not isinstance(table[name], str | bool):
+                raise RobotError(f"{source}: models.{model}.{name} must be text or true or false, found {table[name]!r}.")
+            options.setdefault(model, {})[name] = table[name]
+    return models, options
+
+
+def _arms(data: Mapping[str, Any], source: str) -> Arms:
+    arms = _section(Arms, data, "arms", source)
+    for name, value in dataclasses.asdict(arms).items():
+        if ("sigma" in name or name in ("static_mass_kg", "payload_kg")) and value < 0.0:
+            raise RobotError(f"{source}: arms.{name} is {value:g}; it must not be below 0.")
+    if arms.payload_kg > 0.0 and not arms.payload_link:
+        raise RobotError(f"{source}: arms.payload_kg is {arms.payload_kg:g}, but arms.payload_link names no link that holds it.")
+    if arms.weighed_posture and not arms.postures:
+        raise RobotError(f"{source}: arms.weighed_posture names '{arms.weighed_posture}', but arms.postures names no SRDF that has it.")
+    return arms
+
+
+def _table_of(data: Mapping[str, Any], name: str, source: str) -> Mapping[str, Any]:
+    table = data.get(name, {})
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{source}: '{name}' must be a table ([{name}]), found {table!r}.")
+    return table
+
+
+def _section(kind: type[Section], data: Mapping[str, Any], name: str, source: str) -> Section:
+    return _build(kind, _table_of(data, name, source), name, source)
+
+
+def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
+    if not isinstance(table, Mapping):
+        raise RobotError(f"{source}: '{name}' must be a table, found {table!r}.")
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    _refuse_unknown(table, set(fields), f"{source}, [{name}]")
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        declared = str(fields[key].type)
+        if declared == "float":
+            values[key] = _number(value, f"{name}.{key}", source)
+        elif declared == "str":
+            if not isinstance(value, str):
+                raise RobotError(f"{source}: {name}.{key} must be text, found {value!r}.")
+            values[key] = value
+        else:
+            if not isinstance(value, list) or not value or not all(isinstance(v, str) for v in value):
+                raise RobotError(f"{source}: {name}.{key} must be a list of names, found {value!r}.")
+            values[key] = tuple(value)
+    missing = [
+        f.name
+        for f in fields.values()
+        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and f.name not in values
+    ]
+    if missing:
+        raise RobotError(f"{source}: [{name}] has no {', '.join(missing)}.")
+    return kind(**values)
+
+
+def _refuse_unknown(table: Mapping[str, Any], known: set[str], where: str) -> None:
+    unknown = sorted(set(table) - known)
+    if unknown:
+        nearest = difflib.get_close_matches(unknown[0][:_LONGEST_SHOWN], sorted(known), n=1)
+        meant = f" (did you mean {nearest[0]}?)" if nearest else ""
+        named = ", ".join(name if len(name) <= _LONGEST_SHOWN else f"{name[:_LONGEST_SHOWN]}..." for name in unknown[:10])
+        raise RobotError(f"{where}: unknown entry {named}{meant}; known are {', '.join(sorted(known))}.")
+
+
+def _number(value: Any, name: str, source: str) -> float:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not -_LARGEST <= value <= _LARGEST:  # false for NaN
+        found = repr(value) if not isinstance(value, int) or abs(value) < 10**20 else "an integer of more than 20 digits"
+        raise RobotError(f"{source}: {name} must be a finite number of at most {_LARGEST:g}, found {found[:_LONGEST_SHOWN]}.")
+    return float(value)
 
 
 def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = None, remarks: str = "") -> str:
@@ -140,13 +368,9 @@ def reference() -> str:
     for name, model in MODELS.items():
         doc = (inspect.getdoc(model) or "").split("\n", 1)[0]
         lines += ["", f"### [models.{name}]", "", doc, "", "| key | meaning |", "|---|---|"]
-        lines += [f"| `{key}` | {MEANING.get(key, '')} |" for key in _parameters(model)]
-        lines += [f"| `{key}` | choice, see `motion_models.{name}` |" for key in MODEL_OPTIONS.get(name, ())]
+        lines += [f"| `{p.name}` | {p.text} |" for p in params_of(name)]
+        lines += [f"| `{key}` | choice, see `motion_models.{name}` |" for key in traits_of(name).options]
     return "\n".join(lines) + "\n"
-
-
-def _parameters(model: type[Any]) -> tuple[str, ...]:
-    return tuple(model.param_names)
 
 
 def _header() -> list[str]:

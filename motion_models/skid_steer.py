@@ -7,13 +7,21 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from motion_models.base import Twist
+from motion_models.base import FieldPrior, ModelBase, Twist
 from motion_models.compiled import kernel, subroutine
+from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, TURNING_SIGMA, Free, Param, Traits
 from motion_models.prior import skid_prior
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 _Number = TypeVar("_Number", float, FloatArray)
+_IN_PLACE = 0.25
+"""`Traits.min_track_over_radius`: on gentler arcs tyres creep, which regressions of rotations in place do not cover."""
+
+# The rotations of Ebersole 2016, Ch. 4, to which the coefficients were fitted: positions of the CG [m], and the scatter
+# about the fits of k [-], x_CR and y_CR [m] (`regressions.skid_steer_fit`). They give the covariance of the fits.
+_GRID_X, _GRID_Y = np.arange(-3, 7) * 0.02, np.arange(-3, 4) * 0.01
+_SCATTER_K, _SCATTER_X_CR, _SCATTER_Y_CR = 0.014517, 0.011514, 0.0059057
 YcrVariant = Literal["multivariate", "full", "symmetric"]
 
 # Ebersole 2016: 4.21 divided by its 1.875, 4.22; then y_CR as a polynomial in x_G (c) plus y_G times one (s).
@@ -32,7 +40,7 @@ def thesis_coefficients(variant: YcrVariant = "symmetric") -> FloatArray:
 
 
 @dataclass(frozen=True)
-class SkidSteer:
+class SkidSteer(ModelBase):
     """Ebersole 2016, eqs. 4.6-4.18, with the regressions on the CG as parameters:
 
     k    = k_0 + k_1 x_G + k_2 x_G^2                                                   (4.21)
@@ -51,10 +59,32 @@ class SkidSteer:
     sigmas: FloatArray = field(default_factory=lambda: np.zeros(11))
     """(11,) standard deviations of those that come from the robot's geometry (`motion_models.prior`); 0 for those of a calibration."""
     name: ClassVar[str] = "skid_steer"
-    param_names: ClassVar[tuple[str, ...]] = (
-        *("k_0", "k_1", "k_2", "x_cr_0", "x_cr_1"),
-        *("y_cr_0", "y_cr_1", "y_cr_2", "y_cr_s0", "y_cr_s1", "y_cr_s2"),
+    params: ClassVar[tuple[Param, ...]] = (
+        Param(
+            "k_0",
+            *("1", "k, yaw rate over that of wheels without slip, at CG x = 0", TURNING_SIGMA, "k_0"),
+            free=Free(logs=1, moving_cg=1, turns=1),
+        ),
+        Param("k_1", "1/m", "change of k with the CG ahead", free=Free(moving_cg=6), size=1.0),
+        Param("k_2", "1/m^2", "how k grows when the CG leaves the middle", free=Free(moving_cg=5)),
+        Param(
+            "x_cr_0",
+            *("m", "centre of rotation ahead of the middle, at CG x = 0", CENTRE_X_SIGMA_M),
+            free=Free(logs=2, moving_cg=2),
+        ),
+        Param("x_cr_1", "1", "change of the centre of rotation ahead with the CG ahead", free=Free(moving_cg=4)),
+        Param(
+            "y_cr_0",
+            *("m", "centre of rotation left of the middle, at CG (0, 0)", CENTRE_Y_SIGMA_M),
+            free=Free(logs=3, moving_cg=3),
+        ),
+        Param("y_cr_1", "1", "change of the centre of rotation to the left with the CG ahead"),
+        Param("y_cr_2", "1/m", "curvature of y_CR over the CG ahead"),
+        Param("y_cr_s0", "1", "change of the centre of rotation to the left with the CG left", free=Free(moving_cg=7)),
+        Param("y_cr_s1", "1/m", "change of y_cr_s0 with the CG ahead"),
+        Param("y_cr_s2", "1/m^2", "curvature of y_cr_s0 over the CG ahead"),
     )
+    traits: ClassVar[Traits] = Traits(is_level=True, min_track_over_radius=_IN_PLACE)
 
     @classmethod
     def from_robot(cls, robot: Robot) -> SkidSteer:
@@ -65,6 +95,20 @@ class SkidSteer:
         prior = skid_prior(robot)
         sigmas = np.array([0.0 if name in own else s for name, s in zip(cls.param_names, prior.sigmas, strict=True)])
         return cls(radius, track, robot.coefficients(cls.name, cls.param_names, prior.coefficients), sigmas)
+
+    def field_prior(self) -> FieldPrior:
+        """See `MotionModel.field_prior`: every coefficient of the regressions on the CG.
+
+        Floors and loads drift; the misfit of the regressions does not change.
+        """
+        n = len(self.nominal)
+        floor = np.zeros((n, 3))
+        sigma_k = float(self.sigmas[0])
+        turning = sigma_k / self.nominal[0] if sigma_k else TURNING_SIGMA
+        floor[0:3, 0] = turning * self.nominal[0:3]  # another floor scales k at every CG
+        floor[3, 1], floor[5, 2] = CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M
+        spread = floor @ floor.T
+        return FieldPrior(_regression_cov() + spread, spread)
 
     def rotation(self, cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """k [-], x_CR [m] and y_CR [m], each (...,), for ``cg`` (..., 2)."""
@@ -82,6 +126,25 @@ class SkidSteer:
         forward = vx - wz * y_cr
         half = wz * self.track_width / (2.0 * k)
         return np.stack([forward - half, forward + half], axis=-1) / self.wheel_radius  # 4.17, 4.18
+
+
+def _regression_cov() -> FloatArray:
+    """(11, 11) covariance of the coefficients by the thesis's rotations: s^2 (X^T X)^-1 n / p for each regression.
+
+    A CG position is off its regression by the scatter s systematically, not by noise that more rotations average out. The n samples over
+    p coefficients give predictions that variance s^2, on the mean over the grid.
+    """
+    x, y = (a.ravel() for a in np.meshgrid(_GRID_X, _GRID_Y))
+    reached = ~((x > 0.11) & (np.abs(y) > 0.025))  # without the two front corners, which the arms did not reach
+    x, y = x[reached], y[reached]
+    powers = np.stack([np.ones_like(x), x, x**2], axis=-1)
+    designs = (_SCATTER_K, powers), (_SCATTER_X_CR, powers[:, :2]), (_SCATTER_Y_CR, np.hstack([powers, powers * y[:, None]]))
+    cov, at = np.zeros((11, 11)), 0
+    for scatter, design in designs:
+        own = slice(at, at + design.shape[1])
+        cov[own, own] = len(x) / design.shape[1] * scatter**2 * np.linalg.inv(design.T @ design)
+        at = own.stop
+    return cov
 
 
 @subroutine

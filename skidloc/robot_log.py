@@ -25,7 +25,8 @@ from localization.pipeline import ReplayConfig, Trial, replay
 from localization.trajectory import Trajectory
 from motion_models.errors import ModelError
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 if TYPE_CHECKING:

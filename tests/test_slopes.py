@@ -17,7 +17,8 @@ from localization.simulation.simulator import Simulation, SimulationConfig, writ
 from localization.synchronizer import StepConfig
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import between
 
 ROBOT = load_robot("husky_a200")

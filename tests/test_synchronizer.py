@@ -19,7 +19,8 @@ from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.steps import last_steps, steps, steps_after
 

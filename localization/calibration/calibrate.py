@@ -194,7 +194,7 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     if not maneuvers:
         sources = " ".join(f"{each.source}: {each.warnings[0]}" if each.warnings else each.source for each in cuts)
         raise CalibrationError(f"no motion to calibrate on. {sources} {ADVICE}")
-    if (model.name == "skid_steer" and not of_rotations) or set(free) & set(RADIUS_NAMES):
+    if (not of_rotations and not _has_own_radius(model)) or set(free) & set(RADIUS_NAMES):
         model = CorrectedWheels(model)
     wanted = tuple(free) or free_of(model, maneuvers, of_rotations)
     # In a table of rotations nothing slips at random: every row has the same wheels, and its own errors.
@@ -220,6 +220,11 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     is_learned = heldout is not None and not of_rotations
     noise = learn_noise(found.fit, maneuvers, heldout.residuals) if heldout is not None and is_learned else LearnedNoise(1.0, 1.0)
     return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise, clock_offset_s)
+
+
+def _has_own_radius(model: MotionModel) -> bool:
+    """Whether a parameter of ``model`` changes how far the robot drives straight ahead."""
+    return bool(model.twist(np.ones(2), np.zeros(2), model.nominal).d_params[0].any())
 
 
 def _significant_clock(found: Fit, cuts: Sequence[Cut]) -> float:

@@ -34,8 +34,8 @@ from motion_models.calibration.ros_export import diff_drive_controller_yaml, rob
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
-from motion_models.robot_file import relocated, robot_toml
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot, relocated, robot_toml
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
 

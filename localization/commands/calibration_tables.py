@@ -15,7 +15,7 @@ from localization.calibration.windows import driven
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import Interval, LearnedNoise, root_mean, root_mean_gain
-from motion_models.calibration.plan import CLOCK, MEANING
+from motion_models.calibration.plan import CLOCK, text_of
 from motion_models.calibration.regressions import (
     COMMANDED_RAD_PER_S,
     Regression,
@@ -56,7 +56,7 @@ def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequenc
     )
     table.columns[4].justify = "left"
     for name, (before, value, sigma) in _parameters(found).items():
-        add_row(table, name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
+        add_row(table, name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", text_of(found.model, name))
     print_table(console, table)
     if found.calibration.held:
         print_line(console, "\nNot revealed by this drive, and held:")
@@ -175,7 +175,7 @@ def calibration_numbers(
         "maneuvers": sum(len(each.maneuvers) for each in cuts),
         "witness": {each.source: each.measured_by for each in cuts},
         "parameters": {
-            name: {"value": value, "sigma": sigma, "before": before, "meaning": MEANING.get(name, "")}
+            name: {"value": value, "sigma": sigma, "before": before, "meaning": text_of(found.model, name)}
             for name, (before, value, sigma) in _parameters(found).items()
         },
         "held": [{"parameter": name, "why": why} for name, why in found.calibration.held],
@@ -246,8 +246,8 @@ def print_regressions(console: Console, table: RotationTable, found: SkidSteerFi
     print_table(console, rms)
     free = plain_table("skid_steer, all rows at once", "value", "sigma", "meaning", title="")
     free.columns[3].justify = "left"
-    for name, value, sigma in zip(SkidSteer.param_names, found.coefficients, np.sqrt(np.diagonal(found.cov)), strict=True):
-        add_row(free, name, f"{value:.5g}", f"{sigma:.2g}", MEANING.get(name, ""))
+    for param, value, sigma in zip(SkidSteer.params, found.coefficients, np.sqrt(np.diagonal(found.cov)), strict=True):
+        add_row(free, param.name, f"{value:.5g}", f"{sigma:.2g}", param.text)
     print_table(console, free)
 
 
@@ -326,7 +326,7 @@ def regression_numbers(
 
     return {
         "rotations": len(table.ratio),
-        "parameters": {name: {"value": value, "sigma": sigmas[name], "meaning": MEANING.get(name, "")} for name, value in values.items()},
+        "parameters": {p.name: {"value": values[p.name], "sigma": sigmas[p.name], "meaning": p.text} for p in SkidSteer.params},
         "regressions": {
             "rotation_ratio": numbers(rotation_ratio(table)),
             "x_cr": numbers(cor_x(table)),

@@ -22,8 +22,7 @@ from localization.output import as_text, check_outputs, versions, write_text_fil
 from localization.report.check_page import write_check_page
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml, slam_toolbox_yaml
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
-from motion_models.robot_file import relocated, robot_toml
+from motion_models.robot_file import load_robot, relocated, robot_toml
 
 _COLOURS = {"ok": "green", "contradiction": "red", "cannot be seen": "yellow"}
 

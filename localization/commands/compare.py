@@ -29,7 +29,7 @@ from localization.pipeline import ReplayConfig
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,8 @@ from motion_models.calibration.maneuvers import read_windows, table_columns
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
-from motion_models.robot_file import relocated, robot_toml
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot, relocated, robot_toml
 
 NOT_BETTER = "the corrected robot is not better on the second half of the drive: robot.toml keeps the old values."
 

@@ -16,7 +16,7 @@ from localization.commands.common import write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.output import check_outputs
 from motion_models.prior import prior_notes
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
-from motion_models.robot import DIFF_DRIVE, DRIVES, Robot, load_robot, parse_robot
-from motion_models.robot_file import robot_toml
+from motion_models.robot import DIFF_DRIVE, DRIVES, Robot
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
 
 _NEEDED = {
     "wheel_radius_m": "Wheel radius [m]",

@@ -47,7 +47,8 @@ from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 
 _WHEELLESS = "lidar"
 _HELD_OUT = (

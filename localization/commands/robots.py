@@ -14,7 +14,8 @@ from localization.commands.common import add_row, plain_table, print_line, print
 from localization.output import check_outputs
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma
-from motion_models.robot import DIFF_DRIVE, Robot, load_robot, robot_names
+from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.robot_file import load_robot, robot_names
 from motion_models.skid_steer import SkidSteer
 
 

@@ -18,7 +18,7 @@ from localization.simulation.faults import FAULTS, parse_faults
 from localization.simulation.open_loop_scores import OpenLoopScore, mean_scores_by_trajectory, score_open_loop_runs
 from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 _EXPERIMENTS = "; ".join(f"{e.name}: {e.meaning}" for e in EXPERIMENTS.values())
 _EFFECTS = "; ".join(f"{e.id} [{e.unit}]: {e.meaning}" for e in FAULTS.values())

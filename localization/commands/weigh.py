@@ -20,8 +20,7 @@ from localization.diagnosis.weigh import DrivenWeighing, corrected_hypothesis, w
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.errors import CalibrationError
-from motion_models.robot import load_robot
-from motion_models.robot_file import relocated, robot_toml
+from motion_models.robot_file import load_robot, relocated, robot_toml
 
 _SIGNIFICANCE = 0.05
 _TWO_SIDED_95 = 1.96

@@ -30,7 +30,8 @@ from localization.ros.session import Files
 from localization.settings import Allowed, Positive, Settings, rules_of
 from motion_models.online_calibration import check_forms
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 
 _NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _NAMESPACE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")

@@ -20,7 +20,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motion_models.base import Twist
+from motion_models.base import ModelBase, ModelWrapper, MotionModel, Twist
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import CgError, ModelError
 from motion_models.friction.contact import CREEP, SATURATION, loads, tyre
@@ -37,6 +37,7 @@ from motion_models.friction.equilibrium import (
     sensitivities,
 )
 from motion_models.linear_equations import Matrix3, solve_3x3
+from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, Free, Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope, SlopeTwist
@@ -65,6 +66,17 @@ _CLOSE_ANGLE = 1e-14
 """Rounding of an angle [rad]."""
 _MIN_STEP = 1e-3
 """Least step of the centripetal force, as a share of it."""
+_MU_RATIO_SIGMA = 0.3
+_WARP_SIGMA = 0.15
+"""VaultBot's chassis, as its rotations show it, moves 13 % of m g / 4 to two opposite wheels."""
+_NOT_STRAIGHT = 0.02
+"""`Traits.min_track_over_radius`: on straight motion the two sides differ by noise alone, which would be taken for information."""
+_CG_OFFSETS = (
+    Param("cg_offset_x", "m", "true centre of gravity ahead of the given one", CENTRE_X_SIGMA_M, forms=()),
+    Param("cg_offset_y", "m", "true centre of gravity left of the given one", CENTRE_Y_SIGMA_M, forms=()),
+)
+_MIN_MU_RATIO = 0.05  # -; castors and free rollers
+_MAX_CG = 0.98  # -; of half the wheelbase and half the track, where the robot tips over
 
 
 class _Constants(NamedTuple):
@@ -80,7 +92,7 @@ class _Constants(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FrictionModel:
+class FrictionModel(ModelBase):
     """Quasi-static skidding on four wheels. Parameters, in the order of `param_names`:
 
     wheel_radius [m]; track_width, wheelbase [m]: distances between the contacts; mu [-]: friction along x; mu_ratio [-]: across / along;
@@ -101,9 +113,26 @@ class FrictionModel:
     """Balance the forces with the acceleration of the CG on its circle, too. The motion then depends on speed, and a sample may have none:
     above 2 m/s with the CG almost over a wheel, for commands beyond mu g, and for some in a thousand near the reversal of a wheel."""
     name: ClassVar[str] = "friction"
-    param_names: ClassVar[tuple[str, ...]] = (
-        *("wheel_radius", "track_width", "wheelbase", "mu", "mu_ratio", "slip_stiffness"),
-        *("rolling_resistance", "scrub", "warp", "tread", "tracked_x", "tracked_y"),
+    params: ClassVar[tuple[Param, ...]] = (
+        Param("wheel_radius", "m", "how far the robot drives per radian of its wheels", free=Free(logs=3)),
+        Param("track_width", "m", "distance of the left and right contacts", free=Free(rotations=3)),
+        Param("wheelbase", "m", "distance of the front and rear contacts"),
+        Param("mu", "1", "friction along the wheels"),
+        Param("mu_ratio", "1", "friction across the wheels over that along them", _MU_RATIO_SIGMA, free=Free(logs=1, turns=1)),
+        Param("slip_stiffness", "1", "slope of the contact law at zero slip"),
+        Param("rolling_resistance", "1", "rolling resistance over load"),
+        Param("scrub", "m", "yaw moment of the contact patches over mu m g", free=Free(rotations=4)),
+        Param(
+            "warp",
+            *("1", "load on the front left and rear right wheels by a twisted chassis, over m g / 4", _WARP_SIGMA),
+            *("", ("cg_field",), Free(rotations=2)),
+        ),
+        Param("tread", "1", "how much more the wheels grip when they slide to the left than to the right"),
+        Param("tracked_x", "m", "tracked point ahead of the wheelbase's middle", CENTRE_X_SIGMA_M, free=Free(logs=2, rotations=1)),
+        Param("tracked_y", "m", "tracked point left of the wheelbase's middle", CENTRE_Y_SIGMA_M),
+    )
+    traits: ClassVar[Traits] = Traits(
+        options=("contact", "centripetal"), is_level=True, min_track_over_radius=_NOT_STRAIGHT, correction_params=_CG_OFFSETS
     )
 
     @classmethod
@@ -117,6 +146,10 @@ class FrictionModel:
         defaults = [g.wheel_radius_m, g.track_width_m, g.wheelbase_m, 0.9, 1.0, STIFFNESS[law], 0.0263, 0.0, 0.0, 0.0, 0.0, 0.0]
         nominal = robot.coefficients(cls.name, cls.param_names, np.array(defaults))
         return cls(nominal, SATURATION[law], robot.switch(cls.name, "centripetal", CENTRIPETAL))
+
+    def with_correction_params(self) -> MotionModel:
+        """See `MotionModel.with_correction_params`: with the CG's offset, `CorrectedFriction`."""
+        return CorrectedFriction(self)
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`.
@@ -225,6 +258,47 @@ def check_parameters(cg: FloatArray, params: FloatArray) -> None:
             f"centre of gravity at x = {x:.3f}, y = {y:.3f} m, but the wheels stand at x = +-{half[0]:.3f}, y = +-{half[1]:.3f} m: "
             "this robot tips over. Check the centre of gravity, and wheelbase and track_width."
         )
+
+
+@dataclass(frozen=True)
+class CorrectedFriction(ModelWrapper):
+    """`FrictionModel` with two more parameters, cg_offset_x and cg_offset_y [m]: the true CG less the given one.
+
+    Values outside the valid range (CG beyond the wheels, mu_ratio < 0.05) are clipped; their derivative is zero.
+    """
+
+    inner: FrictionModel
+    params: ClassVar[tuple[Param, ...]] = (*FrictionModel.params, *_CG_OFFSETS)
+
+    @property
+    def nominal(self) -> FloatArray:
+        """(14,)"""
+        return np.append(self.inner.nominal, [0.0, 0.0])
+
+    def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
+        """See `FrictionModel.twist`."""
+        clipped, shifted, is_free = _clip_to_valid(cg, params)
+        found = self.inner.twist(wheels, shifted, clipped)
+        d_cg = found.d_cg * is_free[..., None, :]
+        d_params = np.concatenate([found.d_params, d_cg], axis=-1)
+        if clipped[4] != params[4]:  # mu_ratio
+            d_params[..., 4] = 0.0
+        return Twist(found.value, found.d_wheels, d_cg, d_params)
+
+    def wheels(self, command: FloatArray, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """See `FrictionModel.wheels`."""
+        clipped, shifted, _ = _clip_to_valid(cg, params)
+        return self.inner.wheels(command, shifted, clipped)
+
+
+def _clip_to_valid(cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Parameters (12,) and CG (..., 2) within their valid ranges, and 1 where the CG (..., 2) is not clipped, else 0."""
+    clipped = params[:-2].copy()
+    clipped[4] = max(clipped[4], _MIN_MU_RATIO)
+    check_parameters(cg, clipped)
+    edge = 0.5 * _MAX_CG * clipped[[2, 1]]
+    moved = cg + params[-2:]
+    return clipped, np.clip(moved, -edge, edge), (np.abs(moved) < edge).astype(float)
 
 
 def check_slope(cg: FloatArray, params: FloatArray, slope: Slope) -> None:

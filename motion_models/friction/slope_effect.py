@@ -12,9 +12,6 @@ from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope, SlopeTwist
 
-SLIDING_MODELS = ("skid_steer", "icr", "friction")
-"""Models of robots that skid, whose coefficients hold on level ground."""
-
 
 @dataclass(frozen=True)
 class SlopeEffect:

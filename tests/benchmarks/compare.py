@@ -15,7 +15,7 @@ from localization.logs import TopicOverrides
 from localization.pipeline import ReplayConfig
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 _LOGS, _ROUNDS = 8, 2
 _WANTED = 1.7

@@ -18,7 +18,7 @@ from motion_models.friction import equilibrium
 from motion_models.friction.contact import CREEP, loads
 from motion_models.friction.equilibrium import Floor, Loads
 from motion_models.friction.model import FrictionModel
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 balance = kernel(equilibrium.balance)

@@ -24,7 +24,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.benchmarks.host import paced
 from tests.benchmarks.online_soak import soak
 from tests.studies.buildings import BUILDINGS
@@ -65,7 +65,7 @@ from localization.pipeline import Trial
 from localization.ros.jit_warm_up import warm_up
 from localization.ros.settings import LiveRun
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 robot = load_robot("husky_a200")
 warm_up(LiveRun(robot, lambda has_lidar: Trial(make_model("skid_steer", robot), "ekf")))
 """

@@ -24,7 +24,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 _EVERY_S = 600
 _TOLD_H = (0, 1, 5, 10)

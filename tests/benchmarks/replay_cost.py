@@ -24,7 +24,8 @@ from localization.logs import open_log
 from localization.pipeline import Trial, replay
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 
 ACES = Path(__file__).parents[1] / "data" / "aces" / "aces.mcap"
 

@@ -13,7 +13,8 @@ from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
-from motion_models.robot import WheelNoise, load_robot
+from motion_models.robot import WheelNoise
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
 MODEL = make_model("diff_drive", ROBOT)

@@ -15,7 +15,7 @@ from localization.events import ImuSample, WheelSample
 from localization.logs import Log, open_log
 from localization.pipeline import Trial, replay
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers.online import ROBOT, drive_log
 
 CASE = Path(__file__).parents[1] / "data" / "cases" / "H11-lidar-yaw-180"

@@ -13,7 +13,8 @@ from localization.simulation.world import WORLDS
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.registry import make_model
-from motion_models.robot import GyroNoise, load_robot
+from motion_models.robot import GyroNoise
+from motion_models.robot_file import load_robot
 from tests.helpers.rooms import scan_from
 
 _NS = 1_000_000_000

@@ -20,7 +20,7 @@ from motion_models.calibration.regressions import (
     skid_steer_fit,
 )
 from motion_models.errors import CalibrationError
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import compose, exp
 from motion_models.skid_steer import SkidSteer, thesis_coefficients
 from tests.studies.thesis_regressions import DATA, grid, k_deviation, printed_numbers, variant_errors

@@ -14,8 +14,8 @@ from ruamel.yaml import YAML
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
 from motion_models.errors import CalibrationError
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import Joints, Mount, Robot, load_robot, parse_robot, robot_names
-from motion_models.robot_file import robot_toml
+from motion_models.robot import Joints, Mount, Robot
+from motion_models.robot_file import load_robot, parse_robot, robot_names, robot_toml
 
 VAULTBOT = load_robot("vaultbot")
 NUMBERS = st.floats(-1e9, 1e9)

@@ -11,8 +11,7 @@ import pytest
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
 from localization.events import WheelSample
 from localization.logs import open_log
-from motion_models.robot import load_robot
-from motion_models.robot_file import robot_toml
+from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers.wiring import CASES, ROBOT_TOML, Change, drive
 
 ROBOT = load_robot(ROBOT_TOML)

@@ -12,8 +12,7 @@ import skidloc
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
 from localization.cli import main
 from localization.logs import TopicOverrides, open_log
-from motion_models.robot import load_robot
-from motion_models.robot_file import robot_toml
+from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, Change, drive
 
 ROBOT = load_robot(ROBOT_TOML)

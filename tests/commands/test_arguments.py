@@ -17,8 +17,7 @@ from localization.estimators.graph_fusion import GraphConfig
 from localization.output import check_outputs, whole_file, write_text_file
 from localization.trajectory import Trajectory, write_tum
 from motion_models.errors import RobotError
-from motion_models.robot import load_robot, parse_robot
-from motion_models.robot_file import robot_toml
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
 from tests.helpers import bags
 from tests.helpers.bags import START
 from tests.helpers.disks import files_of_at_most

@@ -23,7 +23,8 @@ from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_text
 from motion_models.preintegration import integrate_twists
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import WheelNoise, load_robot
+from motion_models.robot import WheelNoise
+from motion_models.robot_file import load_robot
 from tests.helpers import bags, diagnosis_drives
 from tests.helpers.bags import START, WHEELS, Record, S
 from tests.studies import drive_husky, friction_grid, thesis_regressions

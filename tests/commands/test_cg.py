@@ -11,7 +11,7 @@ import pytest
 
 from localization.cli import main
 from motion_models.center_of_gravity.files import arms_postures
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import urdf_reference
 
 ROBOT = load_robot("vaultbot")

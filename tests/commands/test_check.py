@@ -11,7 +11,7 @@ import pytest
 
 from localization.cli import main
 from localization.logs import open_log
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers.extended import cases
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, drive
 

@@ -18,7 +18,7 @@ from localization.trajectory import Trajectory, write_tum
 from motion_models import se2
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 
 DATA = Path(__file__).parents[1] / "data"

@@ -9,7 +9,7 @@ import pytest
 
 from localization.cli import main
 from motion_models.center_of_gravity.urdf_wheels import sides, wheel_geometry
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 DATA = Path(__file__).parents[1] / "data"
 HUSKY_BAG = DATA / "husky-outdoor-gps" / "test1.bag"

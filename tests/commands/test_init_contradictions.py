@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
-from motion_models.robot import Robot, Topics, load_robot
+from motion_models.robot import Robot, Topics
+from motion_models.robot_file import load_robot
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 BASE_LOG = CASES / "base-log" / "log.mcap"

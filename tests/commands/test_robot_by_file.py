@@ -16,7 +16,7 @@ from localization.ros.session import Files
 from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation.experiments import EXPERIMENTS
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags, online
 from tests.helpers.online import LogTransport, drive_events, drive_log, run_node
 from tests.helpers.rooms import drive

@@ -12,7 +12,7 @@ from localization.diagnosis.drive import Drive, drive_of_log
 from localization.logs import open_log
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 
 _USUAL = {"friction_anisotropy": -0.2, "lateral_slip_speed": 0.05, "wheel_radius_scale": -0.01}

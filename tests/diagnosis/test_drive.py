@@ -14,7 +14,8 @@ from localization.gyro import GyroRecord
 from localization.wheel_buffer import WheelBuffer
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
-from motion_models.robot import GyroNoise, load_robot
+from motion_models.robot import GyroNoise
+from motion_models.robot_file import load_robot
 
 PERIOD_NS = 20_000_000
 

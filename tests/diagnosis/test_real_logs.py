@@ -15,7 +15,7 @@ from localization.logs import open_log
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import diagnosis_clocks as drive_husky_clocks
 from tests.helpers.diagnosis_rotations import known
 from tests.helpers.diagnosis_rotations import rotations as rotations_driven

@@ -13,7 +13,7 @@ from localization.diagnosis.verdict import trend_motions
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 _DT = np.full(100, 0.02)

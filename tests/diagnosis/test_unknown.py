@@ -8,7 +8,7 @@ from localization.diagnosis.diagnose import diagnose
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.logs import open_log
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.diagnosis_unknown import UNKNOWN
 from tests.helpers.extended import cases

@@ -37,7 +37,7 @@ from localization.diagnosis.verdict import (
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 GRID = Path(__file__).parents[1] / "data" / "vaultbot" / "rotation_grid.csv"

@@ -17,8 +17,8 @@ from localization.simulation.experiments import Experiment, ExperimentConfig, Op
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
-from motion_models.robot import DIFF_DRIVE, Robot, load_robot
-from motion_models.robot_file import robot_toml
+from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.robot_file import load_robot, robot_toml
 from tests.studies.weigh import left_out_cgs, weigh_simulated
 
 _PAYLOAD_KG = 8.0

@@ -9,7 +9,8 @@ from localization.events import Step
 from motion_models import se2
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
-from motion_models.robot import WheelNoise, load_robot
+from motion_models.robot import WheelNoise
+from motion_models.robot_file import load_robot
 
 MODEL = make_model("skid_steer", load_robot("vaultbot"))
 S = 1_000_000_000

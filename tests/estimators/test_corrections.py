@@ -16,11 +16,12 @@ from localization.pipeline import Pipeline, Trial
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.errors import CgError, ModelError
-from motion_models.friction import FrictionModel
-from motion_models.online_calibration import CorrectedFriction, add_correction_parameters, check_forms, make_corrections
+from motion_models.friction import CorrectedFriction, FrictionModel
+from motion_models.online_calibration import add_correction_parameters, check_forms, make_corrections
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import WheelNoise, load_robot
+from motion_models.robot import WheelNoise
+from motion_models.robot_file import load_robot
 from motion_models.se2 import between, log
 from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 from tests.helpers.synthetic_steps import (
@@ -47,7 +48,7 @@ LEVELS = (0.3, 1.0, 2.0, 4.0)
 
 
 def corrected_friction():
-    return CorrectedFriction.from_robot(ROBOT)
+    return CorrectedFriction(FrictionModel.from_robot(ROBOT))
 
 
 # --- the model

@@ -26,7 +26,7 @@ from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.steps import steps
 

@@ -13,7 +13,8 @@ from localization.logs import open_log
 from localization.pipeline import Pipeline, Trial
 from motion_models import se2
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.helpers.extended import cases
 
 CSAIL = Path(__file__).parents[1] / "data" / "mit-csail"

@@ -18,7 +18,8 @@ from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.robot import Driver, Geometry, Robot, load_robot
+from motion_models.robot import Driver, Geometry, Robot
+from motion_models.robot_file import load_robot
 
 TYPICAL: Mapping[str, float] = {
     "wheel_radius_scale": 0.02,

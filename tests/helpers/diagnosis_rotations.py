@@ -21,7 +21,8 @@ from localization.simulation.simulator import Simulation, SimulationConfig
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 
 WRONG = {"diagonal_load": 0.135, "track_width": 0.024}
 TRACKED_X_M = 0.066

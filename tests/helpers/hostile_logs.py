@@ -28,7 +28,7 @@ from localization.logs import open_log
 from localization.logs.reader import open_source
 from localization.logs.serialization import LogDeserializer
 from localization.trajectory import read_tum
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import Record, S
 from tests.helpers.rooms import drive

@@ -13,7 +13,8 @@ import mujoco
 import numpy as np
 
 from localization.events import Event, ImuSample, WheelSample
-from motion_models.robot import Mount, Robot, load_robot
+from motion_models.robot import Mount, Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 _STEP_S, _IMU_EVERY, _WHEELS_EVERY, _GROUND_EVERY = 0.001, 10, 20, 2

@@ -30,7 +30,7 @@ from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, 
 from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
 _FOLDER = tempfile.TemporaryDirectory(prefix="skidloc-tests-")

@@ -17,7 +17,8 @@ from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.simulation.world import Grid, cast, make_grid
 from motion_models import se2
 from motion_models.registry import make_model
-from motion_models.robot import Mount, WheelNoise, load_robot
+from motion_models.robot import Mount, WheelNoise
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 
 TRACK, RADIUS = 0.56, 0.164  # vaultbot

@@ -21,7 +21,8 @@ from motion_models.base import Motion
 from motion_models.online_calibration import Corrections, make_corrections
 from motion_models.preintegration import integrate_twists
 from motion_models.registry import make_model
-from motion_models.robot import GyroNoise, Robot, WheelNoise, load_robot
+from motion_models.robot import GyroNoise, Robot, WheelNoise
+from motion_models.robot_file import load_robot
 
 DT = 0.1
 _SUB = 4

@@ -12,7 +12,7 @@ from localization.events import CgSample, WheelSample
 from localization.logs import TopicOverrides, inspect_log, open_log
 from motion_models.center_of_gravity.files import arms_postures
 from motion_models.errors import RobotError
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags, urdf_reference
 from tests.helpers.bags import START, WHEELS, Record, S
 

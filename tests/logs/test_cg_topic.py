@@ -9,7 +9,8 @@ import pytest
 
 from localization.events import CgSample
 from localization.logs import Log, TopicOverrides, open_log
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, S
 

@@ -16,7 +16,7 @@ from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
 from localization.logs.clock_sync import ClockPlan, FirstMessage, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, Oddity
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 

@@ -15,7 +15,7 @@ from localization.errors import LogError
 from localization.events import Event, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
 from localization.logs.sqlite import RecoveredSqlite
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, S
 from tests.helpers.logs import numbered_records, warnings_of

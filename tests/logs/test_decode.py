@@ -16,7 +16,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import Log, inspect_log, open_log
 from motion_models import se2
-from motion_models.robot import Driver, load_robot
+from motion_models.robot import Driver
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, S
 

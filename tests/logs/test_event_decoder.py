@@ -10,7 +10,8 @@ import pytest
 
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.logs import open_log
-from motion_models.robot import Clock, Robot, load_robot
+from motion_models.robot import Clock, Robot
+from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.logs import inspect_log, open_log
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 from tests.helpers.logs import records_of_every_kind

@@ -20,7 +20,7 @@ from localization.errors import LogError
 from localization.events import Scan, WheelSample
 from localization.logs import inspect_log, open_log
 from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, DamagedError, decompress, decompress_message, zstd
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, S
 from tests.helpers.logs import numbered_records, warnings_of

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from localization.errors import LogError
 from localization.logs import inspect_log, open_log
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers import bags, fuzz
 from tests.helpers.hostile_logs import (
     BAD,

@@ -13,7 +13,8 @@ import pytest
 from localization.events import Reference
 from localization.logs import Log, TopicOverrides, inspect_log, open_log
 from localization.logs.transforms import mount_of
-from motion_models.robot import Mount, load_robot, parse_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot, parse_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 

@@ -13,7 +13,8 @@ import pytest
 from localization.evaluation.references import reference_track
 from localization.events import Scan, WheelSample
 from localization.logs import Log, open_log
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 from tests.helpers.logs import warnings_of

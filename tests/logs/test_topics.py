@@ -11,7 +11,8 @@ import pytest
 from localization.errors import TopicError
 from localization.events import Scan, WheelSample
 from localization.logs import Log, TopicOverrides, inspect_log, open_log
-from motion_models.robot import Joints, Topics, load_robot
+from motion_models.robot import Joints, Topics
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 

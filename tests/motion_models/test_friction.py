@@ -15,7 +15,7 @@ from motion_models.friction import FrictionModel
 from motion_models.friction.contact import CREEP, SATURATION, loads, rolling
 from motion_models.friction.equilibrium import Loads, newton
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 VAULTBOT = load_robot("vaultbot")
 MODEL = make_model("friction", VAULTBOT)

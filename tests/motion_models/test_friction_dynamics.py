@@ -13,7 +13,7 @@ from motion_models.friction import FrictionModel
 from motion_models.friction.contact import CREEP, SATURATION
 from motion_models.friction.dynamics import FrictionDynamics, Influence
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
 MODEL = make_model("friction", ROBOT)

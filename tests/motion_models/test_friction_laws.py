@@ -13,8 +13,7 @@ from motion_models.friction import FrictionModel
 from motion_models.friction.contact import CREEP, SATURATION, contact, tyre
 from motion_models.friction.model import STIFFNESS
 from motion_models.registry import make_model
-from motion_models.robot import load_robot, parse_robot
-from motion_models.robot_file import robot_toml
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
 
 VAULTBOT, HUSKY = load_robot("vaultbot"), load_robot("husky_a200")
 MODEL = FrictionModel.from_robot(HUSKY)

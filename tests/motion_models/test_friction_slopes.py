@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
 from motion_models.friction.dynamics import FrictionDynamics, Influence
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.slope import Slope
 
 ROBOT = load_robot("husky_a200")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from motion_models.errors import ModelError
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("husky_a200")
 CG = np.zeros(2)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from motion_models.errors import SkidlocError
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import WheelNoise, load_robot
+from motion_models.robot import WheelNoise
+from motion_models.robot_file import load_robot
 from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")

@@ -8,7 +8,7 @@ import pytest
 from motion_models.errors import ModelError
 from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels, add_correction_parameters, make_corrections
 from motion_models.registry import MODELS, make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
 RATES = np.array([[2.0, 3.0], [-1.0, 2.5], [4.0, 4.0]])

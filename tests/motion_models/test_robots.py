@@ -10,8 +10,8 @@ import pytest
 
 from localization.cli import main
 from motion_models.errors import RobotError
-from motion_models.robot import DIFF_DRIVE, Clock, load_robot, parse_robot, robot_names
-from motion_models.robot_file import reference, robot_toml
+from motion_models.robot import DIFF_DRIVE, Clock
+from motion_models.robot_file import load_robot, parse_robot, reference, robot_names, robot_toml
 
 # Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], from the sources in each file.
 SOURCES = {

@@ -28,7 +28,8 @@ from localization.ros.state_serialization import deserialize, serialize
 from localization.synchronizer import StepConfig
 from localization.wheel_buffer import WheelInterval
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.helpers.online import ROBOT, drive_events, new_core, numbers, reseal
 
 KINDS = [(name, "skid_steer", "cg_field" if name in ESTIMATORS_WITH_CORRECTIONS else "none") for name in ESTIMATORS]

@@ -25,7 +25,8 @@ from localization.simulation.experiments import ExperimentConfig, Phase, Rest
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.online import ROBOT, LogTransport, drive_events, drive_log, new_core, published, run_node
 

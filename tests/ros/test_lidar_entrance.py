@@ -14,7 +14,7 @@ from localization.ros.node import Node
 from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.helpers.online import LogTransport, track
 
 CASE = Path(__file__).parents[1] / "data" / "cases" / "H11-lidar-yaw-180"

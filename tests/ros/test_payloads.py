@@ -11,7 +11,8 @@ from localization.ros.payloads import Load, Payloads
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.center_of_gravity.parts import Payload
 from motion_models.errors import CgError, RobotError
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 
 VAULTBOT = load_robot("vaultbot")
 POSTURES = arms_postures(VAULTBOT.arms)

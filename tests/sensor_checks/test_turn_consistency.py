@@ -24,7 +24,8 @@ from localization.simulation.simulator import Simulation, SimulationConfig, writ
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.helpers.event_faults import EventFault, faults_of_turns
 
 S = 1_000_000_000

@@ -14,7 +14,8 @@ from localization.simulation.experiments import Experiment, ExperimentConfig, Op
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import RunRecord, SimulationConfig
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from tests.helpers.mujoco_vehicle import EFFECTS, MujocoSimulation
 
 _SETTLED = slice(30, 60)  # records 20 times a second, of a run of 3 s: without its start

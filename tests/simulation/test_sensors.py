@@ -39,7 +39,8 @@ from localization.simulation.world import (
     world_svg,
 )
 from motion_models import se2
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
 STEP = 0.005

@@ -39,7 +39,8 @@ from localization.simulation.simulator import Simulation, SimulationConfig, simu
 from localization.simulation.vehicle import VehicleConfig
 from motion_models import se2
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.studies.thesis_regressions import grid
 
 ROBOT = load_robot("vaultbot")

@@ -29,7 +29,8 @@ from motion_models.errors import CgError
 from motion_models.friction.contact import SATURATION
 from motion_models.friction.dynamics import FrictionDynamics, Influence
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
 BODY = Body.from_robot(ROBOT)

@@ -44,7 +44,7 @@ from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import triple
 from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 

@@ -40,7 +40,8 @@ from localization.pipeline import ReplayConfig, Run, Trial, replay
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.registry import make_model
-from motion_models.robot import Mount, Robot, load_robot
+from motion_models.robot import Mount, Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 DATA = Path(__file__).parents[1] / "data"

@@ -30,7 +30,7 @@ from motion_models.calibration.maneuvers import make_batch
 from motion_models.calibration.prediction import predict
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.studies import drive_husky, gentle_arcs, real_husky, terrain_track
 from tests.studies.friction_grid import FITTED, Errors, fitted, left_out, unfitted

@@ -30,7 +30,7 @@ from localization.maps.place_search import PlaceMap
 from localization.pipeline import Run, Trial, replay
 from localization.simulation.sensors import SensorConfig
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.studies.ablation import simulated
 from tests.studies.buildings import BUILDINGS, DATA, Drive
 

@@ -20,7 +20,7 @@ from motion_models.base import MotionModel
 from motion_models.calibration.regressions import RotationTable, polynomial, skid_steer_fit
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
 from tests.studies.thesis_regressions import grid

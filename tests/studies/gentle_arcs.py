@@ -27,7 +27,7 @@ from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.studies.friction_grid import VAULTBOT, fitted, friction, grid
 from tests.studies.thesis_regressions import DATA

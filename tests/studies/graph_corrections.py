@@ -42,7 +42,8 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.online_calibration import Form, add_correction_parameters, make_corrections
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.helpers.steps import last_steps, steps_after
 from tests.helpers.synthetic_steps import PoseSensor, match_at

@@ -21,7 +21,7 @@ from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.studies.thesis_regressions import DATA
 from tests.studies.uncalibrated import bare
 

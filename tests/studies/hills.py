@@ -21,7 +21,7 @@ from localization.pipeline import ReplayConfig, Trial, replay
 from localization.synchronizer import StepConfig
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
 from tests.helpers.mujoco_hills import HillDrive, Wander, drive, steady, turn_in_place

@@ -29,7 +29,8 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, write_simulation
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from tests.benchmarks.diagnosis import significances
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, drive
 from tests.helpers.diagnosis_scores import STRONG

@@ -18,7 +18,7 @@ from localization.simulation.experiments import CONTROLLERS, TRAJECTORIES
 from localization.simulation.open_loop_scores import OpenLoopScore, score_open_loop_runs
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.studies.friction_grid import fitted
 from tests.studies.thesis_regressions import DATA

@@ -27,7 +27,8 @@ from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.calibration.regressions import Regression, center_from_end_poses, regress
 from motion_models.registry import make_model
-from motion_models.robot import Mount, load_robot
+from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 _REST_S = 1.2

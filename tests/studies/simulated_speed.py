@@ -18,7 +18,7 @@ from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from localization.simulation.vehicle import Body, VehicleConfig, VehicleState, advance
 from motion_models.friction.dynamics import FrictionDynamics
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 SENSORS = {

@@ -17,7 +17,7 @@ from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 DATA = Path(__file__).parent.parent / "data" / "borealtc-husky"

@@ -5,7 +5,7 @@ import pytest
 
 from motion_models import se2
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.studies.friction_grid import fitted, friction, grid
 from tests.studies.gentle_arcs import (
     GENTLE,

@@ -25,7 +25,8 @@ from motion_models.calibration.regressions import read_rotation_table, rotations
 from motion_models.errors import CalibrationError
 from motion_models.online_calibration import CorrectedWheels
 from motion_models.registry import make_model
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import thesis_coefficients
 from tests.studies import drive_husky, terrain_track

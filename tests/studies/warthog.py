@@ -28,7 +28,7 @@ from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
 from motion_models.online_calibration import CorrectedWheels
 from motion_models.registry import make_model
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 DT, SPEED_M_PER_S, LENGTH_M = 0.05, 1.5, 305.0

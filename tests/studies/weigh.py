@@ -29,7 +29,8 @@ from localization.simulation.experiments import Experiment, ExperimentConfig, Op
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
-from motion_models.robot import Robot, load_robot
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.helpers import brush_vehicle
 from tests.studies import friction_grid
