@@ -20,6 +20,11 @@ def kernel(function: _Function) -> _Function:
     return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)  # type: ignore[call-overload, no-any-return]
 
 
+def threaded_kernel(function: _Function) -> _Function:
+    """A `kernel` during which other threads of Python run: for loops of more than some milliseconds beside the estimates."""
+    return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True, nogil=True)(function)  # type: ignore[call-overload, no-any-return]
+
+
 def subroutine(function: _Function) -> _Function:
     """A part of kernels, compiled with them. Called from Python, it is interpreted."""
     return register_jitable(error_model="numpy", no_cfunc_wrapper=True)(function)

@@ -42,12 +42,12 @@ class MapFusion(FilteredOdometry):
     def __init__(self, odometry: Estimator, prior: PriorMap) -> None:
         """``odometry``: an `EkfFusion` with a LiDAR."""
         assert isinstance(odometry, EkfFusion)
-        self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial)
+        self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial, is_background=True)
         self._is_keyframe_due, self._has_key, self._summed_cov = False, False, np.zeros((3, 3))
         self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
         self._first_s: float | None = None
-        self._n_losses = 0
+        self._n_losses, self._waiting_s = 0, 0.0
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""
@@ -55,6 +55,7 @@ class MapFusion(FilteredOdometry):
         ekf = self.odometry.filter
         estimate = self.odometry.step(step)
         self._count(step.duration)
+        self._waiting_s += step.duration
         self._add_step()
         delta, cov = self._motion_since_keyframe()
         is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
@@ -68,6 +69,9 @@ class MapFusion(FilteredOdometry):
     def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, and the place in the map."""
         self.odometry.run_deferred()
+        passed_s, self._waiting_s = self._waiting_s, 0.0
+        if self.localizer.advance(passed_s):
+            self._take_pose()
         if self._is_keyframe_due:
             self._is_keyframe_due, self._has_key = False, True
             ekf, was_localized = self.odometry.filter, self.localizer.state == "localized"
@@ -111,6 +115,7 @@ class MapFusion(FilteredOdometry):
     def finish(self, filtered: Any = None) -> None:
         """The trajectory stays as it was published: nothing is smoothed."""
         self.run_deferred()
+        self.localizer.finish_search()
 
     def localization(self) -> Mapping[str, Any]:
         """State, probability and places in the saved map so far, as JSON holds them."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from localization.lidar.scan_matcher import MIN_POINTS, OUTLIER_SIGMAS, is_narrow, mahalanobis
 from localization.lidar.submap import voxel_means
+from localization.maps.background_search import BackgroundSearch
 from localization.maps.grid import Grid
 from localization.maps.place_search import CELL_M, Place, PlaceMap
 from motion_models import se2
@@ -76,9 +77,12 @@ class _Keyframe:
 class Localizer:
     """`add` keyframe after keyframe; `state`, `probability`, `pose` and `covariance` are those at the last one."""
 
-    def __init__(self, place_map: PlaceMap, initial: Pose2 | None = None, initial_cov: Cov3 = INITIAL_COV) -> None:
-        """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3)."""
-        self.places = place_map
+    def __init__(
+        self, place_map: PlaceMap, initial: Pose2 | None = None, initial_cov: Cov3 = INITIAL_COV, is_background: bool = False
+    ) -> None:
+        """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3). With ``is_background``, searches
+        run beside the estimates, and `advance` takes their results when they are due; else `add` returns with them."""
+        self.places, self._is_background = place_map, is_background
         self.state: State = "searching"
         self.pose, self._cov = place_map.centre, np.zeros((3, 3))
         self._is_tracking, self._track_odds, self._search_odds = False, 0.0, -_MAX_SEARCH_ODDS
@@ -86,7 +90,8 @@ class Localizer:
         self.hypotheses: Sequence[Hypothesis] = ()
         """Places that a search found, the most probable first."""
         self._initial_left = 0
-        self._failures, self._wait, self._searched_at = 0, 0, np.zeros(3)
+        self._failures, self._wait = 0, 0
+        self._running: BackgroundSearch | None = None
         if initial is not None:
             self.set_pose(initial, initial_cov)
 
@@ -96,6 +101,7 @@ class Localizer:
         self.pose, self._cov, self._search_odds = np.asarray(pose, dtype=float), cov, 0.0
         self._initial_left, self._failures, self._wait = _INITIAL_KEYFRAMES, 0, 0
         self._recent.clear()
+        self._running = None
 
     @property
     def probability(self) -> float:
@@ -114,8 +120,12 @@ class Localizer:
         ``cov`` (3, 3) since the one before."""
         if not is_narrow(cov):  # carried, or driven blind: scans before and after do not belong together
             self._recent.clear()
+            self._running = None
         A = se2.adjoint(se2.inverse(delta))
         self.pose, self._cov = se2.compose(self.pose, delta), A @ self._cov @ A.T + cov
+        self.hypotheses = [Hypothesis(se2.compose(place.pose, delta), place.probability) for place in self.hypotheses]
+        if self._running is not None:
+            self._running.move(delta, cov)
         if len(points) < MIN_POINTS:
             return
         self._recent.append(_Keyframe(odometry, points))
@@ -123,8 +133,23 @@ class Localizer:
             self._track(points)
         elif self._is_tracking:
             self._is_tracking, self.state = False, "lost"
-        if self.state != "localized":
-            self._search()
+        if self.state == "localized":
+            self._running = None
+        elif self._running is None:
+            self._start_search()
+
+    def advance(self, duration_s: float) -> bool:
+        """``duration_s`` more have passed in the log; returns whether the result of a search was due, and has been taken."""
+        if self._running is None or not self._running.advance(duration_s):
+            return False
+        self.finish_search()
+        return True
+
+    def finish_search(self) -> None:
+        """Take the result of the search that runs, if one does."""
+        search, self._running = self._running, None
+        if search is not None:
+            self._conclude(search.result(), search.n_points, search.moved, search.cov)
 
     @property
     def grid(self) -> Grid:
@@ -170,8 +195,8 @@ class Localizer:
         self._recent.clear()
         self._recent.append(last)
 
-    def _search(self) -> None:
-        """Search the merged scans of the last keyframes, and take the best place if it is probable and the search before agrees."""
+    def _start_search(self) -> None:
+        """Search the merged scans of the last keyframes."""
         self._wait -= 1
         if self._wait > 0:
             return
@@ -179,31 +204,37 @@ class Localizer:
         self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
         here = self._recent[-1].odometry
         merged = np.vstack([se2.transform(se2.between(here, key.odometry), key.points) for key in self._recent])
-        points = voxel_means(merged, 0.8 * CELL_M)
+        near = (self.pose, _three_sigma(self._cov)) if self._initial_left else None
         if self._initial_left:
             self._initial_left -= 1
-            places = self.places.search(points, self.pose, _three_sigma(self._cov))
-            if not self._initial_left:
-                self._cov = np.zeros((3, 3))
+            self._cov = self._cov if self._initial_left else np.zeros((3, 3))
+        points = voxel_means(merged, 0.8 * CELL_M)
+        if self._is_background:
+            self._running = BackgroundSearch(self.places, points, near)
         else:
-            places = self.places.search(points)
-        before, moved = self.hypotheses, se2.between(self._searched_at, here)
-        self._searched_at = here
-        self.hypotheses = _weigh(places, len(points))
+            self._conclude(self.places.search(points, *(near or ())), len(points), np.zeros(3), np.zeros((3, 3)))
+
+    def _conclude(self, places: Sequence[Place], n_points: int, moved: Pose2, moved_cov: Cov3) -> None:
+        """Take the best of ``places``, which ``n_points`` have found before the robot ``moved`` (3,), if it is probable and the search
+        before agrees."""
+        before = self.hypotheses
+        self.hypotheses = [Hypothesis(se2.compose(place.pose, moved), place.probability) for place in _weigh(places, n_points)]
         self._search_odds = _log_odds(self.hypotheses[0].probability) if places else -_MAX_SEARCH_ODDS
-        if self.probability < LIKELY or not self._is_continued(before, moved):
+        if self.probability < LIKELY or not self._is_continued(before):
             return
         cov = np.asarray(np.linalg.inv(places[0].fit.information + _OPEN)) * max(places[0].residual_variance, 1.0)
         if not is_narrow(cov):
             return
-        self.pose, self._cov, self._is_tracking, self.state = places[0].pose, cov + _BEND, True, "localized"
+        A = se2.adjoint(se2.inverse(moved))
+        self.pose, self._cov = self.hypotheses[0].pose, A @ (cov + _BEND) @ A.T + moved_cov
+        self._is_tracking, self.state = True, "localized"
         self._track_odds, self._initial_left, self._failures, self._wait = self._search_odds, 0, 0, 0
 
-    def _is_continued(self, before: Sequence[Hypothesis], moved: Pose2) -> bool:
-        """Whether the best place is where one of the search ``before`` leads to by the odometry, ``moved`` (3,) since then."""
+    def _is_continued(self, before: Sequence[Hypothesis]) -> bool:
+        """Whether the best place is where the odometry leads to from one of the search ``before``."""
         if len(self._recent) < 2:
             return False
-        off = [se2.between(se2.compose(place.pose, moved), self.hypotheses[0].pose) for place in before]
+        off = [se2.between(place.pose, self.hypotheses[0].pose) for place in before]
         return any(math.hypot(x, y) < 0.3 and abs(yaw) < 0.1 for x, y, yaw in off)
 
 

@@ -1,0 +1,66 @@
+"""A search of the whole map beside the estimates: in a thread, with a result that is due at a time of the log, not of the machine.
+
+Equal events give equal bytes, live and in a replay: the result depends on the arguments alone, and it is taken when it is due. Who takes
+one that is not finished by then waits for it.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from localization.maps.place_search import Place, PlaceMap
+from motion_models import se2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+
+
+class BackgroundSearch:
+    """`PlaceMap.search` of merged scans. `advance` by each step, `move` by each keyframe, and take the `result` when it is due."""
+
+    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None) -> None:
+        """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map."""
+        self._places, self._points, self._near = places, points, near
+        self.n_points = len(points)
+        self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
+        """(3,) motion since the scans, with its covariance (3, 3)."""
+        self._left_s = places.search_s
+        self._start()
+
+    def _start(self) -> None:
+        self._found: list[Place] = []
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._search, name="place search", daemon=True)
+        self._thread.start()
+
+    def _search(self) -> None:
+        try:
+            self._found = self._places.search(self._points, *(self._near or ()))
+        except Exception as error:  # raised again where the result is taken
+            self._error = error
+
+    def advance(self, duration_s: float) -> bool:
+        """``duration_s`` more have passed in the log; returns whether the result is due."""
+        self._left_s -= duration_s
+        return self._left_s <= 0.0
+
+    def move(self, delta: Pose2, cov: Cov3) -> None:
+        """The robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) meanwhile."""
+        A = se2.adjoint(se2.inverse(delta))
+        self.moved, self.cov = se2.compose(self.moved, delta), A @ self.cov @ A.T + cov
+
+    def result(self) -> list[Place]:
+        """The places that were found, at the moment of the scans. Waits where the search is not finished."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The arguments: who resumes it searches again."""
+        return {name: value for name, value in vars(self).items() if name not in ("_found", "_error", "_thread")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._start()
