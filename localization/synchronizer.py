@@ -19,6 +19,7 @@ from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
+from motion_models.extended_model import Series, in_series
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
@@ -265,20 +266,24 @@ class Synchronizer:
         before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
         n = len(before)
         rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
+        since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self._first_wheel_ns or start_ns)) * 1e-9
+        model = in_series(self.model, Series(np.r_[np.zeros(n), dt], since))
         if tilt is None:
-            twist = self.model.twist(rates, cg, self.params)
+            twist = model.twist(rates, cg, self.params)
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
             motion = integrate_twists(dt, inside, self._wheel_noise)
         else:
-            twist, motion = self._integrate_on_slope(dt, rates, cg, tilt)
+            twist, motion = self._integrate_on_slope(model, dt, rates, cg, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 
-    def _integrate_on_slope(self, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt) -> tuple[Twist, Motion]:
+    def _integrate_on_slope(
+        self, model: MotionModel, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt
+    ) -> tuple[Twist, Motion]:
         """Twists at ``rates`` (m + n, 2), and the motion over the n intervals, with what is uncertain about the slope in its covariance."""
         m, whole, k = len(rates) - len(dt), float(dt.sum()), len(self.params)
         downhill = np.vstack([np.tile(tilt.before, (m, 1)), tilt.at((np.cumsum(dt) - 0.5 * dt) / whole)])
-        found, is_limited = self._slope_effect.twist(self.model, rates, cg, self.params, downhill)
+        found, is_limited = self._slope_effect.twist(model, rates, cg, self.params, downhill)
         twist = found.twist
         by = np.concatenate([twist.d_params, found.d_downhill], axis=-1)
         motion = integrate_twists(dt, Twist(twist.value[m:], twist.d_wheels[m:], twist.d_cg[m:], by[m:]), self._wheel_noise)

@@ -119,8 +119,10 @@ def make_corrections(model: MotionModel, form: Form) -> Corrections:
     check_forms([form])
     field = model.field_prior() if form == "cg_field" else None
     if field is not None:
-        walk = field.spread / PRIOR_RETURNS_AFTER_S
-        return Corrections(model.param_names, np.eye(len(model.param_names)), field.cov, walk, model.traits.min_track_over_radius)
+        i = np.flatnonzero(np.diagonal(field.cov) > 0.0)
+        walk, directions = field.spread / PRIOR_RETURNS_AFTER_S, np.eye(len(model.param_names))[:, i]
+        names = tuple(model.param_names[n] for n in i)
+        return Corrections(names, directions, field.cov[np.ix_(i, i)], walk[np.ix_(i, i)], model.traits.min_track_over_radius)
     found = _named(model, form)
     directions = np.zeros((len(model.param_names), len(found)))
     for column, correction in enumerate(found):

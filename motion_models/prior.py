@@ -187,19 +187,23 @@ def scaling_prior(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> Scal
 
 
 def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[str]:
-    """A sentence for the user where `scaling_prior` is not None; else none.
+    """A sentence for the user where `scaling_prior` is not None, and one where the robot's learned terms belong to none of ``models``.
 
     >>> from motion_models import load_robot
     >>> prior_notes(load_robot("vaultbot"))
     []
     """
+    others = [name for name in robot.terms if name not in models] if not set(robot.terms) & set(models) else []
+    unused = f"{robot.name}: the learned terms of its file are of {', '.join(others)}, and {', '.join(models)} runs without them."
+    notes = [unused] if others else []
     found = scaling_prior(robot, models)
     if found is None:
-        return []
+        return notes
     if robot.drive == DIFF_DRIVE:
-        return [f"{robot.name} has two driven wheels and a caster: diff_drive is its model, and skid_steer is the same with k = 1."]
+        return [*notes, f"{robot.name} has two driven wheels and a caster: diff_drive is its model, and skid_steer is the same with k = 1."]
     return [
+        *notes,
         f"{robot.name}: [models.skid_steer] has no k_0, so k = {found.k:.2f} +- {found.sigma:.2f} from {found.source}; "
         f"{_CALIBRATION_TURN_S:g} s of turning make it +- {found.sigma_after_turning:.2f} "
-        "(`skidloc calibrate LOG --robot ... --out ROBOT.toml`)."
+        "(`skidloc calibrate LOG --robot ... --out ROBOT.toml`).",
     ]

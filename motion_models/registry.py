@@ -7,6 +7,7 @@ from typing import cast
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import ModelError
+from motion_models.extended_model import ExtendedModel
 from motion_models.friction import FrictionModel
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
@@ -34,7 +35,7 @@ def traits_of(model: str) -> Traits:
 
 
 def make_model(name: str, robot: Robot) -> MotionModel:
-    """The motion model ``name`` with the coefficients of ``robot``. Raises `ModelError` for a name that does not exist.
+    """The motion model ``name`` with the coefficients and terms of ``robot``. Raises `ModelError` for a name that does not exist.
 
     >>> import numpy as np
     >>> from motion_models import load_robot
@@ -46,4 +47,5 @@ def make_model(name: str, robot: Robot) -> MotionModel:
     """
     if name not in MODELS:
         raise ModelError(f"no motion model '{name}'; there are {', '.join(MODELS)}.")
-    return MODELS[name].from_robot(robot)
+    model = MODELS[name].from_robot(robot)
+    return ExtendedModel(model, robot.terms[name]) if robot.terms.get(name) else model

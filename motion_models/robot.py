@@ -12,6 +12,7 @@ import numpy as np
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
+from motion_models.terms import Term
 
 DIFF_DRIVE = "diff_drive"
 """`Robot.drive` of two driven wheels and casters."""
@@ -208,6 +209,8 @@ class Robot:
     """Coefficients by model name, then by parameter name; what is not named keeps the model's own default."""
     options: Mapping[str, Mapping[str, str | bool]] = field(default_factory=dict)
     """Choices by model name, then by `Traits.options`; in the file they stand among the model's coefficients."""
+    terms: Mapping[str, tuple[Term, ...]] = field(default_factory=dict)
+    """Learned terms by model name (`motion_models.terms`), which are added to its twist."""
     arms: Arms | None = None
     """Arms that move the centre of gravity; None where it stays at that of `Geometry`."""
     folder: Path | None = field(default=None, compare=False)

@@ -23,6 +23,7 @@ from motion_models.center_of_gravity.parts import Arms
 from motion_models.errors import RobotError
 from motion_models.registry import MODELS, params_of, traits_of
 from motion_models.robot import DRIVES, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
+from motion_models.terms import VARIABLES, parse_terms, terms_table
 from motion_models.text_files import read_text
 
 Section = TypeVar("Section")
@@ -61,6 +62,14 @@ Lengths are in metres, angles in radians, masses in kilograms; unknown keys are 
 This page is generated from the dataclasses (`python -m motion_models.robot_file`), and a test compares both.
 """
 
+_TERMS = "terms"
+"""Table of a model's learned terms, among its coefficients."""
+_TERMS_TEXT = (
+    "Learned terms, which are added to the twist of any model: a table for each of vx, vy and wz, by products of variables, each as it is, "
+    'to a power (`v^2`), or in `abs()` or `sign()`: `vy = {"wz*abs(wz)" = [-0.12, 0.01, "m s"]}` is value, standard deviation (with which '
+    "it is corrected online; 0 or none: it stays) and unit (may be left out). `skidloc diagnose --extend` finds them."
+)
+
 
 def robot_names() -> list[str]:
     """Names of the robots that are shipped."""
@@ -98,7 +107,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         raise RobotError(f"{source}: not valid TOML: {error}.") from error
     except RecursionError as error:
         raise RobotError(f"{source}: not valid TOML: its brackets are nested too deeply.") from error
-    known = {f.name for f in dataclasses.fields(Robot)} - {"folder", "options"}
+    known = {f.name for f in dataclasses.fields(Robot)} - {"folder", "options", "terms"}
     _refuse_unknown(data, known, source)
     if not isinstance(data.get("name"), str):
         raise RobotError(f'{source}: needs a line name = "...".')
@@ -119,7 +128,8 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier) <= 0:
         raise RobotError(f"{source}: every number of [driver] must be positive.")
     mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table_of(data, "mounts", source).items()}
-    models, options = _models(_table_of(data, "models", source), source)
+    tables = _table_of(data, "models", source)
+    models, options = _models(tables, source)
     return Robot(
         name=data["name"],
         geometry=geometry,
@@ -134,6 +144,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         clock=_clock(data, source),
         models=models,
         options=options,
+        terms={name: found for name, t in tables.items() if (found := parse_terms(t.get(_TERMS, {}), f"{source}, [models.{name}.terms]"))},
         arms=_arms(data, source) if "arms" in data else None,
         folder=folder,
     )
@@ -196,8 +207,10 @@ def _models(tables: Mapping[str, Any], source: str) -> tuple[dict[str, dict[str,
     options: dict[str, dict[str, str | bool]] = {}
     for model in tables:
         table, choices = _table_of(tables, model, source), traits_of(model).options
-        _refuse_unknown(table, {*(p.name for p in params_of(model)), *choices}, f"{source}, [models.{model}]")
-        models[model] = {name: _number(value, f"models.{model}.{name}", source) for name, value in table.items() if name not in choices}
+        _refuse_unknown(table, {*(p.name for p in params_of(model)), *choices, _TERMS}, f"{source}, [models.{model}]")
+        models[model] = {
+            name: _number(value, f"models.{model}.{name}", source) for name, value in table.items() if name not in (*choices, _TERMS)
+        }
         for name in table.keys() & choices:
             if not isinstance(table[name], str | bool):
                 raise RobotError(f"{source}: models.{model}.{name} must be text or true or false, found {table[name]!r}.")
@@ -293,9 +306,11 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
         lines += _table("arms", {name: value for name, value in dataclasses.asdict(robot.arms).items() if value != ()})
     for frame, mount in robot.mounts.items():
         lines += _table(f"mounts.{_key(frame)}", _not_default(mount))
-    for model in [*robot.models, *(name for name in robot.options if name not in robot.models)]:
+    for model in dict.fromkeys([*robot.models, *robot.options, *robot.terms]):
         entries = {**robot.options.get(model, {}), **robot.models.get(model, {})}
-        lines += _table(f"models.{_key(model)}", entries, sigmas.get(model, {}))
+        lines += _table(f"models.{_key(model)}", entries, sigmas.get(model, {})) if entries or model not in robot.terms else []
+        if robot.terms.get(model):
+            lines += ["", f"[models.{_key(model)}.{_TERMS}]", *terms_table(robot.terms[model])]
     return "\n".join(lines) + "\n"
 
 
@@ -370,6 +385,8 @@ def reference() -> str:
         lines += ["", f"### [models.{name}]", "", doc, "", "| key | meaning |", "|---|---|"]
         lines += [f"| `{p.name}` | {p.text} |" for p in params_of(name)]
         lines += [f"| `{key}` | choice, see `motion_models.{name}` |" for key in traits_of(name).options]
+    lines += ["", f"### [models.NAME.{_TERMS}]", "", _TERMS_TEXT, "", "| variable | meaning |", "|---|---|"]
+    lines += [f"| `{name}` | {variable.meaning} |" for name, variable in VARIABLES.items()]
     return "\n".join(lines) + "\n"
 
 

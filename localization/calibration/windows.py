@@ -66,6 +66,7 @@ def cut(
     around = round(config.around_s / _NS)
     waiting: list[Span] = []
     found: list[tuple[Span, Maneuver]] = []
+    first_wheel_ns: int | None = None
     short = unmeasured = 0
 
     def take(until_ns: int | None) -> Iterator[Span]:
@@ -92,6 +93,7 @@ def cut(
     for event in events:
         if isinstance(event, WheelSample):
             history.insert(event)
+            first_wheel_ns = event.stamp_ns if first_wheel_ns is None else first_wheel_ns
         elif isinstance(event, CgSample):
             history.set_cg(event)
         waiting.extend(reference.spans(event, wheels))
@@ -106,7 +108,8 @@ def cut(
     for (_, maneuver), span in zip(found, corrected, strict=True):
         number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
         group = f"{name}, {number * config.window_s * config.per_group:g} s"
-        maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group))
+        start_s = (span.start_ns - (first_wheel_ns or 0)) * _NS
+        maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group, start_s=start_s))
     return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()))
 
 

@@ -16,6 +16,7 @@ from motion_models.calibration.identifiability import Weakness, weaknesses
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES, predict
 from motion_models.errors import CalibrationError, ModelError
+from motion_models.extended_model import terms_of
 from motion_models.online_calibration import RADIUS_NAMES
 from motion_models.robot import Robot, WheelNoise
 from motion_models.se2 import FloatArray
@@ -84,8 +85,14 @@ class Fit:
         """
         fitted = {*self.names, *self.config.ties, *robot.models.get(self.model.name, {})}
         everything = dict(zip(self.model.param_names, (float(p) for p in self.params), strict=True))
-        table = {name: value for name, value in everything.items() if name in fitted and name not in RADIUS_NAMES}
+        terms = tuple(
+            dataclasses.replace(t, value=everything[t.name], sigma=self.sigmas.get(t.name, t.sigma)) for t in terms_of(self.model)
+        )
+        apart = {*RADIUS_NAMES, *(t.name for t in terms)}
+        table = {name: value for name, value in everything.items() if name in fitted and name not in apart}
         found = dataclasses.replace(robot, models={**robot.models, self.model.name: table})
+        if terms:
+            found = dataclasses.replace(found, terms={**robot.terms, self.model.name: terms})
         found = _with_radius(found, 1.0 + everything.get("wheel_radius_scale", 0.0))
         return _with_difference(found, everything.get("wheel_radius_difference", 0.0))
 

@@ -77,6 +77,8 @@ class Maneuver:
     """Maneuvers of one group share their errors (same step, same place): they are resampled and held out together."""
     lead: int = 0
     """First intervals that lie before the start; they feed a lag and a time offset, and are not integrated."""
+    start_s: float = 0.0
+    """When it starts, after the drive's first wheel message [s]; for terms of a model that change with time."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +105,8 @@ class Batch:
     """(M, 3, 3)"""
     group: IntArray
     """(M,) index of the group of each measured pose."""
+    t: FloatArray
+    """(N,) when each interval begins, after the drive's first wheel message [s]."""
     groups: tuple[str, ...]
     """Names of the groups, in order of their first maneuver."""
 
@@ -132,6 +136,7 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
         measured=np.concatenate([m.measured for m in maneuvers]),
         cov=np.concatenate([np.broadcast_to(m.cov, (n, 3, 3)) for m, n in zip(maneuvers, counts, strict=True)]),
         group=np.array([index[m.group] for m in maneuvers])[owner],
+        t=np.concatenate([m.start_s + np.cumsum(m.dt) - m.dt - m.dt[: m.lead].sum() for m in maneuvers]),
         groups=groups,
     )
     interval_owner = np.repeat(np.arange(len(maneuvers)), lengths)

@@ -14,6 +14,7 @@ from motion_models import se2
 from motion_models.base import Twist
 from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.compiled import kernel
+from motion_models.extended_model import Series, in_series
 from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
@@ -100,7 +101,7 @@ def predict(
         for a, b in zip(batch.first[:-1], batch.first[1:], strict=True):
             smooth = _low_pass(batch.dt[a:b], batch.wheels[a:b], lag)
             _interpolate(smooth, offset, Delayed(wheels[a:b], by_offset[a:b], by_lag[a:b]))
-    twist = model.twist(wheels, batch.cg, params)
+    twist = in_series(model, series_of(batch)).twist(wheels, batch.cg, params)
 
     by = np.zeros((len(batch.dt), 3, len(columns)))
     for c, column in enumerate(columns):
@@ -116,6 +117,13 @@ def predict(
     if np.any(reference_params[2:] != 0.0) or bool(np.any(columns >= k + 2)):
         poses, d = _track(poses, d, reference_params[2:], columns - (k + 2))
     return poses, d, cov
+
+
+def series_of(batch: Batch) -> Series:
+    """When the intervals of ``batch`` were driven; nothing accelerates at the first of a maneuver."""
+    dt = batch.dt.copy()
+    dt[batch.first[:-1]] = 0.0
+    return Series(dt, batch.t)
 
 
 def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:

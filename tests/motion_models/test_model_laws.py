@@ -9,16 +9,32 @@ from motion_models.errors import SkidlocError
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise
-from motion_models.robot_file import load_robot
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
+from tests.helpers.extended import cases
 from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 
 ROBOT = load_robot("vaultbot")
+TERMS = """
+[models.{}.terms]
+vx = {{"v*abs(v)" = 0.03, "wz*cg_y" = [0.2, 0.1]}}
+vy = {{"wz*abs(wz)" = [-0.12, 0.01, "m s"], "v*abs(wz)" = 0.01}}
+wz = {{"abs(v)*wz" = 0.05, "sign(wz)*wz^2*cg_x" = 0.02}}
+"""
+EXTENDED = " with terms"
 MIRROR = np.array([1.0, -1.0, -1.0])  # vx, vy, wz of a robot seen in a mirror along its x axis
 
-pytestmark = pytest.mark.parametrize("name", list(MODELS))
+WITH_TERMS = [f"{name}{EXTENDED}" for name in ("diff_drive", "skid_steer", "friction")]
+pytestmark = pytest.mark.parametrize("name", cases([*MODELS, *WITH_TERMS], [*MODELS, WITH_TERMS[0]]))
 # Numbers come from a generator and not from hypothesis, whose round ones sit on kinks (a wheel that just lifts off).
 drawn = given(seed=st.integers(0, 2**32 - 1))
 few = settings(max_examples=25, deadline=None)
+
+
+def some_model(name):
+    """A model by its name, with learned terms where it ends so."""
+    plain = name.removesuffix(EXTENDED)
+    text = robot_toml(ROBOT) + (TERMS.format(plain) if plain != name else "")
+    return make_model(plain, parse_robot(text, "test"))
 
 
 def mirrored(wheels, cg):
@@ -55,7 +71,7 @@ def identify(model, wheels, cg, value, start):
 @few
 def test_twist_derivatives_of_every_model_are_differences(name, seed):
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     params = some_params(model, rng)
     wheels, cg = some_drive(rng, 5)
     twist = model.twist(wheels, cg, params)
@@ -70,7 +86,7 @@ def test_twist_derivatives_of_every_model_are_differences(name, seed):
 @few
 def test_twist_of_still_wheels_is_zero(name, seed):
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     twist = model.twist(np.zeros((4, 2)), some_drive(rng, 4)[1], some_params(model, rng))
     assert not twist.value.any()
     assert not twist.d_cg.any()
@@ -83,7 +99,7 @@ def test_twist_of_still_wheels_is_zero(name, seed):
 def test_twist_of_a_mirrored_robot_is_mirrored(name, seed):
     """Whatever is deliberately lopsided in a model (a warp, unlike sides) must be in its parameters: so a mirrored robot has some too."""
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     params = some_params(model, rng)
     wheels, cg = some_drive(rng, 200)
     image = model.twist(wheels, cg, params).value * MIRROR
@@ -100,7 +116,7 @@ def test_twist_of_a_mirrored_robot_is_mirrored(name, seed):
 @few
 def test_preintegrate_of_cut_intervals_is_that_of_whole_ones(name, seed):
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     params = some_params(model, rng)
     wheels, cg = some_drive(rng, 6)
     dt = rng.uniform(0.01, 0.3, 6)
@@ -117,7 +133,7 @@ def test_preintegrate_of_cut_intervals_is_that_of_whole_ones(name, seed):
 @few
 def test_wheels_of_a_command_give_the_command(name, seed):
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     params = some_params(model, rng)
     cg = rng.uniform(-1, 1, (20, 2)) * [0.12, 0.05]
     command = rng.uniform(-1, 1, (20, 2)) * [1.0, 1.0]
@@ -130,7 +146,7 @@ def test_wheels_of_a_command_give_the_command(name, seed):
 @few
 def test_twist_of_a_batch_is_a_loop(name, seed):
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     params = some_params(model, rng)
     wheels, cg = some_drive(rng, 6)
     wheels = wheels.reshape(2, 3, 2)
@@ -149,7 +165,7 @@ def test_twist_of_a_batch_is_a_loop(name, seed):
 @settings(max_examples=5, deadline=None)
 def test_fit_of_clean_data_recovers_the_parameters(name, seed):
     rng = np.random.default_rng(seed)
-    model = make_model(name, ROBOT)
+    model = some_model(name)
     truth = some_params(model, rng)
     wheels, cg = some_drive(rng, 200)
     twist = model.twist(wheels, cg, truth)

@@ -1,0 +1,231 @@
+"""Learned terms of a motion model: what is added to a component of its twist, read from the robot's file.
+
+    [models.skid_steer.terms]
+    vy = {"wz*abs(wz)" = [-0.12, 0.01, "m s"]}      # vy = the model's + c wz |wz| with c = -0.12 +- 0.01 m s
+
+A term is a coefficient times a product of `VARIABLES`, each as it is, to a power (v^2), or in abs() or sign(); its sigma is that of the
+coefficient, and the unit may be left out. Terms are zero at rest: at least one factor is a motion.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from motion_models.errors import RobotError
+from motion_models.se2 import FloatArray
+
+COMPONENTS = ("vx", "vy", "wz")
+"""Components of the twist, in the order of `Twist.value`."""
+_MAX_POWER = 4
+"""Largest power of a variable: higher ones of noisy rates are noise."""
+_LARGEST = 1e6
+"""Largest coefficient, in SI units."""
+_MOST_TERMS = 32
+"""Most terms of one model: each is a parameter that the filter may correct."""
+
+
+class Variable(NamedTuple):
+    """What a term may depend on."""
+
+    meaning: str
+    metres: int
+    """Powers of metre and second in its unit; radians are 1."""
+    seconds: int
+    mirror: int
+    """Sign that it takes on for a robot seen in a mirror along its x axis; 0 where it becomes another variable."""
+    is_motion: bool
+    """Whether it is zero at rest."""
+
+
+VARIABLES: Mapping[str, Variable] = {
+    "v": Variable("speed ahead by the model without terms [m/s]", 1, -1, 1, True),
+    "wz": Variable("yaw rate by the model without terms [rad/s]", 0, -1, -1, True),
+    "left": Variable("rate of the left wheels [rad/s]", 0, -1, 0, True),
+    "right": Variable("rate of the right wheels [rad/s]", 0, -1, 0, True),
+    "dv": Variable("change of v [m/s^2]", 1, -2, 1, True),
+    "dwz": Variable("change of wz [rad/s^2]", 0, -2, -1, True),
+    "cg_x": Variable("centre of gravity ahead of the middle [m]", 1, 0, 1, False),
+    "cg_y": Variable("centre of gravity left of the middle [m]", 1, 0, -1, False),
+    "t": Variable("time since the drive began [s]", 0, 1, 1, False),
+}
+"""Variables of terms. Changes and time need samples in order of time (`in_series`); without, changes and time are 0."""
+
+_NAMES = tuple(VARIABLES)
+_FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
+
+
+class Factor(NamedTuple):
+    """One factor of an expression."""
+
+    variable: str
+    form: str
+    """Empty, abs or sign."""
+    power: int
+
+    def __str__(self) -> str:
+        name = f"{self.form}({self.variable})" if self.form else self.variable
+        return name if self.power == 1 else f"{name}^{self.power}"
+
+    def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Value and derivative by the variable ``x`` (n,); at the kinks of abs and sign the derivative is the mean of both sides', 0."""
+        if self.form == "sign":
+            return np.asarray(np.sign(x) ** self.power), np.zeros_like(x)
+        base, slope = (np.abs(x), np.sign(x)) if self.form else (x, np.ones_like(x))
+        return np.asarray(base**self.power), np.asarray(self.power * base ** (self.power - 1) * slope)
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A product of factors, each variable and form once, in the order of `VARIABLES`."""
+
+    factors: tuple[Factor, ...]
+
+    def __str__(self) -> str:
+        """As in robot files."""
+        return "*".join(str(f) for f in self.factors)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of the variables in it."""
+        return tuple(dict.fromkeys(f.variable for f in self.factors))
+
+    @property
+    def mirror(self) -> int:
+        """Its sign for a mirrored robot: 1, -1, or 0 where a mirrored robot has another expression (one side's wheels)."""
+        return math.prod(
+            1 if f.form == "abs" and VARIABLES[f.variable].mirror else VARIABLES[f.variable].mirror ** f.power for f in self.factors
+        )
+
+    def dimension(self) -> tuple[int, int]:
+        """Powers of metre and second in its unit; signs have none."""
+        has_unit = [f for f in self.factors if f.form != "sign"]
+        return sum(VARIABLES[f.variable].metres * f.power for f in has_unit), sum(VARIABLES[f.variable].seconds * f.power for f in has_unit)
+
+    def evaluate(self, values: Mapping[str, FloatArray]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Value (n,) at the variables' ``values`` (n,) each, and derivatives (n,) by the variables in it."""
+        parts = [f.at(values[f.variable]) for f in self.factors]
+        value = np.asarray(math.prod(part for part, _ in parts))
+        slopes: dict[str, FloatArray] = {}
+        for i, (factor, (_, slope)) in enumerate(zip(self.factors, parts, strict=True)):
+            others = math.prod((part for j, (part, _) in enumerate(parts) if j != i), start=1.0)
+            slopes[factor.variable] = slopes.get(factor.variable, 0.0) + slope * others
+        return value, slopes
+
+
+def parse_expression(text: str, where: str = "term") -> Expression:
+    """The product that ``text`` writes, as ``wz*abs(wz)`` or ``v^2*cg_y``; ``where`` begins errors. Raises `RobotError`.
+
+    >>> str(parse_expression("abs(wz) * wz"))
+    'wz*abs(wz)'
+    """
+    powers: dict[tuple[str, str], int] = {}
+    for part in re.sub(r"\*\*", "^", text.replace(" ", "")).split("*"):
+        found = _FACTOR.fullmatch(part)
+        if found is None:
+            raise RobotError(
+                f"{where}: cannot read {part[:40]!r} in {text[:60]!r}; terms are products such as v*abs(wz), wz^2 or sign(v)*cg_y."
+            )
+        form, name, power = found[1] or "", found[2] or found[3], int(found[4] or 1)
+        if name not in VARIABLES:
+            near = difflib.get_close_matches(name, _NAMES, n=1, cutoff=0.4)
+            meant = f" (did you mean {near[0]}?)" if near else ""
+            raise RobotError(f"{where}: unknown variable {name[:40]!r} in {text[:60]!r}{meant}; there are {', '.join(_NAMES)}.")
+        powers[name, form] = powers.get((name, form), 0) + power
+        if not 1 <= powers[name, form] <= _MAX_POWER:
+            raise RobotError(f"{where}: power {powers[name, form]} of {name} in {text[:60]!r}; powers are 1 to {_MAX_POWER}.")
+    order = sorted(powers, key=lambda key: (_NAMES.index(key[0]), ("", "abs", "sign").index(key[1])))
+    expression = Expression(tuple(Factor(name, form, powers[name, form]) for name, form in order))
+    if not any(VARIABLES[f.variable].is_motion for f in expression.factors):
+        motions = ", ".join(name for name, v in VARIABLES.items() if v.is_motion)
+        raise RobotError(f"{where}: {text[:60]!r} would move a robot that stands; multiply it by one of {motions}.")
+    return expression
+
+
+@dataclass(frozen=True)
+class Term:
+    """A coefficient times an expression, added to one component of the twist."""
+
+    component: str
+    expression: Expression
+    value: float
+    sigma: float = 0.0
+    """Standard deviation of ``value``; 0 for one that is not corrected online."""
+
+    @property
+    def name(self) -> str:
+        """Name of its coefficient among a model's parameters, as ``vy[wz*abs(wz)]``."""
+        return f"{self.component}[{self.expression}]"
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a robot that is the same on both sides may have it: vx is even, vy and wz are odd in a mirror."""
+        return self.expression.mirror == (1 if self.component == "vx" else -1)
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the coefficient; radians are 1.
+
+        >>> Term("vy", parse_expression("wz*abs(wz)"), -0.12).unit
+        'm s'
+        """
+        metres, seconds = self.expression.dimension()
+        return _unit_text((self.component != "wz") - metres, -1 - seconds)
+
+
+def _unit_text(metres: int, seconds: int) -> str:
+    above = [f"{name}^{power}" if power > 1 else name for name, power in (("m", metres), ("s", seconds)) if power > 0]
+    below = [f"{name}^{-power}" if power < -1 else name for name, power in (("m", metres), ("s", seconds)) if power < 0]
+    return " ".join(above or ["1"]) + "".join(f"/{name}" for name in below)
+
+
+def parse_terms(table: Any, where: str) -> tuple[Term, ...]:
+    """Terms of a table by component, then by expression, of value, [value, sigma] or [value, sigma, unit]. Raises `RobotError`."""
+    if not isinstance(table, Mapping):
+        raise RobotError(f'{where}: must be a table, as vy = {{"wz*abs(wz)" = [-0.12, 0.01]}}; found {str(table)[:60]!r}.')
+    found: dict[str, Term] = {}
+    for component, entries in table.items():
+        if component not in COMPONENTS:
+            near = difflib.get_close_matches(str(component), COMPONENTS, n=1, cutoff=0.3)
+            meant = f" (did you mean {near[0]}?)" if near else ""
+            raise RobotError(f"{where}: unknown component {component[:40]!r}{meant}; terms are added to {', '.join(COMPONENTS)}.")
+        if not isinstance(entries, Mapping):
+            raise RobotError(f'{where}: {component} must be a table, as {{"wz*abs(wz)" = [-0.12, 0.01]}}; found {str(entries)[:60]!r}.')
+        for text, entry in entries.items():
+            term = _term(component, str(text), entry, f"{where}.{component}")
+            if term.name in found:
+                raise RobotError(f"{where}.{component}: {term.expression} stands there twice; add its coefficients.")
+            found[term.name] = term
+    if len(found) > _MOST_TERMS:
+        raise RobotError(f"{where}: has {len(found)} terms; at most {_MOST_TERMS} make sense.")
+    return tuple(sorted(found.values(), key=lambda term: COMPONENTS.index(term.component)))
+
+
+def _term(component: str, text: str, entry: Any, where: str) -> Term:
+    """One term of a file. Raises `RobotError`."""
+    parts = entry if isinstance(entry, list) else [entry]
+    numbers = parts[:2]
+    is_number = [isinstance(n, int | float) and not isinstance(n, bool) and abs(n) <= _LARGEST for n in numbers]  # false for NaN
+    if not 1 <= len(parts) <= 3 or not all(is_number) or (len(parts) == 2 and parts[1] < 0.0) or (len(parts) == 3 and not parts[1] >= 0.0):
+        raise RobotError(
+            f"{where}: {text[:60]!r} must be value, [value, sigma] or [value, sigma, unit], sigma not below 0; found {str(entry)[:60]}."
+        )
+    term = Term(component, parse_expression(text, where), float(numbers[0]), float(numbers[1]) if len(numbers) > 1 else 0.0)
+    if len(parts) == 3 and parts[2] != term.unit:
+        raise RobotError(f"{where}: the unit of {text[:60]!r} is {term.unit!r}, found {str(parts[2])[:30]!r}.")
+    return term
+
+
+def terms_table(terms: tuple[Term, ...]) -> list[str]:
+    """Lines of a robot file for ``terms``, one for each component."""
+    lines = []
+    for component in COMPONENTS:
+        entries = [f'"{t.expression}" = [{float(t.value)!r}, {float(t.sigma)!r}, "{t.unit}"]' for t in terms if t.component == component]
+        lines += [f"{component} = {{{', '.join(entries)}}}"] if entries else []
+    return lines

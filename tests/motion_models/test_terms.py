@@ -1,0 +1,148 @@
+"""Learned terms: their grammar, units and files, and the places that use them as parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from motion_models.calibration.fit import FitConfig, fit
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.errors import RobotError
+from motion_models.extended_model import ExtendedModel, Series, in_series
+from motion_models.online_calibration import add_correction_parameters, make_corrections
+from motion_models.preintegration import preintegrate
+from motion_models.prior import prior_notes
+from motion_models.registry import make_model
+from motion_models.robot import Robot, WheelNoise
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
+from motion_models.terms import Term, parse_expression
+from tests.helpers.synthetic_steps import Noise, squared_errors
+
+HUSKY = load_robot("husky_a200")
+CG = np.zeros(2)
+
+
+def husky(entry: str, model: str = "diff_drive") -> Robot:
+    """A Husky with one line in its table of terms."""
+    return parse_robot(f"{robot_toml(HUSKY)}\n[models.{model}.terms]\n{entry}\n", "husky.toml")
+
+
+@pytest.mark.parametrize(
+    ("component", "text", "written", "unit", "is_symmetric"),
+    [
+        ("vy", "abs(wz) * wz", "wz*abs(wz)", "m s", True),
+        ("vx", "v**2", "v^2", "s/m", True),
+        ("vx", "v*v", "v^2", "s/m", True),
+        ("vx", "dv", "dv", "s", True),
+        ("wz", "sign(v)*wz", "sign(v)*wz", "1", True),
+        ("wz", "v", "v", "1/m", False),
+        ("vy", "v*cg_y", "v*cg_y", "1/m", True),
+        ("vx", "left", "left", "m", False),
+        ("wz", "t*wz", "wz*t", "1/s", True),
+    ],
+)
+def test_expression_is_written_in_one_way_with_its_unit(component: str, text: str, written: str, unit: str, is_symmetric: bool) -> None:
+    term = Term(component, parse_expression(text), 1.0)
+    assert (str(term.expression), term.unit, term.is_symmetric) == (written, unit, is_symmetric)
+    assert parse_expression(written) == term.expression
+
+
+def test_term_value_is_that_of_python() -> None:
+    v, wz, cg_y = 0.7, -0.4, 0.02
+    values = {name: np.array([x]) for name, x in {"v": v, "wz": wz, "cg_y": cg_y}.items()}
+    value, slopes = parse_expression("v^2*abs(wz)*cg_y").evaluate(values)
+    assert value[0] == pytest.approx(v**2 * abs(wz) * cg_y)
+    assert {name: s[0] for name, s in slopes.items()} == pytest.approx(
+        {"v": 2 * v * abs(wz) * cg_y, "wz": v**2 * np.sign(wz) * cg_y, "cg_y": v**2 * abs(wz)}
+    )
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ('vz = {"wz" = 1}', "unknown component 'vz' .did you mean wz"),
+        ('vy = {"wzz" = 1}', "unknown variable 'wzz' in 'wzz' .did you mean wz"),
+        ('vy = {"cg_x" = 1}', "would move a robot that stands"),
+        ('vy = {"wz + v" = 1}', "cannot read"),
+        ('vy = {"__import__(os)" = 1}', "cannot read"),
+        ('vy = {"wz^9" = 1}', "power 9 of wz"),
+        ('vy = {"wz" = [1, -1]}', "sigma not below 0"),
+        ('vy = {"wz" = [nan, 1]}', "must be value"),
+        ('vy = {"wz" = [1, 1, "m/s"]}', "the unit of 'wz' is 'm', found 'm/s'"),
+        ('vy = {"wz*v" = 1, "v*wz" = 2}', "stands there twice"),
+        ("vy = 3", "must be a table"),
+    ],
+)
+def test_parse_robot_with_a_wrong_term_names_what_is_meant(entry: str, message: str) -> None:
+    with pytest.raises(RobotError, match=message) as error:
+        husky(entry)
+    assert "husky.toml, [models.diff_drive.terms]" in str(error.value)
+
+
+def test_robot_toml_with_terms_is_read_as_it_was_written() -> None:
+    robot = husky('vy = {"wz*abs(wz)" = [-0.12, 0.01, "m s"]}\nvx = {"v*abs(v)" = 0.1}', "skid_steer")
+    assert parse_robot(robot_toml(robot), "again.toml") == robot
+    assert [t.name for t in robot.terms["skid_steer"]] == ["vx[v*abs(v)]", "vy[wz*abs(wz)]"]
+
+
+def test_terms_of_another_model_are_said() -> None:
+    robot = husky('vy = {"wz" = 0.1}', "icr")
+    assert "are of icr, and skid_steer runs without them" in prior_notes(robot)[0]
+    assert not any("terms" in note for note in prior_notes(robot, ["icr", "skid_steer"]))
+    assert type(make_model("skid_steer", robot)).__name__ == "SkidSteer"
+
+
+def test_acceleration_term_moves_by_the_change_of_speed() -> None:
+    """The integral of c dv/dt is c times the change of speed, however it is sampled."""
+    model = make_model("diff_drive", husky('vx = {"dv" = 0.2}'))
+    plain = make_model("diff_drive", HUSKY)
+    rates = np.array([[1.0, 1.0], [2.0, 2.0], [5.0, 5.0], [4.0, 4.0]])
+    dt = np.array([0.1, 0.3, 0.2, 0.1])
+    series = Series(np.r_[0.0, dt[1:]], np.zeros(4))
+    moved = preintegrate(in_series(model, series), dt, rates, CG, model.nominal, WheelNoise()).delta
+    alone = preintegrate(plain, dt, rates, CG, plain.nominal, WheelNoise()).delta
+    assert moved[0] - alone[0] == pytest.approx(0.2 * 3.0 * HUSKY.geometry.wheel_radius_m)
+    assert in_series(plain, series) is plain
+
+
+def test_fit_recovers_a_term_with_its_sigma() -> None:
+    rng = np.random.default_rng(3)
+    model = make_model("diff_drive", husky('vy = {"wz*abs(wz)" = [0.0, 0.5]}\nvx = {"v*t" = [0.0, 0.1]}'))
+    true = model.nominal + np.array([*(0.0,) * (len(model.nominal) - 2), 0.002, -0.12])
+    noise, n, maneuvers = 2e-3, 20, []
+    for i in range(40):
+        rates, start = np.tile(rng.uniform(-4.0, 4.0, 2), (n, 1)), 2.0 * i
+        series = Series(np.full(n, 0.1), start + 0.1 * np.arange(n))
+        delta = preintegrate(in_series(model, series), np.full(n, 0.1), rates, CG, true, WheelNoise()).delta
+        measured = (delta + noise * rng.normal(size=3))[None]
+        maneuvers.append(Maneuver(np.full(n, 0.1), rates, measured, np.array([n]), CG, noise**2 * np.eye(3), str(i), start_s=start))
+    quiet = WheelNoise(**dict.fromkeys(WheelNoise.__dataclass_fields__, 0.0))
+    found = fit(model, maneuvers, ("vx[v*t]", "vy[wz*abs(wz)]"), FitConfig(noise=quiet))
+    np.testing.assert_allclose(found.values, [0.002, -0.12], atol=4.0 * max(found.sigmas.values()))
+    written = found.robot(husky('vy = {"wz*abs(wz)" = [0.0, 0.5]}\nvx = {"v*t" = [0.0, 0.1]}')).terms["diff_drive"]
+    assert [t.value for t in written] == list(found.values)
+    assert [t.sigma for t in written] == pytest.approx(list(found.sigmas.values()))
+
+
+@pytest.mark.parametrize(("model", "form"), [("diff_drive", "constant"), ("skid_steer", "cg_field"), ("friction", "constant")])
+def test_corrections_hold_the_terms_that_have_a_sigma(model: str, form: str) -> None:
+    made = add_correction_parameters(make_model(model, husky('vy = {"wz*abs(wz)" = [-0.1, 0.05], "v*wz" = 0.1}', model)), form)
+    found = make_corrections(made, form)
+    at = found.names.index("vy[wz*abs(wz)]")
+    assert found.sigmas[at] == pytest.approx(0.05)
+    np.testing.assert_array_equal(np.flatnonzero(found.directions[:, at]), [made.param_names.index("vy[wz*abs(wz)]")])
+
+
+@pytest.mark.extended
+def test_ekf_estimates_terms_with_an_honest_covariance() -> None:
+    """True coefficients are drawn from the file's sigmas; the filter corrects them beside all else, with a consistent covariance."""
+    robot = husky('vy = {"wz*abs(wz)" = [-0.1, 0.05]}\nwz = {"v*abs(v)" = [0.0, 0.05]}')
+    model = make_model("diff_drive", robot)
+    assert isinstance(model, ExtendedModel)
+    nees, inside = [], []
+    for seed in range(12):
+        squared, within, counts = squared_errors(seed, 120, Noise(), model)
+        nees.append(squared[1] / counts[1])
+        inside.append(within[-2:])
+    assert 0.5 < np.mean(nees) < 1.6  # 12 runs of 7 numbers: 1 +- .15, and correlated walks
+    assert np.mean(inside) > 0.7  # of 90 %; 24 numbers
