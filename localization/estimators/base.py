@@ -59,6 +59,10 @@ class Residuals(NamedTuple):
     """Innovation of the gyro by what wheels and all measurements so far predict, and its variance [rad, rad^2]; None without a gyro."""
     file_delta: Pose2
     """(3,) motion by the wheels with the robot file's parameters."""
+    scan_turn: tuple[float, float] | None = None
+    """Innovation of the matched scan's yaw by what all other measurements predict, and its variance [rad, rad^2]; None without a scan."""
+    scan_way: tuple[float, float] | None = None
+    """The same of the way ahead [m, m^2]."""
 
 
 class GyroCalibration(NamedTuple):

@@ -80,6 +80,8 @@ class Filter:
         self.is_considered[MAP] = self.is_considered[KEY] = True
         self.turn_innovation: tuple[float, float] | None = None
         """Innovation of the gyro in the last step and its variance [rad, rad^2]; None without a gyro."""
+        self.scan_innovation: tuple[FloatArray, Cov3] | None = None
+        """Innovation (3,) of the scan in the last step and its covariance (3, 3), where the prior is no outlier; None without a scan."""
         self.wheel_noise_scale = 1.0
         """Factor on the robot file's wheel noise, estimated from the innovations."""
         self._scale_information, self._slip_cov = 0.0, np.zeros((n, n))  # Fisher information; the part of P that is this step's slip
@@ -118,7 +120,8 @@ class Filter:
         _, P = predict_linear(np.zeros(len(F)), self.P, F=F, Q=Q)  # P = F P F^T + Q
         pose = se2.compose(self.pose, delta)
         _check(f"the motion of the wheels until stamp {step.end_ns} ns", pose, P)
-        self.start, self.pose, self.P, self.turn_innovation = self.pose, pose, P, None
+        self.start, self.pose, self.P = self.pose, pose, P
+        self.turn_innovation = self.scan_innovation = None
         self.is_considered[PARAMS:] = not is_turning
 
     def wheel_cov(self, step: Step) -> Cov3:
@@ -139,10 +142,11 @@ class Filter:
 
         ``outlier_cov`` (3, 3): what the wheels' motion is worse by than predicted.
         """
-        self.P[POSE, POSE] += outlier_cov
         innovation, by_pose, by_map = submap_residual(self.pose, measured)
         H = np.zeros((3, len(self.P)))
         H[:, POSE], H[:, MAP] = by_pose, by_map
+        self.scan_innovation = innovation, H @ self.P @ H.T + R
+        self.P[POSE, POSE] += outlier_cov
         self.is_considered[RADIUS] = R[0, 0] > H[0] @ self.P @ H[0]  # the scene leaves the way open
         return self._update(innovation, H, R, is_of_map=True)
 

@@ -180,13 +180,18 @@ class EkfFusion(Estimator):
     @property
     def residuals(self) -> Residuals:
         """Residuals of the last step."""
-        return Residuals(self.filter.turn_innovation, self._file_delta)
+        if self.filter.scan_innovation is None:
+            return Residuals(self.filter.turn_innovation, self._file_delta)
+        y, S = self.filter.scan_innovation
+        way, turn = ((float(y[i]), float(S[i, i])) for i in (0, 2))
+        return Residuals(self.filter.turn_innovation, self._file_delta, turn, way)
 
     def learned_parameters(self) -> Sequence[LearnedParameter]:
         """The motion model's parameters that are corrected, against the robot file."""
         ekf, nominal = self.filter, dict(zip(self.model.param_names, self.model.nominal, strict=True))
         sigmas, priors = np.sqrt(np.diagonal(ekf.P)[PARAMS:]), self.corrections.sigmas
-        return [
+        radius = LearnedParameter("wheel_radius_scale", ekf.radius_scale, math.sqrt(ekf.P[RADIUS, RADIUS]), 0.0, self.wheel_radius_sigma)
+        return [radius] * (self._sensor is not None and self.wheel_radius_sigma > 0.0) + [
             LearnedParameter(name, nominal.get(name, 0.0) + change, sigma, nominal.get(name, 0.0), prior)
             for name, change, sigma, prior in zip(
                 self.corrections.names, ekf.corrections.tolist(), sigmas.tolist(), priors.tolist(), strict=True
@@ -249,6 +254,15 @@ class FilteredOdometry(Estimator):
     def gyro_calibration(self) -> GyroCalibration | None:
         """See `EkfFusion.gyro_calibration`."""
         return self.odometry.gyro_calibration
+
+    @property
+    def residuals(self) -> Residuals:
+        """See `EkfFusion.residuals`."""
+        return self.odometry.residuals
+
+    def learned_parameters(self) -> Sequence[LearnedParameter]:
+        """See `EkfFusion.learned_parameters`."""
+        return self.odometry.learned_parameters()
 
     @property
     def lost(self) -> LostScans | None:

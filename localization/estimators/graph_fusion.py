@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate, LearnedParameter, Residuals
+from localization.estimators.base import Estimate
 from localization.estimators.filter import KEY, PARAMS, RADIUS, START
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
@@ -90,15 +90,6 @@ class GraphFusion(FilteredOdometry):
         self._waiting: list[PositionSample] = []
         self._is_aligned, self._failure = False, ""
         self.n_loops = self.n_positions = self._n_late = 0
-
-    @property
-    def residuals(self) -> Residuals:
-        """See `EkfFusion.residuals`."""
-        return self.odometry.residuals
-
-    def learned_parameters(self) -> Sequence[LearnedParameter]:
-        """See `EkfFusion.learned_parameters`."""
-        return self.odometry.learned_parameters()
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""

@@ -10,6 +10,7 @@ from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.check import Check
+from localization.sensor_checks.consistency import Consistency
 from localization.sensor_checks.disagreement import Disagreement
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GyroRate
@@ -18,7 +19,6 @@ from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
-from localization.sensor_checks.turn_consistency import TurnConsistency
 from localization.sensor_checks.turn_rates import TurnRates
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
@@ -44,7 +44,7 @@ class SensorChecks:
             Standstill(faults, window, step_config),
             Disagreement(faults),
         )
-        self._turns = TurnConsistency(faults)
+        self._consistency = Consistency(faults)
         self._step: Step | None = None
         self._pose: Pose2 | None = None
 
@@ -74,7 +74,7 @@ class SensorChecks:
         """Compare the innovations of the last step, and the learned parameters, with their covariances."""
         residuals = estimator.residuals
         if self._step is not None and residuals is not None:
-            self._turns.add(self._step, residuals, estimator.learned_parameters)
+            self._consistency.add(self._step, residuals, estimator.learned_parameters)
 
     def inflate(self, estimate: Estimate) -> Estimate:
         """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""
@@ -85,7 +85,7 @@ class SensorChecks:
         if before is not None and self._step is not None:
             for check in self._checks:
                 check.compare_estimate(self._step, delta, estimate.nis)
-            self._turns.compare_estimate(delta, estimate.nis)
+            self._consistency.compare_estimate(delta, estimate.nis)
         return self._inflation.inflate(estimate, delta)
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:

@@ -27,8 +27,8 @@ class CovarianceInflation:
         self._since_ns: int | None = None
         self.ongoing: FloatArray | None = None
         """(3,) difference of a disagreement that lasts, of wheels and scans."""
-        self.ongoing_turn: FloatArray | None = None
-        """(3,) difference of a disagreement that lasts, of wheels and gyro."""
+        self.ongoing_pair: FloatArray | None = None
+        """(3,) difference of a pair of sensors that differ for now."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -78,7 +78,7 @@ class CovarianceInflation:
 
     def _total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        return self._spread + sum((np.outer(d, d) for d in (self.ongoing, self.ongoing_turn) if d is not None), np.zeros((3, 3)))
+        return self._spread + sum((np.outer(d, d) for d in (self.ongoing, self.ongoing_pair) if d is not None), np.zeros((3, 3)))
 
 
 def _turn(cov: Cov3, angle: float) -> Cov3:

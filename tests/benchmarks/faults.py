@@ -1,6 +1,9 @@
 """A campaign of mutated logs: faults of sensors and of files, all drives, formats and models, by seed. Prints what was survived.
 
-python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose]
+python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs]
+
+`--pairs` prints faults that no check knows by name instead, without the test of pairs of sensors and with it: the largest error of the
+position at its sigma [m], what wheels and scans alone make of the drive, and what is reported.
 """
 
 from __future__ import annotations
@@ -12,7 +15,11 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+from localization.sensor_checks import SensorChecks
+from tests.helpers import fault_drives
+from tests.helpers.event_faults import faults_of_stamps, faults_of_turns
 from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
 
 
@@ -22,7 +29,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="cases whose description has this in it")
     parser.add_argument("--verbose", action="store_true", help="print each case")
+    parser.add_argument("--pairs", action="store_true", help="faults without a name, instead of the campaign")
     options = parser.parse_args([] if arguments is None else arguments)
+    if options.pairs:
+        for line in _table_of_pairs(options.only):
+            print(line, flush=True)
+        return
     with tempfile.TemporaryDirectory(prefix="skidloc-faults-") as name:
         _campaign(Path(name), [c for c in cases(options.count, options.seed) if options.only in str(c)], options.seed, options.verbose)
 
@@ -54,6 +66,27 @@ def _campaign(folder: Path, chosen: list[Case], seed: int, verbose: bool) -> Non
     )
     for line in bad:
         print(line)
+
+
+def _table_of_pairs(only: str) -> Iterator[str]:
+    husky, room = fault_drives.without_lidar("husky_a200"), fault_drives.in_room()
+    rows = [
+        *((husky, "no LiDAR", name, fault) for name, fault in faults_of_turns(fault_drives.upright_axis(husky)).items()),
+        *((room, "room", name, fault) for name, fault in (faults_of_turns() | faults_of_stamps()).items()),
+    ]
+    yield "| drive | fault | before | after | at the end | wheels alone | scans alone | reported |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for drive, place, name, fault in rows:
+        if only not in name:
+            continue
+        with mock.patch.object(SensorChecks, "compare_residuals"):
+            before = fault_drives.run(drive, fault)
+        after = fault_drives.run(drive, fault)
+        alone = [fault_drives.run(drive, fault, estimator=e).last[0] for e in ("odometry", "lidar")[: 1 + drive.has_lidar]]
+        cells = [f"{error:.3f} at {sigma:.3f}" for error, sigma in (before.worst, after.worst, after.last)]
+        cells += [f"{error:.3f}" for error in alone] + [""] * (2 - len(alone))
+        known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in after.warnings if warning not in before.warnings)
+        yield f"| {place} | {name} | {' | '.join(cells)} | {known} |"
 
 
 if __name__ == "__main__":

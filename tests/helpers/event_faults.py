@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.events import Event, ImuSample, WheelSample
+from localization.events import Event, ImuSample, Scan, WheelSample
 
 EventFault = Callable[[list[Event]], Iterable[Event]]
 
@@ -55,4 +55,25 @@ def faults_of_turns(axis: int = 2) -> dict[str, EventFault]:
         "gyro bias rises by 2.6 deg/s": change_gyro(lambda w, part: w + _BIAS_RAD_S * part, axis),
         "left ticks lost": lose_ticks(0.3, 0.0),
         "ticks lost": lose_ticks(0.3, 0.3),
+    }
+
+
+def change_scans(change: Callable[[Scan, int], Scan]) -> EventFault:
+    """``change`` of each scan, by the stamp of the first event too."""
+
+    def apply(events: list[Event]) -> list[Event]:
+        begin_ns = events[0].stamp_ns
+        found = [change(event, begin_ns) if isinstance(event, Scan) else event for event in events]
+        return sorted(found, key=lambda event: event.stamp_ns)
+
+    return apply
+
+
+def faults_of_stamps() -> dict[str, EventFault]:
+    """Of a planar LiDAR, by name."""
+    return {
+        "stamps at the sweep's end": change_scans(lambda s, t: replace(s, stamp_ns=s.stamp_ns + round(1e9 * float(s.offsets.max())))),
+        "wrong sign of time_increment": change_scans(lambda s, t: replace(s, offsets=-s.offsets)),
+        "LiDAR's clock 1 % fast": change_scans(lambda s, t: replace(s, stamp_ns=t + round(1.01 * (s.stamp_ns - t)))),
+        "LiDAR's stamps .2 s late": change_scans(lambda s, t: replace(s, stamp_ns=s.stamp_ns + 200_000_000)),
     }

@@ -2,96 +2,58 @@
 
 from __future__ import annotations
 
-import functools
 import math
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from localization.estimators import Estimate, LearnedParameter, Residuals
-from localization.events import Event, Step, Turn
-from localization.logs import open_log
-from localization.pipeline import Pipeline, Trial
+from localization.events import Step, Turn
 from localization.ros.state_serialization import deserialize, serialize
+from localization.sensor_checks.consistency import DIFFERENCES, PARAMETER_FAR, Consistency
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
-from localization.sensor_checks.turn_consistency import PARAMETER_FAR, TURNS_DIFFER, TurnConsistency
-from localization.simulation.experiments import Experiment, OpenLoop, Rest, constant
-from localization.simulation.sensors import SensorConfig
-from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
+from localization.sensor_checks.innovations import InnovationWindows
+from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
 from motion_models import se2
 from motion_models.base import Motion
-from motion_models.registry import make_model
-from motion_models.robot import Mount
-from motion_models.robot_file import load_robot
-from tests.helpers.event_faults import EventFault, faults_of_turns
+from tests.helpers.event_faults import faults_of_stamps, faults_of_turns
+from tests.helpers.extended import cases
+from tests.helpers.fault_drives import in_room, run, upright_axis, without_lidar
 
 S = 1_000_000_000
+TURNS_DIFFER = DIFFERENCES[GYRO_WHEELS]
 ROBOTS = ("vaultbot", "husky_a200", "jackal", "pioneer_3at", "leo", "rosbot")
-_FOLDER = tempfile.TemporaryDirectory(prefix="skidloc-tests-")
-
-
-def _phases(robot, config):
-    yield Rest(3.0)
-    for direction in (1.0, -1.0):
-        yield OpenLoop("ahead", constant(0.3 * direction, 0.0), 5.0)
-        yield OpenLoop("turn", constant(0.0, 0.6), 4.0)
-        yield OpenLoop("arc", constant(0.25 * direction, 0.3), 6.0)
-        yield Rest(2.5)
-        yield OpenLoop("arc", constant(-0.25 * direction, -0.35), 8.0)
-        yield OpenLoop("turn", constant(0.0, -0.7), 4.0)
-    yield Rest(2.5)
-
-
-@functools.cache
-def driven(robot: str) -> tuple[list[Event], dict[str, Mount], list[tuple[int, np.ndarray]]]:
-    """Events, mounts, and true poses by stamp, of a minute without a LiDAR."""
-    path = Path(_FOLDER.name) / f"{robot}.mcap"
-    experiment = Experiment("turns", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
-    config = SimulationConfig(sensors=SensorConfig(lidar="none"))
-    write_simulation(path, Simulation(experiment, load_robot(robot), 0, {}, config))
-    log = open_log(path, load_robot(robot))
-    assert log.reference_topic is not None
-    truth = [(r.stamp_ns, np.append(r.position, r.yaw)) for r in log.references(log.reference_topic)]
-    return list(log.events()), dict(log.mounts), truth
-
-
-def estimate(robot: str, fault: EventFault | None, model: str = "skid_steer", estimator: str = "ekf") -> tuple[Pipeline, list[Estimate]]:
-    events, mounts, _ = driven(robot)
-    pipeline = Pipeline(Trial(make_model(model, load_robot(robot)), estimator), load_robot(robot), mounts, has_lidar=False)
-    estimates = [e for event in (events if fault is None else fault(events)) for e in pipeline.process(event)]
-    return pipeline, [*estimates, *pipeline.finish()]
-
-
-def upright_axis(robot: str) -> int:
-    return int(np.argmax(np.abs(driven(robot)[1]["imu_link"].rotation()[2])))
-
-
-def error_and_sigma(robot: str, last: Estimate) -> tuple[float, float]:
-    """Of the position at the end [m]."""
-    stamps = np.array([stamp for stamp, _ in driven(robot)[2]])
-    truth = driven(robot)[2][int(np.argmin(np.abs(stamps - last.stamp_ns)))][1]
-    off = se2.between(driven(robot)[2][0][1], truth)[:2] - last.pose[:2]
-    assert last.covariance is not None
-    return float(np.hypot(*off)), math.sqrt(np.trace(last.covariance[:2, :2]))
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("model", ["skid_steer", "diff_drive"])
 def test_healthy_drive_is_not_reported(robot: str, model: str) -> None:
-    assert estimate(robot, None, model)[0].warnings() == []
+    assert run(without_lidar(robot), None, model).warnings == []
 
 
 @pytest.mark.parametrize("name", faults_of_turns())
 def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> None:
-    robot = "husky_a200"
-    pipeline, estimates = estimate(robot, faults_of_turns(upright_axis(robot))[name])
-    assert set(pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR}, pipeline.warnings()
-    assert "saturated" not in name or any("end at 20 deg/s, its range" in warning for warning in pipeline.warnings())
-    error, sigma = error_and_sigma(robot, estimates[-1])
+    drive = without_lidar("husky_a200")
+    outcome = run(drive, faults_of_turns(upright_axis(drive))[name], "skid_steer")
+    assert set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR}, outcome.warnings
+    assert "saturated" not in name or any("end at 20 deg/s, its range" in warning for warning in outcome.warnings)
+    error, sigma = outcome.last
     assert error < max(3.0 * sigma, 0.1)
+
+
+@pytest.mark.parametrize("name", cases(faults_of_stamps(), usual=["wrong sign of time_increment"]))
+def test_wrong_stamps_of_scans_are_reported_and_in_the_covariance(name: str) -> None:
+    outcome = run(in_room(), faults_of_stamps()[name])
+    assert DIFFERENCES[LIDAR_GYRO] in outcome.pipeline.checks.found, outcome.warnings
+    error, sigma = outcome.worst
+    assert error < max(5.0 * sigma, 0.1)
+    assert not outcome.is_silent
+
+
+@pytest.mark.parametrize("number", cases(range(3), usual=["0"]))
+def test_healthy_tour_of_a_room_is_not_reported(number: int) -> None:
+    assert run(in_room(number)).warnings == []
 
 
 class Driven:
@@ -99,7 +61,7 @@ class Driven:
 
     def __init__(self) -> None:
         self.faults = FaultLog(CovarianceInflation())
-        self.check = TurnConsistency(self.faults)
+        self.check = Consistency(self.faults)
         self.seconds = 0.0
 
     def drive(
@@ -162,8 +124,8 @@ def test_distance_while_the_turns_differ_stays_in_the_covariance() -> None:
     restored = deserialize(*serialize(robot.check))
     robot.drive(80.0, 0.0, speed=0.0)
     assert robot.inflation_m >= 0.9 * during_m
-    assert robot.faults.inflation.ongoing_turn is None
-    assert isinstance(restored, TurnConsistency)
+    assert robot.faults.inflation.ongoing_pair is None
+    assert isinstance(restored, Consistency)
 
 
 def test_turns_that_differ_while_scans_match_leave_the_covariance() -> None:
@@ -179,3 +141,20 @@ def test_learned_factor_far_from_the_robot_file_is_reported(learned: float, is_r
     robot.drive(5.0, 0.0, learned=learned)
     assert (list(robot.faults.found) == [PARAMETER_FAR]) == is_reported
     assert not is_reported or f"k_0 is learned as {learned:.3g} +- 0.01, 25 sigma from this robot's file (1)" in robot.faults.warnings()[0]
+
+
+@pytest.mark.parametrize("limit", [1.0, 2.0])
+def test_sums_of_innovations_exceed_a_limit_as_often_as_a_normal_variable(limit: float) -> None:
+    """500 windows of 2 s, and the share of them beyond ``limit`` against the normal distribution's, within 3 sigma of the count."""
+    rng, n = np.random.default_rng(0), 500
+    expected, beyond = math.erfc(limit / math.sqrt(2.0)), 0
+    for _ in range(n):
+        windows = InnovationWindows(GYRO_WHEELS._replace(floor=0.0))
+        for k in range(20):
+            variance = float(rng.uniform(0.5, 2.0))
+            regressors = np.array([0.1, 0.0, 0.03, 0.0])
+            windows.add(math.sqrt(variance) * float(rng.normal()), variance, regressors, 0.1 * (k + 1), np.zeros((3, 3)))
+        worst = windows.worst()
+        assert worst is not None
+        beyond += worst.sigmas > limit
+    assert abs(beyond - n * expected) < 3.0 * math.sqrt(n * expected * (1.0 - expected))

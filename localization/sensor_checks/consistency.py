@@ -1,0 +1,268 @@
+"""Pairs of sensors that measure one quantity, against the covariances of both, whatever the reason; learned parameters against the file.
+
+The filter's innovations are compared over windows (`innovations.py`). A fault that the filter learns, as a factor, leaves them white: there
+the learned parameter is far from the robot file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.estimators import LearnedParameter, Residuals
+from localization.events import Step
+from localization.sensor_checks.disagreement import DISAGREEMENT
+from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
+from localization.sensor_checks.innovations import BIN_S, SECONDS, TURN, TURN_CHANGE, WAY, InnovationWindows, Pair
+from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
+from motion_models import se2
+from motion_models.se2 import FloatArray, Pose2
+
+_MESSAGE = (
+    "for {{seconds:.0f}} s in all the {quantity} by the {first} and those by the {second} differ by more than both sensors' noise"
+    " ({{sigmas:.1f}} sigma: {{difference}} in {{window:.0f}} s). {{cause}} {{use}}"
+)
+DIFFERENCES: Mapping[Pair, Fault] = {
+    pair: Fault(_MESSAGE.format(quantity=pair.quantity, first=pair.first, second=pair.second)) for pair in NAMED
+}
+"""What is reported of each pair that differs."""
+PARAMETER_FAR = Fault(
+    "{name} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or load, a"
+    " wrong scale of the gyro, or encoders that lose counts. {use} Fit the file with `skidloc calibrate`.",
+)
+_NAMED_WITHIN_S = 10.0
+"""A named fault is found at most so long after a pair begins to differ."""
+_MAX_SIGMAS = 4.5
+"""Largest sum of innovations over a window, in sigmas: 7e-6 by chance, one of 60 hours. Largest of healthy drives: gyro and wheels 4.0 (six
+simulated robots; Husky outdoors 1.0), LiDAR and gyro 3.3, ways by LiDAR and wheels 3.1 (ACES), turns by both 1.0 (ACES)."""
+_MIN_LEARNED_SIGMAS = 4.0
+"""Distance of a learned parameter from the robot file's, in its own sigmas."""
+_MIN_PRIOR_SIGMAS = 3.0
+"""The same, in those of its prior."""
+_MIN_TURNING_SIGMAS, _MIN_TURNING_SHARE = 1.4, 0.18
+"""Factors on turns stand for the gyro's scale as well, whose prior is far narrower: they count from so many sigmas of the prior
+on, and from this share of the file's value. ACES, fr079, CSAIL and the Husky outdoors have 0.2 sigmas and 3 %, simulated robots 11 %
+(two wheels, and a caster that drags)."""
+_TURNING = ("k_0", "wheel_separation_multiplier", "rotation_scale")
+_SAME_AS_DISAGREEMENT = (DIFFERENCES[LIDAR_WHEELS_TURNS], DIFFERENCES[LIDAR_WHEELS_WAYS])
+"""Both are of wheels and LiDAR: one report is enough."""
+_MATCHED_S = 2.0
+"""Scans that were matched so recently hold the pose, whatever wheels and gyro do [s]."""
+_MAX_CLIPPED_SIGMAS = 3.0
+"""Largest sum of innovations over a window, in sigmas, where the gyro's rates end at a value."""
+_REPEATED_RAD_S, _MIN_REPEATED_S, _MIN_CLIPPED_RAD_S = 1e-9, 0.5, 0.05
+"""Rates that are equal to the last digit, for so long, and far from zero, are the end of the gyro's range."""
+_USE_WITHOUT_SCANS = "The covariance has the distance between both while that lasts."
+_USE_WITH_SCANS = "The scans decide."
+
+
+class _Episode(NamedTuple):
+    """A time in which a pair differs, or a learned parameter is far from the robot file."""
+
+    begin_s: float
+    poses: FloatArray
+    """(3, 3) poses at its begin: see `Consistency`."""
+    reckoning: int
+    """Row of the dead reckoning that the estimate is compared with."""
+    is_by_lidar: bool = False
+    """The LiDAR's stamps explain the difference: matched scans do not decide."""
+
+
+class _Reported(NamedTuple):
+    """What was reported of a fault."""
+
+    begin_s: float
+    seconds: float
+    sigmas: float
+    numbers: Mapping[str, float | str]
+
+
+_ESTIMATED, _BY_FILE, _BY_GYRO = range(3)
+"""Rows of the poses: by the estimate, by the wheels with the robot file's parameters, by these with the gyro's turns."""
+
+
+class Consistency:
+    """Leaves out nothing, as either sensor may be right. While a pair differs the covariance has the distance of the estimate from the
+    dead reckoning by the wheels with the robot file's parameters (LiDAR and gyro: with the gyro's turns); it stays afterwards, as no scan
+    takes it back. Where scans are matched, and it is not their stamps that explain the difference, they decide."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults, self._clipping = faults, _Clipping()
+        self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
+        self._poses, self._file_delta = np.zeros((3, 3)), np.zeros(3)
+        self._totals = np.zeros(4)  # what causes are proportional to, since the first step
+        self._totals_at = {pair: np.zeros(4) for pair in NAMED}  # at the last measurement of each pair
+        self._gyro_turn = math.nan  # in the last step [rad]
+        self._has_moved = False
+        self._matched_s = -math.inf
+        self._episodes: dict[Fault, _Episode] = {}
+        self._reported: dict[Fault, _Reported] = {}
+
+    def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
+        """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
+        self._file_delta = residuals.file_delta
+        self._gyro_turn = math.nan if step.turn is None else step.turn.angle
+        self._has_moved |= not step.is_standing
+        self._add_totals(step)
+        if not self._has_moved:
+            return  # before the first motion, the bias is measured
+        if step.turn is not None and step.has_wheels:
+            self._clipping.add(step.turn.angle / step.duration, step.duration)
+        has_ended = False
+        for pair, innovation in _innovations(step, residuals).items():
+            regressors, self._totals_at[pair] = self._totals - self._totals_at[pair], self._totals.copy()
+            if self._windows[pair].add(*innovation, regressors, self._faults.now_s, self._poses):
+                self._compare(pair)
+                has_ended = True
+        if has_ended:
+            self._compare_parameters(learned())
+
+    def _add_totals(self, step: Step) -> None:
+        if step.duration == 0.0:
+            return
+        way, _, turn = (step.predicted.delta if step.has_wheels else np.zeros(3)).tolist()
+        self._totals[[SECONDS, TURN, WAY]] += [step.duration, turn, way]
+        self._totals[TURN_CHANGE] = (turn if step.turn is None else step.turn.angle) / step.duration
+
+    def compare_estimate(self, delta: Pose2, nis: float | None) -> None:
+        """The last step moved the estimate by ``delta`` (3,); ``nis`` of its scan, if one was matched."""
+        by_gyro = self._file_delta if math.isnan(self._gyro_turn) else np.array([*self._file_delta[:2], self._gyro_turn])
+        self._poses = se2.compose(self._poses, np.array([delta, self._file_delta, by_gyro]))
+        if nis is not None:
+            self._matched_s = self._faults.now_s
+        differences = [self._difference(e) for e in self._episodes.values() if self._is_inflating(e)]
+        self._faults.inflation.ongoing_pair = max(differences, key=lambda d: float(d @ d), default=None)
+
+    @property
+    def _has_scans(self) -> bool:
+        return self._faults.now_s - self._matched_s < _MATCHED_S
+
+    def _is_inflating(self, episode: _Episode) -> bool:
+        return episode.is_by_lidar or not self._has_scans
+
+    def _difference(self, episode: _Episode) -> FloatArray:
+        """(3,) of the dead reckoning from the estimate since the begin of ``episode``."""
+        moved = se2.between(episode.poses, self._poses)
+        return se2.log(se2.between(moved[_ESTIMATED], moved[episode.reckoning]))
+
+    def _compare(self, pair: Pair) -> None:
+        """Report whether ``pair`` differs now, and begin or end an episode."""
+        fault, worst = DIFFERENCES[pair], self._windows[pair].worst()
+        if fault in _SAME_AS_DISAGREEMENT and DISAGREEMENT in self._faults.found:
+            self._faults.retract(fault)
+            self._end(fault)
+            return
+        is_clipped = self._clipping.is_clipped and pair != LIDAR_WHEELS_WAYS
+        if self._is_explained(fault, NAMED[pair]) or worst is None or worst.sigmas < (_MAX_CLIPPED_SIGMAS if is_clipped else _MAX_SIGMAS):
+            self._end(fault)
+            return
+        regressor, cause = worst.explain(pair, CAUSES[pair])
+        if is_clipped:
+            regressor, cause = TURN, self._clipping.describe()
+        is_by_lidar = regressor == TURN_CHANGE
+        before = self._episodes.get(fault)
+        begin_s, poses = (worst.bins[1].end_s, worst.bins[1].poses) if before is None else (before.begin_s, before.poses)
+        reckoning = _BY_GYRO if pair == LIDAR_GYRO else _BY_FILE
+        episode = self._episodes[fault] = _Episode(begin_s, poses, reckoning, is_by_lidar)
+        unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
+        numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
+        self._report(fault, episode, worst.sigmas, numbers)
+
+    def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
+        """Report the learned parameter that is farthest from the robot file, where it is too far."""
+        off = _farthest(learned)
+        if off is None or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
+            self._end(PARAMETER_FAR)
+            return
+        bins = next(window.bins for window in self._windows.values() if window.bins)
+        episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, _BY_FILE))
+        numbers: dict[str, float | str] = {"name": off.name, "value": off.value, "sigma": off.sigma, "file": off.file_value}
+        self._report(PARAMETER_FAR, episode, abs(off.value - off.file_value) / off.sigma, numbers)
+
+    def _is_explained(self, fault: Fault, named: Sequence[Fault]) -> bool:
+        """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
+        found = [self._faults.found[other].at_s for other in named if other in self._faults]
+        if not found:
+            return False
+        episode = self._episodes.get(fault)
+        if episode is not None and found[0] - episode.begin_s >= _NAMED_WITHIN_S:
+            return False
+        if episode is not None:
+            self._faults.retract(fault)
+            self._reported.pop(fault, None)
+        return True
+
+    def _report(self, fault: Fault, episode: _Episode, sigmas: float, numbers: Mapping[str, float | str]) -> None:
+        """Report the begin of the first episode, the time of all, and the numbers of the worst moment."""
+        use = _USE_WITHOUT_SCANS if self._is_inflating(episode) else _USE_WITH_SCANS
+        now = _Reported(episode.begin_s, 0.0, sigmas, {**numbers, "use": use})
+        before = self._reported.get(fault, now)
+        worst = now if sigmas >= before.sigmas else before
+        seconds = before.seconds + BIN_S
+        self._reported[fault] = _Reported(before.begin_s, seconds, worst.sigmas, worst.numbers)
+        message = fault.message.format(seconds=seconds, sigmas=worst.sigmas, **worst.numbers)
+        self._faults.revise(DetectedFault(fault, before.begin_s, message))
+
+    def _end(self, fault: Fault) -> None:
+        """The sensors agree again: what the pose is off by stays."""
+        episode = self._episodes.pop(fault, None)
+        if episode is None or not self._is_inflating(episode):
+            return
+        other = next((name for name, e in self._episodes.items() if self._is_inflating(e)), None)
+        if other is None:
+            self._faults.inflation.add(self._difference(episode))
+        elif episode.begin_s < self._episodes[other].begin_s:  # the difference of both counts once
+            self._episodes[other] = episode
+
+
+def _innovations(step: Step, residuals: Residuals) -> Mapping[Pair, tuple[float, float]]:
+    """Innovation and variance of each pair that ``step`` has measured."""
+    found = {
+        GYRO_WHEELS: residuals.turn if step.turn is not None and step.has_wheels else None,
+        LIDAR_GYRO: residuals.scan_turn if step.turn is not None else None,
+        LIDAR_WHEELS_TURNS: residuals.scan_turn if step.turn is None and step.has_wheels else None,
+        LIDAR_WHEELS_WAYS: residuals.scan_way if step.has_wheels else None,
+    }
+    return {pair: innovation for pair, innovation in found.items() if innovation is not None}
+
+
+def _farthest(learned: Sequence[LearnedParameter]) -> LearnedParameter | None:
+    """The parameter that is farthest from the robot file, if it is too far by its own sigma and by that of its prior."""
+
+    def distance(p: LearnedParameter) -> float:
+        least = max(_MIN_PRIOR_SIGMAS * p.prior_sigma, _MIN_LEARNED_SIGMAS * p.sigma)
+        if p.name == "wheel_separation_multiplier" and p.file_value == 1.0 < p.value:
+            return 0.0  # a driver's factor that nobody has set, of a robot that slides as it turns
+        if p.name in _TURNING:
+            least = max(_MIN_TURNING_SIGMAS * p.prior_sigma, _MIN_TURNING_SHARE * abs(p.file_value), _MIN_LEARNED_SIGMAS * p.sigma)
+        return abs(p.value - p.file_value) / least if least else 0.0
+
+    far = max(learned, key=distance, default=None)
+    return far if far is not None and distance(far) > 1.0 else None
+
+
+class _Clipping:
+    """Whether a gyro's rates end at a value: the end of its range."""
+
+    def __init__(self) -> None:
+        self._largest = self._seconds = 0.0
+
+    def add(self, rate: float, seconds: float) -> None:
+        """Mean ``rate`` of the gyro over a step [rad/s]."""
+        size = abs(rate)
+        if size > self._largest + _REPEATED_RAD_S:
+            self._largest, self._seconds = size, 0.0
+        elif size >= self._largest - _REPEATED_RAD_S:
+            self._seconds += seconds
+
+    @property
+    def is_clipped(self) -> bool:
+        """Its largest rate lasts, to the last digit."""
+        return self._largest > _MIN_CLIPPED_RAD_S and self._seconds >= _MIN_REPEATED_S
+
+    def describe(self) -> str:
+        """The fault in a sentence."""
+        return f"The gyro's rates end at {math.degrees(self._largest):.3g} deg/s, its range: set a larger one, or turn more slowly."

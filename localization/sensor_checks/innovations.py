@@ -1,0 +1,129 @@
+"""Innovations of two sensors that measure one quantity, over windows of seconds, and what explains them best.
+
+A filter that is right has white innovations nu_k with the variances S_k that it computes: over any window the sum of nu has the variance
+sum of S (Bar-Shalom, Li, Kirubarajan 2001, 5.4: time-average test).
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from motion_models.se2 import FloatArray
+
+BIN_S = 0.25
+WINDOWS_S = (2.0, 10.0, 60.0)
+_MIN_FILLED = 0.9
+"""Part of a window that must have been measured."""
+SECONDS, TURN, WAY, TURN_CHANGE = range(4)
+"""What a cause is proportional to, in each bin: time [s], turn [rad] and way [m] by the wheels, change of the turn rate from begin to end
+[rad/s]."""
+
+
+class Pair(NamedTuple):
+    """Two sensors that measure one quantity."""
+
+    first: str
+    second: str
+    quantity: Literal["turns", "ways"]
+    floor: float
+    """Standard deviation over a window of what no model has [rad, m]."""
+
+
+Causes = Sequence[tuple[int, Callable[[float], str]]]
+"""What each cause is proportional to, and its sentence by the factor."""
+
+
+class Bin(NamedTuple):
+    """Sums up to the end of a quarter of a second or more, since the first."""
+
+    end_s: float
+    innovation: float
+    variance: float
+    seconds: float
+    regressors: FloatArray
+    """(4,) of this bin alone."""
+    poses: FloatArray
+    """(k, 3) by the estimate and by dead reckonings, before its last step."""
+
+
+class Window(NamedTuple):
+    """The innovations of the last seconds."""
+
+    bins: list[Bin]
+    """That before the window, and those in it."""
+    seconds: float
+    innovation: float
+    """Their sum [rad, m]."""
+    sigmas: float
+
+    def explain(self, pair: Pair, causes: Causes) -> tuple[int, str]:
+        """What takes away most of the innovations' chi-square, of the ``causes`` of a ``pair``, and its sentence."""
+        rows = np.array([(b.innovation, b.variance, b.seconds) for b in self.bins])
+        innovation, variance, _ = np.diff(rows, axis=0).T
+        X = np.array([b.regressors for b in self.bins[1:]])
+        if not X[:, [TURN, WAY]].any():
+            return SECONDS, _STANDING[pair.quantity].format(first=pair.first)
+        gains = [_fit(X[:, regressor], innovation, variance) for regressor, _ in causes]
+        best = max(range(len(gains)), key=lambda k: gains[k][0])
+        regressor, describe = causes[best]
+        return regressor, describe(gains[best][1])
+
+
+_STANDING = {
+    "turns": "The wheels stand: the {first}'s bias has changed, or the robot was turned by something else.",
+    "ways": "The wheels stand: objects move past the {first}, or the robot was moved by something else.",
+}
+
+
+def _fit(x: FloatArray, innovation: FloatArray, variance: FloatArray) -> tuple[float, float]:
+    """Chi-square that a multiple of ``x`` takes away from ``innovation`` (n,) with ``variance`` (n,), and the factor."""
+    power, product = float(x @ (x / variance)), float(x @ (innovation / variance))
+    return (product**2 / power, product / power) if power else (0.0, 0.0)
+
+
+class InnovationWindows:
+    """The innovations of one pair over the last minute: `add` each measurement."""
+
+    def __init__(self, pair: Pair) -> None:
+        self.pair = pair
+        self.bins: deque[Bin] = deque()
+        self._innovation = self._variance = self._seconds = 0.0
+        self._regressors = np.zeros(4)
+
+    def add(self, innovation: float, variance: float, regressors: FloatArray, now_s: float, poses: FloatArray) -> bool:
+        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``regressors`` (4,) since the last one; ``poses``
+        (k, 3) before it."""
+        if not self.bins:
+            self.bins.append(Bin(now_s - float(regressors[SECONDS]), 0.0, 0.0, 0.0, np.zeros(4), poses))
+        self._innovation, self._variance = self._innovation + innovation, self._variance + variance
+        self._regressors = self._regressors + regressors
+        self._seconds += float(regressors[SECONDS])
+        if self._regressors[SECONDS] < BIN_S:
+            return False
+        self.bins.append(Bin(now_s, self._innovation, self._variance, self._seconds, self._regressors, poses))
+        self._regressors = np.zeros(4)
+        while self.bins[1].end_s < now_s - WINDOWS_S[-1]:
+            self.bins.popleft()
+        return True
+
+    def worst(self) -> Window | None:
+        """That of the windows that end now whose sum is farthest from zero, in sigmas; None before the first is full."""
+        ends = [b.end_s for b in self.bins]
+        found = [window for seconds in WINDOWS_S if (window := self._window(ends, seconds)) is not None]
+        return max(found, key=lambda window: window.sigmas, default=None)
+
+    def _window(self, ends: Sequence[float], seconds: float) -> Window | None:
+        last = self.bins[-1]
+        before = max(bisect.bisect_right(ends, last.end_s - seconds) - 1, 0)
+        first = self.bins[before]
+        if last.seconds - first.seconds < _MIN_FILLED * seconds:
+            return None
+        total, variance = last.innovation - first.innovation, last.variance - first.variance
+        sigmas = abs(total) / math.sqrt(variance + self.pair.floor**2)
+        return Window(list(self.bins)[before:], seconds, total, sigmas)

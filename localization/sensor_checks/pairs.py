@@ -1,0 +1,94 @@
+"""Pairs of sensors that measure one quantity: what explains their differences, and the named faults that do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from localization.sensor_checks.faults import Fault
+from localization.sensor_checks.gyro_rate import GYRO_RATE
+from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
+from localization.sensor_checks.standstill import WHEELS_STANDING
+from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
+from localization.sensor_checks.turn_rates import (
+    GYRO_OPPOSITE,
+    GYRO_STUCK,
+    GYRO_UNIT,
+    LIDAR_OPPOSITE,
+    WHEELS_OPPOSITE,
+    WHEELS_SPIN,
+)
+
+_FLOOR_RAD = 0.01
+"""Turn of a standing robot that no model has: tyres that relax, someone who leans on it [rad]."""
+_FLOOR_M = 0.02
+"""Way of a standing robot that no model has, and by which a submap is off [m]: the noise of a range."""
+_OTHER = {"left": "right", "right": "left"}
+
+
+def _describe_bias(rate: float) -> str:
+    return f"A change of the gyro's bias by {math.degrees(rate):+.1f} deg/s explains it best."
+
+
+def _describe_turn_factor(change: float) -> str:
+    return (
+        f"A factor of {1.0 + change:.2f} on the wheels' turns explains it best: a floor that is more or less slippery, encoders that lose"
+        " counts, or the gyro's scale."
+    )
+
+
+def _describe_side(change: float) -> str:
+    side = "left" if change < 0.0 else "right"
+    return f"Encoders that lose counts, or a smaller radius, of the {side} wheels explain it best, or the {_OTHER[side]} ones spin."
+
+
+def _describe_gyro_scale(change: float) -> str:
+    return f"A factor of {1.0 + change:.2f} on the gyro's turns explains it best: its scale, its range, or the tilt of its mount."
+
+
+def _describe_gyro_bias(rate: float) -> str:
+    return f"A change of the gyro's bias by {math.degrees(-rate):+.1f} deg/s explains it best."
+
+
+def _describe_stamps(shift: float) -> str:
+    direction = "late" if shift < 0.0 else "early"
+    return (
+        f"LiDAR stamps that are {abs(shift):.3f} s too {direction} explain it best: a stamp is that of the first beam, and time_increment"
+        " has the sign of the sweep. Correct the LiDAR's driver, or its clock."
+    )
+
+
+def _describe_way_factor(change: float) -> str:
+    return (
+        f"A factor of {1.0 + change:.2f} on the wheels' ways explains it best: wheels that spin, encoders that lose counts, or another"
+        " radius."
+    )
+
+
+def _describe_moving(speed: float) -> str:
+    return f"Objects that move along at {abs(speed):.1f} m/s explain it best, or a robot that is pushed."
+
+
+GYRO_WHEELS = Pair("gyro", "wheels", "turns", _FLOOR_RAD)
+LIDAR_GYRO = Pair("LiDAR", "gyro", "turns", _FLOOR_RAD)
+LIDAR_WHEELS_TURNS = Pair("LiDAR", "wheels", "turns", _FLOOR_RAD)
+LIDAR_WHEELS_WAYS = Pair("LiDAR", "wheels", "ways", _FLOOR_M)
+
+CAUSES: Mapping[Pair, Causes] = {
+    GYRO_WHEELS: ((SECONDS, _describe_bias), (TURN, _describe_turn_factor), (WAY, _describe_side)),
+    LIDAR_GYRO: ((TURN_CHANGE, _describe_stamps), (SECONDS, _describe_gyro_bias), (TURN, _describe_gyro_scale)),
+    LIDAR_WHEELS_TURNS: ((TURN, _describe_turn_factor), (WAY, _describe_side)),
+    LIDAR_WHEELS_WAYS: ((WAY, _describe_way_factor), (SECONDS, _describe_moving)),
+}
+"""What may explain why a pair differs. Between wheels and LiDAR the filter estimates an offset of the clocks."""
+
+_OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_SPIN, WHEELS_STANDING)
+_OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)
+_OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION)
+NAMED: Mapping[Pair, tuple[Fault, ...]] = {
+    GYRO_WHEELS: (*_OF_GYRO, *_OF_WHEELS),
+    LIDAR_GYRO: (*_OF_GYRO, *_OF_LIDAR),
+    LIDAR_WHEELS_TURNS: (*_OF_WHEELS, *_OF_LIDAR),
+    LIDAR_WHEELS_WAYS: (*_OF_WHEELS, *_OF_LIDAR),
+}
+"""Faults with a check of their own that explain why a pair differs."""
