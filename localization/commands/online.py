@@ -143,6 +143,7 @@ class Online(OnlineSettings):
         transport = open_transport(self.transport, run.node.names, self.domain, self.interface)
         if run.node.use_sim_time:
             transport = SimTimeTransport(transport)
+        console.print(f"listening in {transport.place}, compiling meanwhile", markup=False, soft_wrap=True)
         try:
             node = Node.start(transport, run, report, stop.is_set, view)
             text = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"

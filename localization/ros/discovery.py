@@ -68,19 +68,29 @@ class TopicDiscovery:
         self._first: dict[str, list[FirstMessage]] = defaultdict(list)
 
     def discover(
-        self, wait_s: float, needed: Iterable[str], report: Callable[[str], None], is_over: Callable[[], bool]
+        self,
+        wait_s: float,
+        needed: Iterable[str],
+        report: Callable[[str], None],
+        is_over: Callable[[], bool],
+        is_ready: Callable[[], bool] = lambda: True,
     ) -> DiscoveredTopics:
         """Wait for wheels or a LiDAR, for the topics ``needed``, and for at most ``wait_s`` [s] for others that are published.
 
-        Silent ones are reported when they change and every half minute. Raises `TransportError` for a topic that carries another type,
-        `KeyboardInterrupt` when ``is_over``.
+        Until ``is_ready``, messages are stored; as many as the store holds, then they wait in the transport.
+
+        Silent ones are reported once it is ready, when they change and every half minute. Raises `TransportError` for a topic that
+        carries another type, `KeyboardInterrupt` when ``is_over``.
         """
         needed = {*needed, *self._requested}
         begin = reported = time.monotonic()
         last_report, first = "", None
         while not is_over():
-            for received in self._transport.take(_POLL_S):
-                self._receive(received)
+            if is_ready() or len(self._backlog) < _MAX_BACKLOG:
+                for received in self._transport.take(_POLL_S):
+                    self._receive(received)
+            else:
+                time.sleep(_POLL_S)
             now = time.monotonic()
             published = self._transport.publishers()
             self._check_types(published)
@@ -91,11 +101,15 @@ class TopicDiscovery:
             silent = sorted(waited_for - set(self._counts))
             is_settled = first is not None and now - first >= min(wait_s, _SETTLE_S)
             has_mounts = bool(self._transforms.mounts()) or self._tf_static not in published or is_late
-            if is_settled and not silent and has_mounts:
+            if is_settled and not silent and has_mounts and is_ready():
                 for topic in sorted(set(published) & set(self.candidates) - set(self._counts)):
                     report(f"started without {topic}: it is published, but no message comes.")
                 return self._discovered()
-            if now - begin > wait_s and ((text := self._silence(published, silent)) != last_report or now - reported > _REPORT_PERIOD_S):
+            if (
+                is_ready()
+                and now - begin > wait_s
+                and ((text := self._silence(published, silent)) != last_report or now - reported > _REPORT_PERIOD_S)
+            ):
                 last_report, reported = text, now
                 report(text)
         raise KeyboardInterrupt

@@ -1,24 +1,25 @@
-"""Compile before the robot moves: numba compiles each kernel at its first call, for seconds, and scans would wait for it."""
+"""Compile beside the discovery of topics: numba compiles each kernel at its first call, for seconds, and scans would wait for it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from localization.errors import EstimatorError
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
-from localization.pipeline import Pipeline
+from localization.pipeline import Pipeline, Trial
 from localization.ros.publisher import Predictor
 from localization.ros.settings import LiveRun
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
-_compiled: set[tuple[str, ...]] = set()
-"""What this process has warmed up."""
+_threads: dict[tuple[str, ...], threading.Thread] = {}
+"""What compiles, or has compiled, in this process, by settings."""
 _ROOM_M, _SPEED_M_S = 8.0, 0.5
 _PUSH = np.array([0.6, 0.4, 0.2])
 """Far enough that scans do not fit until they are searched [m, m, rad]."""
@@ -28,29 +29,50 @@ _PERIOD_NS = 10_000_000
 _EVENTS_PER_SCAN = 10
 
 
-def warm_up(run: LiveRun) -> None:
-    """Process short synthetic drives with every kind of sensor that the robot may have, and discard the results.
+class WarmUp:
+    """Process short synthetic drives with every kind of sensor that the robot may have, in a thread, and discard the results.
 
     Once with planar scans, once with clouds and once without a LiDAR (where the estimator works without one), each with a push that
     the wheels do not measure, after which the matcher searches. The centre of gravity of the robot's arms first. A process does it once for
-    each model and estimator.
+    each model and estimator: a second object of these waits for the first one.
     """
-    trial = run.make_trial(True)
-    settings = (trial.estimator, trial.model.name, trial.corrections, repr(run.config), repr(run.robot.arms))
-    if settings in _compiled:
-        return
-    _compiled.add(settings)
-    if run.robot.arms is not None:
-        model = arms_model(run.robot.arms, run.robot.folder)
-        model.estimate(np.zeros_like(model.chain.lower))
+
+    def __init__(self, run: LiveRun) -> None:
+        """Begin. Raises `SkidlocError` where the estimator of ``run`` cannot be made."""
+        trial = run.make_trial(True)
+        settings = (trial.estimator, trial.model.name, trial.corrections, repr(run.config), repr(run.robot.arms))
+        if settings not in _threads:
+            drives = list(_drives(run))
+            _threads[settings] = threading.Thread(target=_process, args=(run, drives), name="warm-up", daemon=True)
+            _threads[settings].start()
+        self._thread = _threads[settings]
+
+    def is_done(self) -> bool:
+        """Whether everything is compiled."""
+        return not self._thread.is_alive()
+
+    def wait(self) -> None:
+        """Until everything is compiled."""
+        self._thread.join()
+
+
+def _drives(run: LiveRun) -> Iterator[tuple[Trial, Pipeline, bool, bool]]:
+    """Trial, pipeline, whether it has a LiDAR, and whether that is planar. Raises `EstimatorError` if there is none even with a LiDAR."""
     for has_lidar, is_planar in ((True, True), (True, False), (False, True)):
         try:
             trial = run.make_trial(has_lidar)
-            pipeline = Pipeline(trial, run.robot, {"base_link": Mount(), **run.robot.mounts}, has_lidar, run.config)
+            mounts = {"base_link": Mount(), **run.robot.mounts}
+            yield trial, Pipeline(trial, run.robot, mounts, has_lidar, run.config), has_lidar, is_planar
         except EstimatorError:
             if has_lidar:
                 raise
-            continue
+
+
+def _process(run: LiveRun, drives: Sequence[tuple[Trial, Pipeline, bool, bool]]) -> None:
+    if run.robot.arms is not None:
+        model = arms_model(run.robot.arms, run.robot.folder)
+        model.estimate(np.zeros_like(model.chain.lower))
+    for trial, pipeline, has_lidar, is_planar in drives:
         predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s)
         for event in synthetic_drive(has_lidar, is_planar):
             predictor.insert(event)

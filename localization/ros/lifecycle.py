@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from localization.errors import SettingError
-from localization.ros.jit_warm_up import warm_up
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node, StopSignal
 from localization.ros.settings import LiveRun, ManagedNodeSettings, Names, make_settings, nearest, parameters
 from localization.ros.transports.base import SimTimeTransport, Transport
@@ -64,12 +64,12 @@ class ManagedNode:
             self._transport.take(_IDLE_S)
 
     def configure(self) -> None:
-        """Read the parameters and compile. Raises `SkidlocError`."""
+        """Read the parameters and begin to compile. Raises `SkidlocError`."""
         settings = self._read_settings()
         if not settings.robot:
             raise SettingError("parameter 'robot' is empty; it must be the name of a shipped robot or the path of a robot TOML file.")
         self._live_run = settings.live_run()
-        warm_up(self._live_run)
+        WarmUp(self._live_run)  # compiles while the node waits to be activated
         self._settings = settings
 
     def activate(self) -> None:

@@ -24,7 +24,7 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
-from localization.ros.jit_warm_up import warm_up
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.lidar_entrance import LidarEntrance
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.operator_commands import OperatorCommands
@@ -72,6 +72,8 @@ class Node:
         self._next_status = self._next_path = self._next_map = -float("inf")
         self._newest_ns = 0
         self._begin_ns: int | None = None
+        self._caught_up_ns: int | None = None
+        """When the messages of the start were processed: the latency of scans counts from there on."""
         self.statuses: list[Status] = []
         """Statuses that were published last, once a second."""
         self.is_paused = False
@@ -85,19 +87,19 @@ class Node:
         is_over: Callable[[], bool] = lambda: False,
         view: View | None = None,
     ) -> Node:
-        """Compile, discover the topics, then begin, or continue from the state on disk.
+        """Compile and discover the topics side by side, then begin, or continue from the state on disk.
 
         ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`). Raises `TransportError`, `TopicError`,
         `EstimatorError`, `CheckpointError` and `OutputError`.
         """
-        warm_up(run)
+        warming = WarmUp(run)
         run = run.resolve_topics()
         config, state_file = run.node, run.files.state
         discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
         # now: subscribers have found it by the first estimate
         publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
         needed = read_head(state_file).get("topics", []) if state_file is not None and state_file.exists() else []
-        discovered = discovery.discover(config.wait_s, needed, report, is_over)
+        discovered = discovery.discover(config.wait_s, needed, report, is_over, warming.is_done)
         trial = run.make_trial(discovered.parts.sources.lidar is not None)
         for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)
@@ -135,7 +137,8 @@ class Node:
             elif self._sources.lidar is not None and self._sources.wheels is not None:
                 self._entrance = LidarEntrance(LidarYawCheck(mounts, self._run.robot, self._sources.lidar.topic))
             for received in discovered.backlog:
-                self._receive(received, is_backlog=True)
+                self._receive(received)
+            self._caught_up_ns = self._transport.now_ns()
             failing.pop_all()
 
     def _subscribe(self) -> None:
@@ -242,7 +245,7 @@ class Node:
         """Since the first event [s]."""
         return 0.0 if self._begin_ns is None else (self._newest_ns - self._begin_ns) * 1e-9
 
-    def _receive(self, received: Received, *, is_backlog: bool = False) -> bool:
+    def _receive(self, received: Received) -> bool:
         """Process a message; True if it made an estimate."""
         if received.topic == self._tf:
             if (conflict := self._conflicts.check(received.data, self._publisher.recent_transforms)) is not None:
@@ -256,15 +259,16 @@ class Node:
             return False
         has_estimate = False
         for event in self._stream.events(received):
-            has_estimate |= self._process(event, received, is_backlog=is_backlog)
+            has_estimate |= self._process(event, received)
         if has_estimate:  # the next scan is farthest now, and does not wait
             self.session.pipeline.run_deferred()
             self.session.save_state(self._head)
         return has_estimate
 
-    def _process(self, event: Event, received: Received, *, is_backlog: bool) -> bool:
+    def _process(self, event: Event, received: Received) -> bool:
         self._newest_ns = max(self._newest_ns, event.stamp_ns)
         self._begin_ns = event.stamp_ns if self._begin_ns is None else self._begin_ns
+        is_backlog = self._caught_up_ns is None or received.received_ns < self._caught_up_ns
         arrived_ns = received.received_ns if not is_backlog and isinstance(event, Scan) else None
         is_predictable = self._predictor is not None and self._predictor.insert(event)
         estimates = self.session.process(event, partial(self._publish, event, arrived_ns))

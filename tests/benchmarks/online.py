@@ -1,6 +1,6 @@
 """The estimator live: how long after a scan its estimate is out, what part of a core it takes, and whether its memory stays flat.
 
-python -m tests.benchmarks.online [steps | latency | soak [HOURS [BEAMS]]]
+python -m tests.benchmarks.online [steps | latency | start | soak [HOURS [BEAMS]]]
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 
 from localization.logs import open_log
 from localization.pipeline import Pipeline, ReplayConfig, Trial
-from localization.ros.jit_warm_up import warm_up
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.settings import LiveRun
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
@@ -47,7 +47,7 @@ def in_process(path: Path, robot_name: str, estimator: str, model: str = "skid_s
     robot = load_robot(robot_name)
     log = open_log(path, robot)
     pair, config = Trial(make_model(model, robot), estimator), ReplayConfig()
-    warm_up(LiveRun(robot, lambda has_lidar: pair, config=config))
+    WarmUp(LiveRun(robot, lambda has_lidar: pair, config=config)).wait()
     events, took = list(log.events()), []
     pipeline = Pipeline(pair, robot, log.mounts, True, config)
     begin = time.process_time()
@@ -62,12 +62,12 @@ def in_process(path: Path, robot_name: str, estimator: str, model: str = "skid_s
 
 _FIRST_START = """
 from localization.pipeline import Trial
-from localization.ros.jit_warm_up import warm_up
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.settings import LiveRun
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 robot = load_robot("husky_a200")
-warm_up(LiveRun(robot, lambda has_lidar: Trial(make_model("skid_steer", robot), "ekf")))
+WarmUp(LiveRun(robot, lambda has_lidar: Trial(make_model("skid_steer", robot), "ekf"))).wait()
 """
 
 
@@ -93,25 +93,41 @@ def steps() -> None:
     print("wanted: p99 <= 5 ms, first start <= 10 s\n")
 
 
+def start_peer(path: Path, domain: str) -> subprocess.Popen[str]:
+    """The robot of ``path`` on DDS; it plays as soon as a node is there and a line with the seconds was written to it."""
+    command = [sys.executable, "-m", "tests.helpers.dds_peer", str(path), domain]
+    peer = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert peer.stdout is not None
+    peer.stdout.readline()
+    return peer
+
+
+def play(peer: subprocess.Popen[str], seconds: int) -> None:
+    """Begin to play, as soon as a node is there."""
+    assert peer.stdin is not None
+    peer.stdin.write(f"{seconds}\n")
+    peer.stdin.flush()
+
+
+def start_node(domain: str, *options: str) -> subprocess.Popen[str]:
+    """The node on DDS."""
+    command = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--transport", "dds", "--domain", domain)
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    return subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+
+
 def over_dds(path: Path, estimator: str, folder: Path) -> tuple[np.ndarray, np.ndarray, float]:
     """Seconds from each scan on the wire to its odometry on the wire; the same as another process sees it, which writes the one and reads
     the other in Python; and the estimator's part of a pipeline."""
     domain = "97"
-    node_command = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--transport", "dds", "--domain", domain)
-    options = ("--estimator", estimator, "--node.wait-s", "1", "--state", folder / f"{estimator}.state")
-    peer = subprocess.Popen(
-        [sys.executable, "-m", "tests.helpers.dds_peer", path, domain], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert peer.stdout is not None
-    assert peer.stdin is not None
-    peer.stdout.readline()
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    node = subprocess.Popen([*node_command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+    peer = start_peer(path, domain)
+    node = start_node(domain, "--estimator", estimator, "--node.wait-s", "1", "--state", str(folder / f"{estimator}.state"))
     assert node.stdout is not None
-    node.stdout.readline()
+    assert peer.stdout is not None
+    for _ in ("listening", "waiting for topics, with everything compiled"):
+        node.stdout.readline()
     before, begin = _cpu_seconds(node.pid), time.monotonic()
-    peer.stdin.write("60\n")
-    peer.stdin.flush()
+    play(peer, 60)
     peer.stdout.readline()  # matched
     peer.stdout.readline()  # played
     cpu = (_cpu_seconds(node.pid) - before) / (time.monotonic() - begin)
@@ -120,6 +136,30 @@ def over_dds(path: Path, estimator: str, folder: Path) -> tuple[np.ndarray, np.n
     node.communicate()
     settled = int(_SETTLED_S * 12.5)
     return np.array(heard["out_s"])[settled:], np.array(heard["latencies_s"])[settled:], cpu
+
+
+def start() -> None:
+    """A robot that is already driving: from the start of the node, and from its first scan on the wire, to the first odometry."""
+    print("start of the node beside a robot that drives             first line s    odometry s    after the first scan s")
+    with tempfile.TemporaryDirectory() as cache:
+        path = write_laps(Path(cache) / "laps.mcap", laps=2)
+        for name in ("kernels compiled", "kernels from the cache"):
+            os.environ["NUMBA_CACHE_DIR"] = cache
+            peer, begin = start_peer(path, "96"), time.monotonic()
+            play(peer, 90)
+            node = start_node("96")
+            assert node.stdout is not None
+            node.stdout.readline()
+            first_line_s = time.monotonic() - begin
+            report = json.loads(peer.communicate()[0].splitlines()[-1])
+            node.terminate()
+            node.communicate()
+            if not report["arrivals_s"]:
+                print(f"{name:56}{first_line_s:12.1f}  no odometry within 90 s", flush=True)
+                continue
+            odometry_s, scan_s = report["arrivals_s"][0], report["scans"][0][1]
+            print(f"{name:56}{first_line_s:12.1f}{odometry_s - begin:14.1f}{odometry_s - scan_s:22.1f}", flush=True)
+    print("wanted: 3 s after the first message with kernels from the cache, 12 s without\n")
 
 
 def _cpu_seconds(pid: int) -> float:
@@ -155,6 +195,8 @@ def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
         steps()
     if part in ("all", "latency"):
         latency()
+    if part in ("all", "start"):
+        start()
     if part in ("all", "soak"):
         soak(float(hours), int(beams))
 

@@ -44,6 +44,11 @@ def start_node(*arguments):
     return subprocess.Popen([*command, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
 
+def first_lines(node):
+    """What it prints until it waits for topics: by then everything is compiled."""
+    return "".join(node.stdout.readline() for _ in range(2))
+
+
 class Peer:
     """The robot: `tests.helpers.dds_peer`."""
 
@@ -114,7 +119,7 @@ def followed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("followed")
     files = ("--state", folder / "state", "--out", folder / "live.tum", "--node.wait-s", "1")
     peer, node = Peer(), start_node(*files)
-    waiting = node.stdout.readline()
+    waiting = first_lines(node)
     peer.begin(14.0)
     time.sleep(5.0)
     node.send_signal(signal.SIGSTOP)
@@ -128,7 +133,7 @@ def followed(tmp_path_factory):
     before = waiting + node.communicate()[0]
     assert (folder / "state").exists(), before
     node = start_node(*files)
-    waiting = node.stdout.readline()
+    waiting = first_lines(node)
     peer.begin(99.0)
     peer.wait()
     after = waiting + ended(node)
@@ -196,7 +201,7 @@ def test_node_publishes_lateral_velocity_corrections_and_diagnostics(followed):
 def test_node_without_a_robot_reports_where_it_listens_and_ends():
     """By SIGTERM, in the domain of ROS's environment."""
     node = start_node("--node.wait-s", "0.5")
-    text = " ".join((node.stdout.readline() + ended(node, signal.SIGTERM)).split())
+    text = " ".join((first_lines(node) + ended(node, signal.SIGTERM)).split())
     assert "no messages come on /joint_states (sensor_msgs/JointState)" in text
     assert f"No topic is published in domain {DOMAIN} on interface lo." in text
     assert "--interface default" in text

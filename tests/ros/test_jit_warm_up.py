@@ -8,7 +8,7 @@ import sys
 CODE = """
 import sys
 from numba.core.registry import CPUDispatcher
-from localization.ros.jit_warm_up import warm_up
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
 from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.session import Files
@@ -25,7 +25,7 @@ for estimator, model in (("ekf", "skid_steer"), ("graph", "friction")):
     transport = LogTransport(drive_log())
     trial = Trial(make_model(model, ROBOT), estimator)
     run = LiveRun(ROBOT, lambda has_lidar: trial, node=NodeConfig(wait_s=0.0))
-    warm_up(run)
+    WarmUp(run).wait()
     before = compiled()
     node = Node.start(transport, run, print)
     node.spin(transport.is_empty)

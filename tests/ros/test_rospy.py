@@ -78,7 +78,7 @@ def test_rospy_node_follows_a_played_bag(ros, tmp_path):
     write_simulation(bag, Simulation(DRIVE, ROBOT, 0, {}, SimulationConfig()))
     online = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "rospy", "--node.wait-s", "1")
     node = start(ros, *online, "--out", tmp_path / "live.mcap")
-    waiting = node.stdout.readline()
+    waiting = node.stdout.readline() + node.stdout.readline()  # listening, then waiting for topics
     topics = ("/skidloc/odometry", "/tf", "/diagnostics", "/skidloc/corrections")
     recorder = start(ros, "rosbag", "record", "-O", tmp_path / "recorded.bag", *topics)
     wait_until(lambda: all(subscribers(ros, topic) for topic in topics))
