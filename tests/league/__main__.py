@@ -1,0 +1,158 @@
+"""Run skidloc and its peers on the same logs, with the defaults of each, and judge them by evo and smfeval.
+
+python -m tests.league [--log fr079,csail,aces] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
+
+Peers are installed into .league/, an environment of their own, from tests/league/requirements.txt; what cannot be installed or crashes
+is a row that says so. What has been run is kept in the output folder and is not run again: delete a file to run it anew. The page
+league.html has tables, plots and settings; league.json the numbers. CPU seconds are those of the estimate alone, of all its threads,
+without reading the log. `--folder` adds NAME.mcap with NAME.toml and a reference NAME.tum, .csv, .txt or .relations beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from localization.evaluation.metrics import relation_errors
+from localization.evaluation.references import ReferenceTrack, Relations
+from localization.trajectory import Trajectory
+from tests.league import page
+from tests.league.logs import find_logs, peer_arrays
+from tests.league.systems import PEERS, SYSTEMS, System
+from tests.studies.buildings import REFERENCE_SIGMA, SHORT_S, Building, Drive
+
+_ENVIRONMENT = Path(".league")
+_TIMEOUT_S = 3600.0
+
+
+def prepare_environment() -> None:
+    """Make the peers' environment, each package by itself, so that one that cannot be had leaves the others."""
+    ready = _ENVIRONMENT / "ready"
+    if ready.exists():
+        return
+    subprocess.run([sys.executable, "-m", "venv", str(_ENVIRONMENT)], check=True)
+    for line in (Path(__file__).parent / "requirements.txt").read_text().split():
+        print(f"installing {line}", flush=True)
+        subprocess.run([str(_python()), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", line], check=False)
+    ready.touch()
+
+
+def _python() -> Path:
+    return _ENVIRONMENT / "bin" / "python"
+
+
+def run_system(system: System, log: str, out: Path, folder: Path | None) -> str:
+    """Run ``system`` on ``log`` unless its result is there. Returns why it failed, or an empty string."""
+    target, failure = out / log / system.name, out / log / f"{system.name}.failed"
+    if target.with_name(f"{system.name}.json").exists():
+        return ""
+    if failure.exists():
+        return failure.read_text()
+    if system.peer:
+        command = [str(_python()), str(PEERS / f"{system.peer}.py"), str(out / log / "drive.npz"), str(target)]
+    else:
+        command = [
+            sys.executable,
+            "-m",
+            "tests.league.ours",
+            log,
+            system.estimator,
+            system.matcher,
+            str(target),
+            *([str(folder)] if folder else []),
+        ]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+        reason = "" if done.returncode == 0 else (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
+    except subprocess.TimeoutExpired:
+        reason = f"not finished after {_TIMEOUT_S:.0f} s"
+    if reason:
+        failure.write_text(reason)
+    return reason
+
+
+def write_reference(drive: Drive, path: Path) -> None:
+    """Write the reference's poses for the judge, with the noise of a pose (tests/data/*/SOURCE.txt) where it has no covariance."""
+    track = drive.reference
+    assert isinstance(track, ReferenceTrack)
+    noise = np.broadcast_to(np.diag(REFERENCE_SIGMA**2), (len(track.stamps_ns), 3, 3))
+    given = noise if track.covariances is None else np.where(np.isfinite(track.covariances), track.covariances, noise)
+    np.savez_compressed(path, stamps_ns=track.stamps_ns, poses=track.poses, covariances=given)
+
+
+def judge(estimate: Path, reference: Path | Relations) -> dict[str, Any]:
+    """Scores by `peers/judge.py`; of relations, which evo does not have, mean errors of all and of those under 20 s."""
+    if isinstance(reference, Path):
+        done = subprocess.run(
+            [str(_python()), str(PEERS / "judge.py"), str(estimate), str(reference)], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            raise SystemExit(f"the judge failed on {estimate}:\n{done.stderr}")
+        return dict(json.loads(done.stdout))
+    with np.load(estimate) as arrays:
+        found = relation_errors(Trajectory(arrays["stamps_ns"], arrays["poses"]), reference)
+    return {"ate_m": float(found.translation_m.mean()), "rpe_m": float(found.translation_m[found.spans_s < SHORT_S].mean())}
+
+
+def rows_of(log: str, building: Building, systems: Sequence[System], out: Path, folder: Path | None) -> list[dict[str, Any]]:
+    """A row for each kind of poses of each system on one log."""
+    drive = building.open()
+    (out / log).mkdir(parents=True, exist_ok=True)
+    if not (out / log / "drive.npz").exists():
+        peer_arrays(drive).save(out / log / "drive.npz")
+    reference: Path | Relations = drive.reference if isinstance(drive.reference, Relations) else out / log / "reference.npz"
+    if isinstance(reference, Path):
+        write_reference(drive, reference)
+    seconds = (drive.events[-1].stamp_ns - drive.events[0].stamp_ns) * 1e-9
+    rows: list[dict[str, Any]] = []
+    for system in systems:
+        reason = run_system(system, log, out, folder)
+        print(f"{log}: {system.name}: {reason or 'done'}", flush=True)
+        if reason:
+            rows.append({"log": log, "system": system.name, "failure": reason})
+            continue
+        cost = json.loads((out / log / f"{system.name}.json").read_text())
+        usage = {"cpu_per_s": cost["cpu_s"] / seconds, "memory_mb": cost["memory_mb"]}
+        for kind in ("", " live"):
+            estimate = out / log / f"{system.name}{kind}.npz"
+            if estimate.exists():
+                rows.append({"log": log, "system": system.name + kind, **judge(estimate, reference), **usage})
+    return rows
+
+
+def _arguments(words: Sequence[str] | None, logs: Mapping[str, Building]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--log", type=lambda text: text.split(","), default=list(logs))
+    parser.add_argument("--system", type=lambda text: text.split(","), default=[system.name for system in SYSTEMS])
+    parser.add_argument("--folder", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("league-out"))
+    return parser.parse_args(words)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run, judge, and write the page."""
+    folder = argparse.ArgumentParser(add_help=False)
+    folder.add_argument("--folder", type=Path)
+    logs = find_logs(folder.parse_known_args(words)[0].folder)
+    options = _arguments(words, logs)
+    names = {system.name for system in SYSTEMS}
+    for given, known, what in ((options.log, logs, "log"), (options.system, names, "system")):
+        if unknown := [name for name in given if name not in known]:
+            raise SystemExit(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}.")
+    systems = [system for system in SYSTEMS if system.name in options.system]
+    prepare_environment()
+    rows = [row for log in options.log for row in rows_of(log, logs[log], systems, options.out, options.folder)]
+    (options.out / "league.json").write_text(json.dumps(rows, indent=1))
+    page.write(rows, systems, options.out)
+    print(f"{options.out / 'league.html'}")
+
+
+if __name__ == "__main__":
+    main()

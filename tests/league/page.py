@@ -1,0 +1,78 @@
+"""The league's page: a table and a plot of errors for each log, what each system was given, and which system has the least error."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from localization.report.figures import svg
+from tests.league.systems import System
+
+_COLUMNS: Mapping[str, tuple[str, str]] = {
+    "ate_m": ("ATE (relations: mean error) [m]", "{:.3f}"),
+    "rpe_m": ("RPE over 10 m (relations: those under 20 s) [m]", "{:.3f}"),
+    "crps_m": ("CRPS of a position axis [m]", "{:.4f}"),
+    "anees": ("ANEES of the position (2 expected)", "{:.2f}"),
+    "cpu_per_s": ("CPU [s per s of log]", "{:.4f}"),
+    "memory_mb": ("memory [MB]", "{:.0f}"),
+}
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1000px; margin: 2em auto; padding: 0 1em; color-scheme: light dark }
+table { border-collapse: collapse; width: 100% }
+th, td { padding: .3em .6em; text-align: right; border-bottom: 1px solid #8885 }
+th:first-child, td:first-child { text-align: left }
+.best { font-weight: bold }
+.scroll { overflow-x: auto }
+svg { max-width: 100%; height: auto; background: #fff }
+"""
+
+
+def write(rows: Sequence[Mapping[str, Any]], systems: Sequence[System], out: Path) -> None:
+    """Write league.html into ``out``."""
+    logs = list(dict.fromkeys(row["log"] for row in rows))
+    parts = [_log_section(log, [row for row in rows if row["log"] == log]) for log in logs]
+    given = "".join(f"<tr><td>{html.escape(system.name)}</td><td>{html.escape(system.what)}</td></tr>" for system in systems)
+    head = f"<meta charset=utf-8><meta name=viewport content='width=device-width'><title>League</title><style>{_STYLE}</style>"
+    about = (
+        "Each system with its own defaults on the same logs. Errors by evo at the reference's instants; covariances by smfeval, with the"
+        " reference's noise added; relations, which evo does not have, by skidloc. One drive is one sample."
+    )
+    table = f"<h2>What each system is given</h2><div class=scroll><table>{given}</table></div>"
+    text = f"<!doctype html><html lang=en>{head}<h1>League</h1><p>{about}</p>{''.join(parts)}{table}</html>"
+    (out / "league.html").write_text(text)
+
+
+def _log_section(log: str, rows: Sequence[Mapping[str, Any]]) -> str:
+    scored = [row for row in rows if "ate_m" in row]
+    best = {key: min((row[key] for row in scored), default=0.0) for key in ("ate_m", "rpe_m")}
+    head = "".join(f"<th>{html.escape(title)}</th>" for title, _ in _COLUMNS.values())
+    body = "".join(_table_row(row, best) for row in rows)
+    first = min(scored, key=lambda row: row["ate_m"], default=None)
+    sentence = f"<p>Least error: {html.escape(first['system'])}, {first['ate_m']:.3f} m.</p>" if first else ""
+    plot = svg(f"league-{log}", 9.0, 4.5, lambda figure: _draw(figure.subplots(), scored))
+    return f"<h2>{html.escape(log)}</h2>{sentence}<div class=scroll><table><tr><th>system</th>{head}</tr>{body}</table></div>{plot}"
+
+
+def _table_row(row: Mapping[str, Any], best: Mapping[str, float]) -> str:
+    name = html.escape(row["system"])
+    if "failure" in row:
+        return f"<tr><td>{name}</td><td colspan={len(_COLUMNS)} style='text-align:left'>{html.escape(row['failure'])}</td></tr>"
+    cells = (
+        f"<td class={'best' if row.get(key) == best.get(key, -1.0) else 'value'}>{form.format(row[key]) if key in row else '–'}</td>"  # noqa: RUF001
+        for key, (_, form) in _COLUMNS.items()
+    )
+    return f"<tr><td>{name}</td>{''.join(cells)}</tr>"
+
+
+def _draw(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    names = [row["system"] for row in rows][::-1]
+    axes.barh(names, [row["ate_m"] for row in rows][::-1], color=["#2a6f97" if name.startswith("skidloc") else "#b0b0b0" for name in names])
+    axes.set_xscale("log")
+    axes.set_xlabel("error [m], logarithmic")
+    for index, row in enumerate(rows[::-1]):
+        axes.annotate(f" {row['ate_m']:.3f}", (row["ate_m"], index), va="center")
+    axes.margins(x=0.15)

@@ -1,0 +1,36 @@
+"""Systems of the league: what each is, how it is run, and by which Python."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+PEERS = Path(__file__).parent / "peers"
+
+
+@dataclass(frozen=True)
+class System:
+    """One system with its default settings."""
+
+    name: str
+    what: str
+    """Sensors that it uses, and settings that are not its defaults."""
+    peer: str = ""
+    """Script in `peers/`, of a peer."""
+    estimator: str = ""
+    """Of skidloc."""
+    matcher: str = "submap"
+
+
+SYSTEMS: Sequence[System] = (
+    System("wheels", "wheel odometry, diff_drive", estimator="odometry"),
+    System("skidloc ekf", "wheels and LiDAR, live", estimator="ekf"),
+    System("skidloc graph", "wheels and LiDAR, live and smoothed", estimator="graph"),
+    System("skidloc ekf, kiss", "wheels and LiDAR, live, KISS-ICP as matcher", estimator="ekf", matcher="kiss"),
+    System("KISS-ICP", "LiDAR alone; its own defaults, 3D pipeline on planar scans", peer="kiss"),
+    System("KISS-ICP + wheels", "LiDAR, each registration started from wheel odometry", peer="kiss_wheels"),
+    System("GenZ-ICP", "LiDAR alone; its interface takes no initial guess", peer="genz"),
+    System("small_gicp + wheels", "LiDAR, scan to model as in its examples, started from wheel odometry", peer="gicp"),
+    System("Karto (yag_slam)", "wheels and LiDAR, slam_toolbox's matcher and graph: final poses", peer="karto"),
+)

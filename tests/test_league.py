@@ -1,0 +1,57 @@
+"""The league without its peers: what they are given, and the page."""
+
+import numpy as np
+import pytest
+
+from motion_models import se2
+from tests.league import page
+from tests.league.logs import find_logs, peer_arrays
+from tests.league.peers.exchange import Drive, matrix, planar
+from tests.league.systems import SYSTEMS
+
+
+def test_peer_arrays_put_walls_where_they_are(tmp_path):
+    """Where MIT-CSAIL's robot turns, neighbouring scans fit better by the wheels' motion: poses, points and frames belong together."""
+    drive = find_logs(None)["csail"].open().until(30.0)
+    peer_arrays(drive).save(tmp_path / "drive.npz")
+    arrays = Drive.load(tmp_path / "drive.npz")
+    scans = list(arrays.scans())
+    assert len(scans) == len(arrays.stamps_ns) == len(arrays.odometry)
+    assert arrays.beams[2] == 361
+    np.testing.assert_allclose(planar(matrix(arrays.odometry)), arrays.odometry, atol=1e-12)
+    moved = planar(np.linalg.multi_dot(arrays.predictions()[:40]))
+    np.testing.assert_allclose(moved, se2.between(arrays.odometry[0], arrays.odometry[39]), atol=1e-9)
+    motions = arrays.predictions()
+    turning = np.flatnonzero(np.abs(planar(motions)[:, 2]) > 0.15)
+    assert len(turning) > 5
+    fits = [[_distance(points, scans[i - 1]) for points in (scans[i], _moved(motions[i], scans[i]))] for i in turning]
+    resting, moved = np.median(fits, axis=0)
+    assert moved < 0.5 * resting
+
+
+def _moved(T, points):
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _distance(points, others):
+    """Median distance to the nearest point of ``others``."""
+    return float(np.median(np.linalg.norm(points[:, None, :2] - others[None, :, :2], axis=2).min(axis=1)))
+
+
+def test_log_without_reference_ends_with_what_is_missing(tmp_path):
+    (tmp_path / "mine.mcap").touch()
+    with pytest.raises(SystemExit, match=r"mine.toml and a reference .* must be beside it"):
+        find_logs(tmp_path)
+
+
+def test_page_names_the_least_error_and_what_failed(tmp_path):
+    rows = [
+        {"log": "a", "system": "skidloc ekf", "ate_m": 0.2, "rpe_m": 0.1, "cpu_per_s": 0.01, "memory_mb": 200.0},
+        {"log": "a", "system": "<peer>", "ate_m": 0.1, "rpe_m": 0.2, "cpu_per_s": 0.01, "memory_mb": 50.0},
+        {"log": "a", "system": "GenZ-ICP", "failure": "No module named 'genz_icp'"},
+    ]
+    page.write(rows, SYSTEMS, tmp_path)
+    text = (tmp_path / "league.html").read_text()
+    assert "Least error: &lt;peer&gt;, 0.100 m." in text
+    assert "No module named &#x27;genz_icp&#x27;" in text
+    assert text.count("class=best") == 2
