@@ -61,6 +61,8 @@ class Compare:
     config: ReplayConfig = field(default_factory=ReplayConfig)
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write means and differences to this file as well."""
+    static: bool = False
+    """Write a report without scripts: smaller by 1.2 MB, with figures as on paper."""
 
     def run(self, console: Console) -> None:
         """Run the command, with output on ``console``."""
@@ -136,7 +138,7 @@ class Compare:
             console.print(f"The reasons of what failed are in {table.path}.", markup=False, soft_wrap=True)
         reference = self.reference or "the robot file's topic"
         head = CompareHead(load_robot(self.robot).name, reference, table.path.name, versions(), self._notes())
-        write_comparison_report(report, head, found)
+        write_comparison_report(report, head, found, is_interactive=not self.static)
         console.print(f"report: {report}", markup=False, soft_wrap=True)
         if self.json is not None:
             write_json(self.json, {**_content(found), "notes": self._notes()})

@@ -19,6 +19,7 @@ from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import DrivenWeighing, corrected_hypothesis, weigh
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
+from localization.report.weigh_page import weigh_rows, write_weigh_page
 from motion_models.errors import CalibrationError
 from motion_models.robot_file import load_robot, relocated, robot_toml
 
@@ -45,12 +46,14 @@ class Weigh:
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     out: Annotated[Path | None, tyro.conf.arg(metavar="ROBOT.toml")] = None
     """Write the robot with this centre of gravity to this file; every command takes it as --robot."""
+    page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
+    """Write a page with the ellipse of the centre of gravity and everything that was estimated to this file."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write what is printed to this file as well."""
 
     def run(self, console: Console) -> None:
         """Read the log, weigh, print, and write what was asked for. Raises `CalibrationError` where the drive does not determine it."""
-        check_outputs(self.out, self.json)
+        check_outputs(self.out, self.json, self.page)
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         robot = load_robot(self.robot)
@@ -69,6 +72,9 @@ class Weigh:
             ]
             write_text_file(self.out, robot_toml(relocated(new.robot, self.out.parent), remarks="\n".join(remarks)))
             console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)
+        if self.page is not None:
+            write_weigh_page(self.page, describe(found, self.at), found, drive.robot.geometry, self.at)
+            console.print(f"page: {self.page}", markup=False, soft_wrap=True)
         if self.json is not None:
             write_json(self.json, {**found.to_dict(), "load_kg": None if self.at is None else list(found.payload(*self.at))})
 
@@ -100,16 +106,8 @@ def print_weighing(console: Console, found: DrivenWeighing, at: tuple[float, flo
     """Sentence, then the table."""
     console.print(describe(found, at), markup=False, soft_wrap=True)
     table = Table("", "unit", "robot file", "found", "+-", "95 % interval", box=None, header_style="bold", pad_edge=False)
-    rows = []
-    for i, axis in enumerate("xy"):
-        rows.append((f"centre of gravity {axis}", "m", f"{found.given[i]:+.4f}", float(found.position[i]), float(found.sigmas[i]), 4))
-    for i, axis in enumerate("xy"):
-        rows.append((f"load moment {axis}", "kg m", "0", float(found.moment[i]), float(found.mass_kg * found.sigmas[i]), 2))
-    if at is not None:
-        rows.append(("load", "kg", "0", *found.payload(*at), 1))
-    for name, unit, given, value, sigma, digits in rows:
-        low, high = value - _TWO_SIDED_95 * sigma, value + _TWO_SIDED_95 * sigma
-        table.add_row(name, unit, given, f"{value:+.{digits}f}", f"{sigma:.{digits}f}", f"{low:+.{digits}f} to {high:+.{digits}f}")
+    for row in weigh_rows(found, at):
+        table.add_row(*row.texts)
     console.print(table)
     console.print("load moment: mass times distance from this centre of gravity", markup=False, soft_wrap=True)
     about = f"{found.windows} windows, {found.turned_rad:.0f} rad of turning by the wheels, motion by {found.motion_reference}"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from localization.comparison.charts import is_wide, run_charts, run_table
 from localization.comparison.statistics import (
     Difference,
     Findings,
@@ -46,15 +47,16 @@ from localization.report.replay_page import MISSING, number
 from localization.report.runs import capitalize, estimator_colours
 
 _MARKERS = "osD^v"  # of matplotlib, by motion model
-_LOG_SCALE_RATIO = 8.0  # of the largest value to the smallest: from here on the axis is logarithmic
 _ROW_HEIGHT_IN = 0.42
 _TITLE = "Comparison over"
 _BEST, _EQUAL, _LOST = "best", "not significant", "LiDAR lost"
 _TERMS = {
     "Mean": "Over logs, each of which counts once: errors within a log are correlated, logs are not. In brackets the interval that holds "
     "the mean of other such logs in 95 of 100 cases, by bootstrap over logs.",
-    "Smaller by": "By what part of the other's mean the best one's is smaller, on the logs that both have, with its 95 % interval. Logs "
-    "differ far more than combinations do on one log: this interval is of the pairs and can be narrow where those of the means overlap.",
+    "Smaller by": "By what part of the other's mean the best one's is smaller, on the logs that both have. In brackets all parts that the "
+    "test of p does not exclude, at 95 % for all pairs together: 0 is among them where the difference is not significant. No brackets: so "
+    "few logs exclude nothing. Logs differ far more than combinations do on one log: this interval is of the pairs and can be narrow where "
+    "those of the means overlap.",
     "p": "Probability of so large a difference if neither were better: signs of the differences are flipped log by log. Corrected for all "
     "pairs of the table after Holm. Below 0.05 a difference is called shown.",
 }
@@ -73,10 +75,10 @@ class CompareHead:
     """On the robot, in sentences."""
 
 
-def write_comparison_report(path: Path, head: CompareHead, found: Findings) -> None:
+def write_comparison_report(path: Path, head: CompareHead, found: Findings, is_interactive: bool = True) -> None:
     """Write the page, over the report of an earlier state of the same table, but over nothing else. Raises `OutputError`."""
     check_report(path)
-    write_text_file(path, comparison_page(head, found), replace=True)
+    write_text_file(path, comparison_page(head, found, is_interactive), replace=True)
 
 
 def check_report(path: Path) -> None:
@@ -88,8 +90,8 @@ def check_report(path: Path) -> None:
         raise OutputError(f"'{path}' cannot be read: {error.strerror}.") from error
 
 
-def comparison_page(head: CompareHead, found: Findings) -> str:
-    """HTML of the whole page; ``found`` has means."""
+def comparison_page(head: CompareHead, found: Findings, is_interactive: bool = True) -> str:
+    """HTML of the whole page; ``found`` has means. Unless it ``is_interactive``, without scripts."""
     n = len(_logs(found))
     title = f"{_TITLE} {n} log{'s' * (n != 1)}"
     styles = _styles(found)
@@ -97,6 +99,7 @@ def comparison_page(head: CompareHead, found: Findings) -> str:
     sections = [
         Section("Means over logs", [_means_figure(found, styles)]),
         Section("The best against the others", [*_gains_figure(found, styles), *_tests(found, styles)]),
+        Section("Every run", [run_table(found, _names(found), styles), *run_charts(found, styles, _names(found))]),
         Section("Every log", _by_log(found, styles)),
         Section("Failures", _failures(found)),
         Section("Problems of logs that did not fail", _problems(found)),
@@ -104,7 +107,8 @@ def comparison_page(head: CompareHead, found: Findings) -> str:
         Section("Sources and versions", [Definitions(_provenance(head, found))]),
     ]
     sentences = [_unbroken(sentence) for sentence in (headline(found), *closing(found), *head.notes)]
-    return render(Page(title, facts, sentences, sections))
+    page = Page(title, facts, sentences, sections)
+    return render(page if is_interactive else page.without_scripts())
 
 
 def _unbroken(sentence: str) -> str:
@@ -122,7 +126,10 @@ def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> lis
     others: list[Mean] = [mean for mean, d in differences if d is not None and not math.isnan(d.relative)]
     if not others:
         return []
-    caption = "Lines are 95 % intervals over logs; where one reaches 0, these logs do not show that the best is better."
+    caption = (
+        "Lines are 95 % intervals of all pairs together; where one reaches 0, these logs do not show that the best is better. A hollow "
+        "mark without a line: so few logs cannot show it, whatever they are."
+    )
     return [Figure(_gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
 
 
@@ -225,6 +232,10 @@ def _logs(found: Findings) -> list[str]:
     return list(dict.fromkeys(r["log"] for r in found.rows))
 
 
+def _names(found: Findings) -> dict[str, str]:
+    return {log: _short(log, found) for log in _logs(found)}
+
+
 def _short(log: str, found: Findings) -> str:
     """The log's name alone, where no other log has the same."""
     name = Path(log).name
@@ -248,7 +259,7 @@ def _means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
             _interval(axes, row, mean.mean, (mean.low, mean.high), colour, _MARKERS[model % len(_MARKERS)])
         everything = np.concatenate([values[mean.name] for mean in found.means])
         least, most = everything.min(), everything.max()
-        if least > 0.0 and most > _LOG_SCALE_RATIO * least:
+        if is_wide([least, most]):
             axes.set(xscale="log", xlim=(least / 1.2, most * 1.2))
             plain_logs(axes)
         else:
@@ -279,8 +290,11 @@ def _gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tup
 
 
 def _interval(axes: Axes, row: int, value: float, interval: tuple[float, float], colour: str, marker: str) -> None:
-    axes.plot(interval, [row, row], color=COLOURS[colour], linewidth=2.0, solid_capstyle="butt")
-    axes.plot(value, row, marker, color=COLOURS[colour], markersize=6.5, markeredgecolor=COLOURS["ink"], markeredgewidth=0.6)
+    is_bounded = not np.isinf(interval).any()
+    if is_bounded:
+        axes.plot(interval, [row, row], color=COLOURS[colour], linewidth=2.0, solid_capstyle="butt")
+    face, edge = (COLOURS[colour], COLOURS["ink"]) if is_bounded else ("none", COLOURS[colour])
+    axes.plot(value, row, marker, color=face, markersize=6.5, markeredgecolor=edge, markeredgewidth=0.6 if is_bounded else 1.4)
 
 
 def _rows(axes: Axes, names: Sequence[str]) -> None:

@@ -1,8 +1,10 @@
 """Statistics of a comparison: means with intervals over logs, what is better than what on the same logs, and both in words.
 
-A log is the unit: errors within one are correlated, logs are not. Intervals are percentiles of the bootstrap over logs; differences
-are tested by flipping their signs log by log (exact for few logs), which assumes no distribution of errors. With n logs no
-p-value can be below 2^(1-n); several of them are corrected after Holm.
+A log is the unit: errors within one are correlated, logs are not. Intervals of means are percentiles of the bootstrap over logs;
+differences are tested by flipping their signs log by log (exact for few logs), which assumes no distribution of errors. With n logs no
+p-value can be below 2^(1-n); several of them are corrected after Holm (1979, Scand. J. Statist. 6). The interval of a difference holds
+all values that the same test, at the level that Holm's correction leaves it, does not reject (inversion of a test: Lehmann & Romano 2005,
+section 3.5): it contains 0 where, and only where, the difference is not significant, and has no end where so few logs exclude nothing.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +27,11 @@ _DRAWS = 10_000
 _EXACT_UP_TO = 14
 
 _SIGNIFICANCE_LEVEL = 0.05
+_UNKNOWN = (math.nan, math.nan)
+_LEAST_STEP, _MOST_STEPS = 1e-3, 1e4
+"""Of the search for the end of an interval: its first step, and how many times that the last one is."""
+_BOUND_ACCURACY = 1e-4
+"""Of an end, over the interval in which it was found."""
 _MEASURES = {
     "ate_rmse_m": "position error (ATE)",
     "ate_rmse_deg": "heading error (ATE)",
@@ -31,6 +39,12 @@ _MEASURES = {
     "rpe_rotation_deg_per_m": "relative heading error (RPE)",
     "end_error_m": "error at the end",
     "drift_percent": "drift",
+    "relations_all_translation_m": "translation error of relations",
+    "relations_all_rotation_deg": "rotation error of relations",
+    "nees_mean": "NEES",
+    "nis_mean": "NIS",
+    "lidar_lost_share": "share without LiDAR",
+    "distance_m": "distance",
 }
 
 
@@ -57,6 +71,7 @@ class Difference:
     mean: float
     """Mean over the logs of the worse one's number minus the better one's."""
     low: float
+    """95 % interval by the test itself, corrected for all differences of the table; -inf where the logs are too few for a bound."""
     high: float
     wins: int
     """Logs on which the better one has the smaller number."""
@@ -66,6 +81,11 @@ class Difference:
     relative_high: float
     p_value: float
     """Probability of a mean as far from zero if neither were better; corrected for all differences of the table."""
+
+
+def measure_of(metric: str) -> str:
+    """Name of a column of the table in a sentence."""
+    return _MEASURES.get(metric, metric)
 
 
 def combination(row: Row) -> str:
@@ -98,20 +118,53 @@ def means(rows: Sequence[Row], metric: str, seed: int = 0) -> list[Mean]:
 def differences(rows: Sequence[Row], metric: str, seed: int = 0) -> list[Difference]:
     """Differences of every two combinations with at least two logs in common, the smallest p-value first. Smaller numbers are better."""
     rng = np.random.default_rng(seed)
-    found = []
+    signs: dict[int, FloatArray] = {}
+    found: list[tuple[Difference, _Flips, _Flips]] = []
     for (a, a_table), (b, b_table) in itertools.combinations(by_combination(rows, metric).items(), 2):
         shared = [log for log in a_table if log in b_table]
-        if len(shared) < 2:
+        n = len(shared)
+        if n < 2:
             continue
+        if n not in signs:
+            signs[n] = _signs(n, rng)
         less, more = (np.array([table[log] for log in shared]) for table in (a_table, b_table))
         better, worse = a, b
         if more.mean() < less.mean():
             better, worse, less, more = b, a, more, less
         off = more - less
-        low, high = _interval(off, rng)
-        wins, part = int((off > 0.0).sum()), _relative(less, more, rng)
-        found.append(Difference(better, worse, len(off), float(off.mean()), low, high, wins, *part, sign_flip_p(off, rng)))
-    return _holm(sorted(found, key=lambda d: d.p_value))
+        absolute, relative = (_Flips(signs[n] @ off, signs[n] @ unit, float(off.sum()), float(unit.sum())) for unit in (np.ones(n), more))
+        difference = Difference(
+            *(
+                better,
+                worse,
+                n,
+                float(off.mean()),
+                *_UNKNOWN,
+                int((off > 0.0).sum()),
+                _relative(less, more),
+                *_UNKNOWN,
+                absolute.p_value(0.0),
+            )
+        )
+        found.append((difference, absolute, relative))
+    return _holm(sorted(found, key=lambda entry: entry[0].p_value))
+
+
+class _Flips(NamedTuple):
+    """Sums over logs of d - v u with all assignments of signs: d differences, u the unit in which a value v of the difference is given."""
+
+    differences: FloatArray
+    """(m,) sums of d with each assignment."""
+    units: FloatArray
+    """(m,) of u: 1 for absolute differences, the worse one's numbers for relative ones."""
+    difference: float
+    """Sum of d as measured."""
+    unit: float
+
+    def p_value(self, value: float) -> float:
+        """Share of the assignments with a sum at least as far from zero as the measured one, if the difference really were ``value``."""
+        reached = np.abs(self.differences - value * self.units) >= abs(self.difference - value * self.unit) * (1.0 - 1e-12)
+        return float(np.mean(reached))
 
 
 def _interval(values: FloatArray, rng: np.random.Generator) -> tuple[float, float]:
@@ -122,37 +175,57 @@ def _interval(values: FloatArray, rng: np.random.Generator) -> tuple[float, floa
     return float(low), float(high)
 
 
-def _relative(less: FloatArray, more: FloatArray, rng: np.random.Generator) -> tuple[float, float, float]:
-    """1 - mean(less) / mean(more) of numbers (n,) of the same logs, and its interval."""
-    drawn = rng.integers(0, len(less), (_DRAWS, len(less)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        parts = 1.0 - less[drawn].mean(axis=1) / more[drawn].mean(axis=1)
-    if not (more.mean() > 0.0 and np.isfinite(parts).all()):
-        return math.nan, math.nan, math.nan
-    low, high = np.quantile(parts, [0.025, 0.975])
-    return float(1.0 - less.mean() / more.mean()), float(low), float(high)
+def _relative(less: FloatArray, more: FloatArray) -> float:
+    """1 - mean(less) / mean(more) of numbers (n,) of the same logs; NaN where that is no number."""
+    return float(1.0 - less.mean() / more.mean()) if more.mean() > 0.0 and np.isfinite(less.mean() / more.mean()) else math.nan
 
 
 def sign_flip_p(off: FloatArray, rng: np.random.Generator) -> float:
     """Share of all assignments of signs to ``off`` (n,) whose mean is at least as far from zero as theirs; drawn ones for many."""
-    n = len(off)
+    signs = _signs(len(off), rng)
+    return _Flips(signs @ off, signs.sum(axis=1), float(off.sum()), float(len(off))).p_value(0.0)
+
+
+def _signs(n: int, rng: np.random.Generator) -> FloatArray:
+    """(m, n) all assignments of signs to n numbers; drawn ones, after the observed one, for many."""
     if n <= _EXACT_UP_TO:
-        signs = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
-        extra = 0
-    else:
-        signs = rng.choice((1.0, -1.0), size=(_DRAWS, n))
-        extra = 1  # the one that was observed
-    reached = np.abs(signs @ off) >= abs(off.sum()) * (1.0 - 1e-12)
-    return float((reached.sum() + extra) / (len(signs) + extra))
+        return np.array(list(itertools.product((1.0, -1.0), repeat=n)))
+    return np.vstack([np.ones(n), rng.choice((1.0, -1.0), size=(_DRAWS, n))])
 
 
-def _holm(found: list[Difference]) -> list[Difference]:
-    """Corrected p-values of those sorted by p-value."""
-    corrected, largest = [], 0.0
-    for i, difference in enumerate(found):
-        largest = max(largest, min(1.0, (len(found) - i) * difference.p_value))
-        corrected.append(replace(difference, p_value=largest))
+def _holm(found: Sequence[tuple[Difference, _Flips, _Flips]]) -> list[Difference]:
+    """Corrected p-values of those sorted by p-value, and the intervals that belong to them.
+
+    Once one is not rejected none of the following is, and the level stays.
+    """
+    corrected: list[Difference] = []
+    largest, left = 0.0, len(found)
+    for difference, absolute, relative in found:
+        largest = max(largest, min(1.0, left * difference.p_value))
+        level = _SIGNIFICANCE_LEVEL / left
+        low, high = _accepted(absolute, difference.mean, level)
+        least, most = _UNKNOWN if math.isnan(difference.relative) else _accepted(relative, difference.relative, level)
+        corrected.append(replace(difference, p_value=largest, low=low, high=high, relative_low=least, relative_high=most))
+        left -= largest < _SIGNIFICANCE_LEVEL
     return corrected
+
+
+def _accepted(flips: _Flips, estimate: float, level: float) -> tuple[float, float]:
+    """Smallest and largest value with a p-value of at least ``level``, by bisection from the ``estimate``; infinite without a bound."""
+    ends = []
+    for side in (-1.0, 1.0):
+        step = max(abs(estimate), _LEAST_STEP)
+        while flips.p_value(estimate + side * step) >= level and step < _MOST_STEPS * max(abs(estimate), _LEAST_STEP):
+            step *= 2.0
+        inside, outside = 0.0, step
+        if flips.p_value(estimate + side * step) >= level:
+            ends.append(side * math.inf)
+            continue
+        while outside - inside > _BOUND_ACCURACY * step:
+            middle = 0.5 * (inside + outside)
+            inside, outside = (middle, outside) if flips.p_value(estimate + side * middle) >= level else (inside, middle)
+        ends.append(estimate + side * inside)
+    return ends[0], ends[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +248,7 @@ class Findings:
     @property
     def measure(self) -> str:
         """Name of the metric in a sentence."""
-        return _MEASURES.get(self.metric, self.metric)
+        return measure_of(self.metric)
 
     @property
     def unit(self) -> str:
@@ -254,10 +327,14 @@ def _of(d: Difference, found: Findings) -> str:
 
 
 def percent(d: Difference, unit: str = "") -> str:
-    """By how much the better one is smaller, with its interval: in percent of the worse one's mean if positive, else in the ``unit``."""
-    if math.isnan(d.relative):
-        return f"{d.mean:.3g} {unit}".rstrip() + f" [{d.low:.3g}, {d.high:.3g}]"
-    return f"{_part(d.relative)} % [{_part(d.relative_low)}, {_part(d.relative_high)}]"
+    """By how much the better one is smaller, with its interval where the logs are enough for one: in percent of the worse one's mean if
+    positive, else in the ``unit``."""
+    is_relative = not math.isnan(d.relative)
+    value = f"{_part(d.relative)} %" if is_relative else f"{d.mean:.3g} {unit}".rstrip()
+    low, high = (d.relative_low, d.relative_high) if is_relative else (d.low, d.high)
+    if math.isinf(low) or math.isinf(high):
+        return value
+    return f"{value} [{_part(low)}, {_part(high)}]" if is_relative else f"{value} [{low:.3g}, {high:.3g}]"
 
 
 def p_words(p: float) -> str:

@@ -47,7 +47,7 @@ def _table(rows: tuple[CheckRow, ...]) -> list[Block]:
     cells = []
     for row in rows:
         cells.append([Cell(row.quantity), Cell(row.verdict, mark=_MARKS[row.verdict]), Cell(row.value), Cell(row.second_source)])
-    return [Table(header, cells, is_text=True)]
+    return [Table(header, cells, is_text=True, is_sortable=True)]
 
 
 def _to_drive(unseen: list[CheckRow]) -> list[Block]:

@@ -18,6 +18,7 @@ from localization.diagnosis.findings import (
     unit_of,
 )
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
+from localization.report.diagnosis_charts import COMPONENTS, diagnosis_charts, motion_in_windows
 from localization.report.figures import Axes, svg
 from localization.report.figures import Figure as Canvas
 from localization.report.page import (
@@ -37,7 +38,6 @@ from localization.report.page import (
 )
 from motion_models.se2 import FloatArray
 
-_COMPONENTS = {"x": "along", "y": "sideways", "yaw": "heading", "gyro": "gyro - motion reference"}
 _MAX_PANELS = 4
 _VERDICTS = {
     "consistent": "No discrepancy exceeds noise and tolerances; the table shows each component.",
@@ -58,18 +58,19 @@ _TERMS = {
 }
 
 
-def write_diagnosis_report(path: str | Path, found: DiagnosisResult) -> None:
+def write_diagnosis_report(path: str | Path, found: DiagnosisResult, is_interactive: bool = True) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    write_new(path, diagnosis_page(found).encode())
+    write_new(path, diagnosis_page(found, is_interactive).encode())
 
 
-def diagnosis_page(found: DiagnosisResult) -> str:
-    """HTML of the whole page."""
+def diagnosis_page(found: DiagnosisResult, is_interactive: bool = True) -> str:
+    """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     d = found.diagnosis
     sections = [
         Section("Findings", _findings(d)),
         Section("Components", _components(d)),
         Section("Next drive", [Paragraph(d.next_drive)] if d.next_drive else []),
+        Section("Explore", diagnosis_charts(found)),
         *_figures(found),
         Section("Corrected robot: before and after", _handover(d)),
         Section("Within tolerance", bullets(describe_tolerated(d))),
@@ -81,7 +82,8 @@ def diagnosis_page(found: DiagnosisResult) -> str:
         glossary(_TERMS),
     ]
     facts = f"{d.robot} · model {d.model} · reference {d.motion_reference} · {d.windows:,} windows"
-    return render(Page(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]], sections))
+    page = Page(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]], sections)
+    return render(page if is_interactive else page.without_scripts())
 
 
 def _figures(found: DiagnosisResult) -> list[Section]:
@@ -94,8 +96,8 @@ def _figures(found: DiagnosisResult) -> list[Section]:
         )
         by_motion = Figure(_dependence_svg(found), "Discrepancies by motion", f"One point for each window. {colours}")
         sections += [
-            Section("Discrepancies over time", [over_time]),
-            Section("Discrepancies by motion", [by_motion]),
+            Section("Discrepancies over time", [over_time], is_static=True),
+            Section("Discrepancies by motion", [by_motion], is_static=True),
         ]
     if d.findings:
         caption = "Each finding beside all others; the line is its 95 % interval, by bootstrap over blocks of windows."
@@ -157,7 +159,7 @@ def _discrepancy_svg(found: DiagnosisResult) -> str:
             _band(axes, seconds, 2.0 * r.sigmas[:, c])
             axes.plot(seconds, r.rows[:, c], ".", color=COLOURS["red"], markersize=4.0)
             axes.plot(seconds, r.left[:, c], ".", color=COLOURS["blue"], markersize=3.0)
-            axes.set_ylabel(f"{_COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
+            axes.set_ylabel(f"{COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
         panels[-1].set_xlabel("time since the first window [s]" if found.diagnosis.windows and seconds.any() else "maneuver")
 
     return svg("discrepancy", WIDTH_IN, 1.35 * len(shown) + 0.5, draw)
@@ -168,7 +170,7 @@ def _dependence_svg(found: DiagnosisResult) -> str:
     assert found.predictor is not None
     assert found.residuals is not None
     r = found.residuals
-    driven, turned = _motion(found)
+    driven, turned, _ = motion_in_windows(found.predictor)
     shown = [c for c in range(3) if np.isfinite(r.rows[:, c]).any()]
 
     def draw(figure: Canvas) -> None:
@@ -177,7 +179,7 @@ def _dependence_svg(found: DiagnosisResult) -> str:
             for axes, along in zip(panels[row], (driven, turned), strict=True):
                 axes.plot(along, r.rows[:, c], ".", color=COLOURS["red"], markersize=4.0)
                 axes.plot(along, r.left[:, c], ".", color=COLOURS["blue"], markersize=3.0)
-            panels[row][0].set_ylabel(f"{_COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
+            panels[row][0].set_ylabel(f"{COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
         panels[-1][0].set_xlabel("driven in the window [m]")
         panels[-1][1].set_xlabel("turned in the window [rad]")
 
@@ -204,15 +206,3 @@ def _gain_svg(d: Diagnosis) -> str:
 def _band(axes: Axes, seconds: FloatArray, width: FloatArray) -> None:
     axes.fill_between(seconds, -width, width, facecolor=COLOURS["band"], edgecolor="none", zorder=0.5)
     axes.axhline(0.0, color=COLOURS["soft"], linewidth=0.6, zorder=0.6)
-
-
-def _motion(found: DiagnosisResult) -> tuple[FloatArray, FloatArray]:
-    assert found.predictor is not None
-    batch = found.predictor.batch
-    twist = found.predictor.nominal_twist
-    parts = []
-    for end, owner in zip(batch.ends, batch.owner, strict=True):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
-        parts.append(twist[inside].T @ batch.dt[inside])
-    moved = np.array(parts)
-    return moved[:, 0], moved[:, 2]

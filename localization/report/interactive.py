@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.report.page import Explorer
-from localization.report.runs import PlottedRun, run_with_map, thin_series, timeline
+from localization.report.runs import PlottedRun, map_view, run_with_map, thin_series, timeline
 from localization.trajectory import IntArray
+from motion_models import se2
 from motion_models.se2 import FloatArray
 
-_MOST_POINTS = 3_200
+_MOST_POINTS = 2_700
 """Points of all paths together, of all errors, and of all innovations: 80 bytes in all, so that a page stays below 2 MB."""
 _MOST_MAP_POINTS = 5_000
 _MOST_LOOPS = 400
@@ -42,13 +43,20 @@ def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
     points = points[_evenly(len(points), _MOST_MAP_POINTS)]
     track = reference if isinstance(reference, ReferenceTrack) else None
     return {
-        "runs": [_run(run, start_ns, most) for run in runs if len(run.result.run.trajectory)],
+        "runs": [_run(run, start_ns, most, track) for run in runs if len(run.result.run.trajectory)],
+        "borders": _borders(runs, reference),
         "reference": None if track is None else _reference(track, start_ns),
         "map": {"x": _numbers(points[:, 0], 2), "y": _numbers(points[:, 1], 2), "run": "" if drawn is None else drawn.label},
     }
 
 
-def _run(run: PlottedRun, start_ns: int, most: int) -> dict[str, Any]:
+def _borders(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> dict[str, list[float | None]]:
+    """Part of the plane that the map shows at first [m]: runs that diverged do not set its scale."""
+    view = map_view(runs, reference)
+    return {axis: _numbers([view.low[i], view.high[i]], 2) for i, axis in enumerate("xy")}
+
+
+def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None) -> dict[str, Any]:
     """One run: path with sigma, errors, innovations, loops, and times without a matched scan."""
     trajectory = run.result.run.trajectory
     t = np.asarray((trajectory.stamps_ns - start_ns) * 1e-9, dtype=np.float64)
@@ -67,7 +75,7 @@ def _run(run: PlottedRun, start_ns: int, most: int) -> dict[str, Any]:
         "heading": _numbers(np.degrees(poses[keep, 2]), _TENTHS),
         "way": _numbers(way[keep], 2),
         "sigma": None if sigma is None else _numbers(sigma[keep], 4),
-        "errors": _errors(run, t, way, most),
+        "errors": _errors(run, t, way, most, track),
         "nis": _innovations(run, t),
         "loops": _loops(run),
         "lost": _lost(run, t),
@@ -75,8 +83,8 @@ def _run(run: PlottedRun, start_ns: int, most: int) -> dict[str, Any]:
     }
 
 
-def _errors(run: PlottedRun, t: FloatArray, way: FloatArray, most: int) -> dict[str, Any] | None:
-    """Errors against the reference, aligned as a whole."""
+def _errors(run: PlottedRun, t: FloatArray, way: FloatArray, most: int, track: ReferenceTrack | None) -> dict[str, Any] | None:
+    """Errors against the reference, aligned as a whole and, where ``track`` has headings, at the first pose."""
     line = timeline(run)
     if line is None:
         return None
@@ -87,6 +95,20 @@ def _errors(run: PlottedRun, t: FloatArray, way: FloatArray, most: int) -> dict[
         "way": _numbers(np.interp(seconds[keep], t, way), 2),
         "position": _numbers(line.position_m[keep], 4),
         "heading": None if line.heading_deg is None else _numbers(np.abs(line.heading_deg[keep]), 3),
+        "start": None if track is None or track.yaws is None else _start_errors(run, track, keep),
+    }
+
+
+def _start_errors(run: PlottedRun, track: ReferenceTrack, keep: IntArray) -> dict[str, list[float | None]]:
+    """Errors of the samples ``keep`` once the first matched poses are the same: how errors grow on the way."""
+    assert run.result.accuracy is not None
+    assert run.result.accuracy.errors is not None
+    series = run.result.accuracy.errors
+    truth = track.poses[np.searchsorted(track.stamps_ns, series.stamps_ns)]
+    aligned = se2.compose(se2.compose(truth[0], se2.inverse(series.estimate[0])), series.estimate)[keep]
+    return {
+        "position": _numbers(np.hypot(*(aligned[:, :2] - truth[keep, :2]).T), 4),
+        "heading": _numbers(np.abs(np.degrees(se2.wrap_angle(aligned[:, 2] - truth[keep, 2]))), 3),
     }
 
 

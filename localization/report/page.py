@@ -1,6 +1,7 @@
 """Pages of all reports: blocks of text, tables and figures as data, and the templates (Jinja2) that make HTML of them.
 
-A page loads nothing and runs no script, and the same data gives the same bytes. All HTML is in ``templates/``; texts are escaped there.
+A page loads nothing, and the same data gives the same bytes. All HTML is in ``templates/``; texts are escaped there. What is drawn in the
+browser has a static figure beside it, for paper and browsers without scripts.
 
 The colours are Okabe and Ito's ("Color universal design", 2008), which colour-blind readers can distinguish. In an SVG each colour becomes
 ``var(--name, value)``: the page's style sheet decides for light, dark and paper, and the picture can be shown without one as well.
@@ -10,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import ClassVar
@@ -19,6 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from localization.errors import OutputError
+from localization.report.charts import Chart, safe_json
 from localization.report.runs import PlottedRun
 
 COLOURS = {
@@ -55,6 +57,9 @@ DARK_COLOURS = {
 WIDTH_IN = 8.2
 """Width of all figures of a page [in]: 9 pt letters have the size of the page's small text at its full width."""
 
+_DRAWING_SCRIPTS = ("plotly-basic.min.js", "common.js")
+_SCRIPTS = {"explorer": "explore.js", "chart": "charts.js"}
+"""Script by the kind of block that it draws."""
 _KEPT = ("series-", "reference", "band")
 _PAPER = {"paper": "#ffffff", "card": "#f6f7f8", "accent": "#005a8c"}
 _DARK_PAPER = {"paper": "#14171a", "card": "#1d2125", "accent": "#7cc4f5"}
@@ -69,6 +74,8 @@ class Cell:
     """Second line, small."""
     is_bold: bool = False
     is_code: bool = False
+    is_words: bool = False
+    """Aligned left among numbers."""
     power: str | None = None
     """Exponent of a power of ten that the text is multiplied by."""
     badge: str = ""
@@ -94,6 +101,8 @@ class Table:
     """Title under which the table is folded away; "" to show it."""
     is_text: bool = False
     """Words and not numbers: aligned left, and wrapped."""
+    is_sortable: bool = False
+    """Sorted by a click on a title, and filtered by words, where scripts run."""
 
 
 @dataclass(frozen=True)
@@ -179,16 +188,10 @@ class Explorer:
     @property
     def data(self) -> Markup:
         """The JSON, safe inside a script element."""
-        return Markup(self.json.replace("<", "\\u003c"))
-
-    @property
-    def scripts(self) -> Markup:
-        """Plotly's basic bundle (MIT) and what draws with it: the page needs no network."""
-        folder = files("localization.report") / "templates"
-        return Markup("\n".join((folder / name).read_text(encoding="utf-8") for name in ("plotly-basic.min.js", "explore.js")))
+        return safe_json(self.json)
 
 
-Block = Table | Bullets | Paragraph | Definitions | Figure | Explorer
+Block = Table | Bullets | Paragraph | Definitions | Figure | Explorer | Chart
 
 
 @dataclass(frozen=True)
@@ -215,9 +218,24 @@ class Page:
     """Numbers of runs that a box in a legend can hide."""
 
     @property
-    def has_script(self) -> bool:
-        """Whether a part of the page is drawn in the browser."""
-        return any(block.kind == Explorer.kind for section in self.sections for block in section.blocks)
+    def scripts(self) -> Sequence[Markup]:
+        """Scripts of what is drawn in the browser, Plotly's basic bundle (MIT) before them: the page needs no network."""
+        blocks = [block for section in self.sections for block in section.blocks]
+        drawn = [script for kind, script in _SCRIPTS.items() if any(block.kind == kind for block in blocks)]
+        names = [*_DRAWING_SCRIPTS, *drawn] if drawn else []
+        if any(isinstance(block, Table) and block.is_sortable for block in blocks):
+            names.append("tables.js")
+        folder = files("localization.report") / "templates"
+        return [Markup((folder / name).read_text(encoding="utf-8")) for name in names]
+
+    def without_scripts(self) -> Page:
+        """For paper and mail: figures in place of charts."""
+        sections = []
+        for section in self.sections:
+            blocks = [block for block in section.blocks if block.kind not in _SCRIPTS]
+            plain = [replace(block, is_sortable=False) if isinstance(block, Table) else block for block in blocks]
+            sections.append(replace(section, blocks=plain, is_static=False))
+        return replace(self, sections=sections)
 
 
 def glossary(terms: Mapping[str, str]) -> Section:

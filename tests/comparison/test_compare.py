@@ -157,7 +157,7 @@ def test_compare_broken_log_is_reported_and_the_others_finished(table, tmp_path,
     assert "4 of 10 runs failed, on 2 logs." in printed
     report = (tmp_path / "t.html").read_text()
     assert "no such file" in report
-    assert report.count("failed</td>") == 4
+    assert report.count("failed</td>") == 8
     assert {r["ate_rmse_m"] for r in rows[2:8]} == {r["ate_rmse_m"] for r in rows_of(table)}
     assert compare(tmp_path / "u.csv", of=[absent]) == 2
     assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from html.parser import HTMLParser
 
 import numpy as np
@@ -83,6 +84,11 @@ def with_error(value, estimator="ekf", model="diff_drive"):
     """A result whose ATE is set to ``value``."""
     result = score([run(model, estimator, 0.1)], track())[0]
     return dataclasses.replace(result, accuracy=dataclasses.replace(result.accuracy, ate_rmse_m=value))
+
+
+def without_scripts(made: str) -> str:
+    """The page as it is without what a browser runs."""
+    return re.sub(r"<script.*?</script>", "", made, flags=re.DOTALL)
 
 
 class PageText(HTMLParser):

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -19,24 +15,24 @@ from localization.report.interactive import explorer_data
 from localization.report.replay_page import ReportHead, page
 from localization.report.runs import plotted_runs
 from localization.trajectory import Trajectory
+from tests.helpers.browser import run_in_page
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HEAD = ReportHead("drive.mcap", "husky_a200", "2026-01-02 03:04:05 UTC", 40.0, [], {}, "c0ffee")
 STAMPS = np.arange(401, dtype=np.int64) * 100_000_000
 POSES = np.column_stack([0.5 * STAMPS * 1e-9, np.zeros(401), np.zeros(401)])
-PROBE = """<script>
+PROBE = """
 const box = id => document.getElementById("explore-" + id);
 const change = (id, value, kind) => {box(id).value = value; box(id).dispatchEvent(new Event(kind));};
 const now = () => {const d = box("map").data; return d[d.length - 1].x.slice();};
-const found = {}, titles = () => (box("time").layout.annotations || []).map(a => a.text);
+const titles = () => (box("time").layout.annotations || []).map(a => a.text);
 change("slider", 20, "input"); found.at20 = now(); found.text = box("now").textContent;
 found.log = box("time").layout.yaxis.type; found.titles = titles();
 change("a", 0, "change"); change("b", 1, "change"); found.difference = titles().includes("A to B [m]");
 change("axis", "way", "change"); found.way = box("time").layout.xaxis.title.text;
 found.bands = box("time").layout.shapes.filter(s => s.type === "rect").length;
 found.isStaticHidden = getComputedStyle(document.querySelector("section.static")).display === "none";
-document.body.innerHTML = "<pre id=out>" + JSON.stringify(found) + "</pre>";
-</script></body>"""
+change("aligned", "start", "change"); found.atStart = Math.max(...box("time").data[0].y);
+"""
 
 
 def results():
@@ -82,37 +78,29 @@ def test_static_page_has_no_script():
     assert 'class="static"' not in page(HEAD, found, reference, is_interactive=False)
 
 
-def dom_of(page_file: Path, folder: Path) -> str | None:
-    """The page's elements after its scripts have run; None where no browser runs here."""
-    if CHROMIUM is None:
-        return None
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
-    command = [
-        CHROMIUM,
-        *options,
-        f"--user-data-dir={folder / 'profile'}",
-        "--virtual-time-budget=5000",
-        "--dump-dom",
-        f"file://{page_file}",
-    ]
-    try:
-        shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return shown.stdout if shown.returncode == 0 and "<body" in shown.stdout else None
+def test_explorer_data_has_errors_aligned_at_the_start():
+    found, reference = results()
+    plain = explorer_data(plotted_runs(found), reference)["runs"][0]["errors"]
+    assert plain["start"]["position"][0] == 0.0
+    assert plain["start"]["position"][-1] == pytest.approx(2.0, abs=0.01)  # a tenth of 20 m
+    assert plain["position"][-1] == pytest.approx(1.0, abs=0.02)  # half of that where the whole path is aligned
+
+
+def test_explorer_run_that_diverged_does_not_set_the_scale():
+    found, reference = results()
+    far = dataclasses.replace(found[0].run, trajectory=Trajectory(STAMPS, POSES * [100.0, 1, 1], None))
+    borders = explorer_data(plotted_runs(score([far, found[1].run], reference)), reference)["borders"]
+    assert borders["x"][1] < 40.0
 
 
 def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
-    plain = tmp_path / "plain.html"
-    plain.write_text("<html><body>a page</body></html>")
-    if "a page" not in (dom_of(plain, tmp_path) or ""):
-        pytest.skip("no Chromium runs on this machine")
     found, reference = results()
-    (tmp_path / "report.html").write_text(page(HEAD, found, reference).replace("</body>", PROBE), encoding="utf-8")
-    seen = json.loads(re.search(r'<pre id="out">(.*?)</pre>', dom_of(tmp_path / "report.html", tmp_path))[1])
+    seen = run_in_page(page(HEAD, found, reference), PROBE, tmp_path)
     assert seen["at20"][1] == pytest.approx(10.0, abs=0.1)
     assert (seen["text"], seen["log"], seen["way"]) == ("20.0 s", "log", "way [m]")
     assert {"position error [m]", "heading error [deg]", "position sigma [m]", "NIS (3 expected)", "k_0 ± sigma"} == set(seen["titles"])
     assert seen["difference"]
     assert seen["isStaticHidden"]
     assert seen["bands"] == 1
+    assert seen["atStart"] == pytest.approx(2.0, abs=0.01)
+    assert seen["errors"] == []

@@ -34,7 +34,7 @@ from localization.report.runs import (
 )
 from localization.trajectory import Trajectory
 from motion_models import se2
-from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error
+from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error, without_scripts
 
 # ---- words
 
@@ -439,11 +439,6 @@ def test_page_is_well_formed_and_loads_nothing(case):
     assert wanted <= set(ids)
     assert "nan" not in re.sub(r"base64,[^\"]*", "", first).lower().replace("finance", "")
     assert len(whole) < 2_000_000
-
-
-def without_scripts(made: str) -> str:
-    """The page as it is without what a browser runs."""
-    return re.sub(r"<script.*?</script>", "", made, flags=re.DOTALL)
 
 
 def test_page_starts_and_ends_with_the_summary():

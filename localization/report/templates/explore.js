@@ -1,33 +1,19 @@
 // Draws the interactive part of a replay's page with Plotly from the JSON of localization/report/interactive.py.
 (() => {
+  const {colour, config, before, layout, axis} = skidloc;
   const data = JSON.parse(document.getElementById("explore-data").textContent);
   const box = id => document.getElementById("explore-" + id);
-  const root = document.documentElement;
-  root.classList.add("has-script");
-  const colour = name => getComputedStyle(root).getPropertyValue("--" + name).trim();
   const runs = data.runs;
   const end = Math.max(...runs.map(run => run.t[run.t.length - 1]));
-  const config = {responsive: true, displaylogo: false, scrollZoom: true, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"]};
   let now = end;
 
-  // Index of the last number of sorted `t` that is not after `value`.
-  const before = (t, value) => {
-    let low = 0, high = t.length - 1;
-    while (low < high) {
-      const middle = (low + high + 1) >> 1;
-      if (t[middle] <= value) low = middle; else high = middle - 1;
-    }
-    return low;
-  };
-  const layout = more => ({
-    paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"), font: {color: colour("ink"), family: "inherit", size: 12},
-    margin: {l: 58, r: 12, t: 8, b: 42}, legend: {orientation: "h", y: 1.06, yanchor: "bottom"}, hovermode: "closest", ...more,
-  });
-  const axis = (title, more) => ({title: {text: title}, gridcolor: colour("rule"), linecolor: colour("rule"), zeroline: false, ...more});
   const style = run => ({color: colour(run.colour), width: 2, dash: run.dash});
   const isWay = () => box("axis").value === "way";
   const along = (run, part) => isWay() ? (part ? part.way : run.way) : (part || run).t;
   const wayAt = run => run.way[before(run.t, now)];
+
+  const isStart = () => box("aligned").value === "start";
+  const errors = run => isStart() ? run.errors && run.errors.start && {...run.errors, ...run.errors.start} : run.errors;
 
   const mapTraces = () => {
     const traces = [{x: data.map.x, y: data.map.y, mode: "markers", type: "scatter", name: "scans", hoverinfo: "skip",
@@ -49,8 +35,8 @@
 
   // Rows of the time series: title, unit, and the series of one run or null.
   const rows = () => [
-    ["position error [m]", "log", run => run.errors && [along(run, run.errors), run.errors.position]],
-    ["heading error [deg]", "log", run => run.errors && run.errors.heading && [along(run, run.errors), run.errors.heading]],
+    ["position error [m]", "log", run => errors(run) && [along(run, errors(run)), errors(run).position]],
+    ["heading error [deg]", "log", run => errors(run) && errors(run).heading && [along(run, errors(run)), errors(run).heading]],
     ["position sigma [m]", "log", run => run.sigma && [along(run), run.sigma]],
     ["NIS (3 expected)", "log", run => run.nis && [run.nis.t.map(t => isWay() ? run.way[before(run.t, t)] : t), run.nis.nis]],
   ].concat(parameter(), difference()).filter(row => runs.some(run => row[2](run)));
@@ -115,8 +101,8 @@
   };
   const draw = () => {
     const size = Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
-    Plotly.react(box("map"), mapTraces(), layout({height: size, dragmode: "pan", uirevision: "map", xaxis: axis("x [m]"),
-      yaxis: axis("y [m]", {scaleanchor: "x", scaleratio: 1})}), config);
+    Plotly.react(box("map"), mapTraces(), layout({height: size, dragmode: "pan", uirevision: "map", xaxis: axis("x [m]", {range: data.borders.x}),
+      yaxis: axis("y [m]", {range: data.borders.y, scaleanchor: "x", scaleratio: 1})}), config);
     const [traces, more] = timeFigure();
     Plotly.react(box("time"), traces, more, {...config, scrollZoom: false});
     show(now);
@@ -134,11 +120,12 @@
   box("parameter").value = names[0] || "";
   box("parameter").parentElement.hidden = !names.length;
   box("event").parentElement.hidden = !events.length;
+  box("aligned").parentElement.hidden = !runs.some(run => run.errors && run.errors.start);
   box("slider").max = end;
   draw();
   box("slider").addEventListener("input", event => show(+event.target.value));
   box("event").addEventListener("change", event => event.target.value && show(+event.target.value));
-  ["axis", "a", "b", "parameter"].forEach(name => box(name).addEventListener("change", draw));
+  ["axis", "aligned", "a", "b", "parameter"].forEach(name => box(name).addEventListener("change", draw));
   box("time").on("plotly_click", event => {
     const x = event.points[0].x;
     show(isWay() ? runs[0].t[before(runs[0].way, x)] : x);
@@ -147,5 +134,5 @@
     const t = event.points[0].customdata;
     if (t !== undefined) show(Array.isArray(t) ? t[0] : t);
   });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
+  skidloc.onTheme(draw);
 })();
