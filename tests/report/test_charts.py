@@ -16,7 +16,7 @@ from localization.diagnosis.weigh import DrivenWeighing
 from localization.report.charts import Chart, Series
 from localization.report.page import Cell, Page, Section, Table, render
 from localization.report.weigh_page import confidence_ellipse, weigh_page
-from motion_models.robot import load_robot
+from motion_models.robot_file import load_robot
 from tests.comparison.test_page import BETTER, HARD, HEAD, WORSE, rows
 from tests.helpers.browser import run_in_page
 from tests.helpers.report import PageText, without_scripts
@@ -33,13 +33,12 @@ TABLE = Table([Cell("Run"), Cell("Error")], [[Cell(name), Cell(value)] for name,
 STILL = Table([Cell("a")], [])
 SECTIONS = [Section("Table", [TABLE]), Section("Chart", [CHART]), Section("Still", [TABLE], is_static=True)]
 PAGE = Page("A page", "", ["A sentence."], SECTIONS)
-    "A page", "", ["A sentence."], [Section("Table", [TABLE]), Section("Chart", [CHART]), Section("Still", [TABLE], is_static=True)]
-)
 PROBE = """
 const names = () => [...document.querySelectorAll("tbody tr")].filter(row => !row.hidden).map(row => row.cells[0].innerText);
 document.querySelectorAll("thead button")[1].click(); found.up = names();
 document.querySelectorAll("thead button")[1].click(); found.down = names();
-const words = document.querySelector("input.filter"); words.value = "TWO"; words.dispatchEvent(new Event("input")); found.filtered = names();
+const words = document.querySelector("input.filter"); words.value = "TWO";
+words.dispatchEvent(new Event("input")); found.filtered = names();
 const place = document.querySelector(".chart-place"), list = document.querySelector("select");
 found.traces = place.data.map(t => [t.name, t.x]); list.value = "speed"; list.dispatchEvent(new Event("change"));
 found.speed = place.data.map(t => t.x); found.title = place.layout.xaxis.title.text;
