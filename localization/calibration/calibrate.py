@@ -13,6 +13,7 @@ import numpy as np
 
 from localization.calibration.dead_reckoning import check_reference
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
+from localization.calibration.position_reference import PositionMotionReference
 from localization.calibration.wheel_signals import read_signals
 from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig, cut
@@ -29,13 +30,18 @@ from motion_models.calibration.plan import CLOCK, CLOCK_SIGMA_S, Calibration, ca
 from motion_models.errors import CalibrationError
 from motion_models.online_calibration import RADIUS_NAMES, CorrectedWheels
 from motion_models.registry import make_model
-from motion_models.robot import Robot, WheelNoise
+from motion_models.robot import DIFF_DRIVE, Robot, WheelNoise
 from motion_models.se2 import FloatArray
 
 MotionReferenceName = Literal["auto", "lidar", "gyro", "reference"]
 
 ADVICE = "Drive some 10 s straight, 10 s of turning in place to each side, and a few arcs, with a second of standing in between."
 _FOLDS, _FEWEST_GROUPS = 10, 3
+_FIX = "sensor_msgs/msg/NavSatFix"
+ANTENNA = ("lidar_offset_x", "lidar_offset_y")
+"""Names of the antenna's place among the parameters of a fit."""
+_ANTENNA_SIGMA_M = 0.5
+"""How far an antenna of unknown place may be from the body's origin, as the sigma of its prior [m]; as for the graph's positions."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,10 @@ class Cut:
     measured_by: str
     """What measured the motion, in words."""
     warnings: tuple[str, ...] = ()
+    antenna: tuple[float, float] = (0.0, 0.0)
+    """Where in the body frame positions without headings were measured [m]."""
+    is_antenna_known: bool = True
+    """False where it is to be fitted."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +125,10 @@ def cut_log(
     reference: str | None,
     config: WindowConfig | None = None,
     reference_sigmas: tuple[float, float] | None = None,
+    antenna: tuple[float, float] | None = None,
 ) -> Cut:
     """The maneuvers of a log, as measured by ``reference_name``; "auto" is the reference if one is named, else the LiDAR, else the gyro.
+    ``antenna`` as in `make_motion_reference`.
 
     A reference, even one that the robot file names, is never used unless the user names it: what is calibrated on it cannot be scored
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
@@ -128,12 +140,19 @@ def cut_log(
             f"{log.path.name} has {log.no_wheels or 'no wheels by these options.'} Name them with --topic.joint-states or --topic.odometry."
             " `skidloc info` lists the topics."
         )
-    motion_reference, words = make_motion_reference(log, robot, reference_name, reference, config, reference_sigmas)
-    events = log.events()
-    windows = cut(events, motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
+    motion_reference, words = make_motion_reference(log, robot, reference_name, reference, config, reference_sigmas, antenna)
+    windows = cut(log.events(), motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
+    if isinstance(motion_reference, PositionMotionReference) and not motion_reference.is_antenna_known and windows.maneuvers:
+        # turns in place show by an antenna whose place is known about
+        guess = estimate_antenna(windows.maneuvers, robot)[0]
+        motion_reference = motion_reference.with_guess(guess)
+        windows = cut(log.events(), motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
     kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
     left = f"{kept}; left out: {windows.standing} standing still, {windows.unmeasured} not measured."
-    return Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
+    found = Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
+    if not isinstance(motion_reference, PositionMotionReference):
+        return found
+    return dataclasses.replace(found, antenna=motion_reference.antenna, is_antenna_known=motion_reference.is_antenna_known)
 
 
 def make_motion_reference(
@@ -143,16 +162,25 @@ def make_motion_reference(
     reference: str | None,
     config: WindowConfig,
     reference_sigmas: tuple[float, float] | None = None,
+    antenna: tuple[float, float] | None = None,
 ) -> tuple[MotionReference, str]:
-    """What measures the motion of ``log``, and its name in words; ``reference_sigmas`` as in `TrackMotionReference`.
+    """What measures the motion of ``log``, and its name in words; ``reference_sigmas`` as in `TrackMotionReference`. ``antenna`` is where
+    in the body frame a reference without headings measures [m]; by default where /tf_static has it, else unknown.
 
     Raises `CalibrationError` where the log has none.
     """
     if name == "reference" or (name == "auto" and reference is not None):
         track = _track(log, reference)
+        if track.yaws is None:
+            at = antenna if antenna is not None else _antenna_of(log, track.source)
+            sigma_m = None if reference_sigmas is None else reference_sigmas[0]
+            return PositionMotionReference(track, config.window_s, at, sigma_m), f"positions of {track.source}"
+        if antenna is not None:
+            raise CalibrationError(f"--antenna is for positions alone, and {track.source} has headings: its poses are the body's.")
         return TrackMotionReference(track, config.window_s, reference_sigmas), f"reference {track.source}"
-    if reference_sigmas is not None:
-        raise CalibrationError("--reference-sigma is the noise of a reference, and none measures the motion. Name one with --reference.")
+    if reference_sigmas is not None or antenna is not None:
+        option = "--antenna is of a reference" if reference_sigmas is None else "--reference-sigma is the noise of a reference"
+        raise CalibrationError(f"{option}, and none measures the motion. Name one with --reference.")
     sources = log.sources
     if sources.lidar is not None and name in ("auto", "lidar"):
         return LidarMotionReference(log.mounts, config.window_s), f"scan matching of {sources.lidar.topic}"
@@ -160,9 +188,17 @@ def make_motion_reference(
         return GyroMotionReference(robot.gyro_noise, log.mounts, config.window_s), f"gyro {sources.imu.topic}"
     absent = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no motion reference")
     raise CalibrationError(
-        f"{log.path.name} has {absent}, so nothing measures what the wheels do; name a reference with headings with --reference, or topics"
-        " with --topic.scan, --topic.points or --topic.imu. `skidloc info` lists them."
+        f"{log.path.name} has {absent}, so nothing measures what the wheels do; name a reference (poses, or positions of centimetres) with"
+        " --reference, or topics with --topic.scan, --topic.points or --topic.imu. `skidloc info` lists them."
     )
+
+
+def _antenna_of(log: Log, topic: str) -> tuple[float, float] | None:
+    """Where the log has the antenna of a topic of fixes [m]; None where it has no transform of its own."""
+    frame = log.frames.get(topic, "base_link")
+    if log.types.get(topic) != _FIX or frame == "base_link" or frame not in log.mounts:
+        return None
+    return log.mounts[frame].x, log.mounts[frame].y
 
 
 def _track(log: Log, reference: str | None) -> ReferenceTrack:
@@ -171,7 +207,7 @@ def _track(log: Log, reference: str | None) -> ReferenceTrack:
         raise CalibrationError(f"{log.path.name} has no reference topic {log.robot.topics.reference}; name one with --reference.")
     found = load_reference(log, name)
     if not isinstance(found, ReferenceTrack):
-        raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory with headings (TUM) or a topic.")
+        raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory (TUM) or a topic.")
     check_reference(log, read_signals(log), found)
     return found
 
@@ -196,9 +232,9 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
         raise CalibrationError(f"no motion to calibrate on. {sources} {ADVICE}")
     if (not of_rotations and not _has_own_radius(model)) or set(free) & set(RADIUS_NAMES):
         model = CorrectedWheels(model)
-    wanted = tuple(free) or free_of(model, maneuvers, of_rotations)
+    wanted = with_antenna(tuple(free) or free_of(model, maneuvers, of_rotations), cuts)
     # In a table of rotations nothing slips at random: every row has the same wheels, and its own errors.
-    config = FitConfig(noise=_NO_SLIP if of_rotations else robot.wheel_noise)
+    config = dataclasses.replace(antenna_config(cuts), noise=_NO_SLIP if of_rotations else robot.wheel_noise)
     found = calibrate(model, maneuvers, wanted, config, insist=bool(free))
     if not free:
         unrevealed = tuple((name, _NO_DISTANCE) for name in free_of(model, maneuvers[:0]) if name not in wanted and _only_turns(maneuvers))
@@ -227,6 +263,36 @@ def _has_own_radius(model: MotionModel) -> bool:
     return bool(model.twist(np.ones(2), np.zeros(2), model.nominal).d_params[0].any())
 
 
+def estimate_antenna(maneuvers: Sequence[Maneuver], robot: Robot) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Place of the antenna in the body frame and its sigmas [m], with k (the track of a robot with casters) and radius; the centre of
+    rotation is that of the robot file. Raises `CalibrationError` where the drive does not show it."""
+    kind, turning_by = ("diff_drive", "wheel_separation_multiplier") if robot.drive == DIFF_DRIVE else ("skid_steer", "k_0")
+    config = FitConfig(noise=robot.wheel_noise, prior_sigma=dict.fromkeys(ANTENNA, _ANTENNA_SIGMA_M), strict=False)
+    found = fit(CorrectedWheels(make_model(kind, robot)), maneuvers, (turning_by, *ANTENNA, RADIUS_NAMES[0]), config)
+    (x, y), sigmas = found.reference_params[2:4], found.sigmas
+    return (float(x), float(y)), (sigmas[ANTENNA[0]], sigmas[ANTENNA[1]])
+
+
+def with_antenna(names: Sequence[str], cuts: Sequence[Cut]) -> tuple[str, ...]:
+    """``names`` of parameters, with the antenna's place where that is unknown: before centres of rotation, from which one path of the
+    antenna does not separate it."""
+    if all(each.is_antenna_known for each in cuts):
+        return tuple(names)
+    return tuple(dict.fromkeys((*names[:1], *ANTENNA, *names[1:])))
+
+
+def antenna_config(cuts: Sequence[Cut]) -> FitConfig:
+    """Where the antenna is, and how well that is known. Raises `CalibrationError` for logs with antennas at several places."""
+    known = {each.antenna for each in cuts if each.is_antenna_known}
+    if len(known) > 1 or (known and not all(each.is_antenna_known for each in cuts)):
+        raise CalibrationError("the logs' positions are of antennas at several places: calibrate on each log alone, or give --antenna.")
+    if known:
+        return FitConfig(reference_at=known.pop())
+    x, y = np.mean([each.antenna for each in cuts], axis=0)
+    sizes = dict.fromkeys(ANTENNA, _ANTENNA_SIGMA_M)
+    return FitConfig(reference_at=(float(x), float(y)), prior_sigma=sizes, sizes=sizes)
+
+
 def _significant_clock(found: Fit, cuts: Sequence[Cut]) -> float:
     """The wheels' clock of a fit, against LiDAR or gyro and twice its sigma or more, else 0; a reference is no sensor of the robot, so that
     its clock may be the one that is off."""
@@ -251,7 +317,10 @@ class ClockEstimate(NamedTuple):
 
 
 def estimate_clocks(maneuvers: Sequence[Maneuver], robot: Robot) -> tuple[ClockEstimate, ...]:
-    """By headings alone and by positions alone, as far as they were measured; with turning and radius as diff_drive has them."""
+    """By headings alone and by positions alone, as far as they were measured; with turning and radius as diff_drive has them. None for
+    chords, whose lengths and angles are of the same positions."""
+    if any(m.middle for m in maneuvers):
+        return ()
     found = []
     config = FitConfig(noise=robot.wheel_noise, prior_sigma={CLOCK: CLOCK_SIGMA_S}, strict=False)
     for by, others, free in (

@@ -23,9 +23,9 @@ from motion_models.robot import GyroNoise, Mount, WheelNoise
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
-_MAX_SCAN_GAP_S, _MAX_REFERENCE_GAP_S = 1.0, 0.5
+_MAX_SCAN_GAP_S, MAX_REFERENCE_GAP_S = 1.0, 0.5
 """Gaps in scans and references beyond which a window is not measured [s]."""
-_MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one missing measurement does not end a window
+MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one missing measurement does not end a window
 _MAX_GYRO_BIAS = 0.05  # rad/s; a robot that turns faster by the gyro than any bias does not stand, whatever its wheels report
 HOLD_S = 0.5
 """Without a new sample, the wheels' last rates hold for this time [s]."""
@@ -44,7 +44,7 @@ _MAX_UNMATCHED_S, _MAX_UNMATCHED_M, _MAX_UNMATCHED_RAD = 0.3, 0.15, 0.15
 _RANGE_STEP_M = 0.2
 """Added to all ranges, and taken off, for the scene's derivative [m]. In a hall the derivative is 2 to 4 mm per metre, and its own noise
 3 mm at 0.05 m, 0.7 mm at 0.2 m and 0.6 mm at 0.4 m."""
-_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.02, 0.01
+REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.02, 0.01
 """Sigma of position and heading of a reference without covariances [m, rad]: about those of RTK-GPS with two antennas; motion capture is
 better."""
 _FINEST_SIGMA = 1e-4
@@ -64,6 +64,9 @@ class Span:
     cov: FloatArray
     """(3, 3) of its right perturbation, inf on the diagonal for what is not measured."""
     is_valid: bool = True
+    middle_ns: int | None = None
+    """Where positions alone were measured, the moment of the one between: ``measured`` is then the second chord relative to the first
+    (`motion_models.calibration.chords`)."""
     range_slope: FloatArray | None = None
     """(3,) change of ``measured`` per metre that is added to all ranges of a LiDAR; None for other references."""
 
@@ -261,7 +264,7 @@ class LidarMotionReference:
         """Let the longest gap within a window follow the median of the first gaps between scans: keyframes may be seconds apart."""
         if len(self._first_gaps_s) < _RATE_GAPS and self._scans > 1:
             self._first_gaps_s.append((stamp_ns - self._last_scan_ns) * _NS)
-            self._max_gap_s = max(_MAX_SCAN_GAP_S, _MAX_GAP_OVER_PERIOD * float(np.median(self._first_gaps_s)))
+            self._max_gap_s = max(_MAX_SCAN_GAP_S, MAX_GAP_OVER_PERIOD * float(np.median(self._first_gaps_s)))
         self._last_scan_ns = stamp_ns
 
     def _is_near_last(self, stamp_ns: int, wheels: Wheels) -> bool:
@@ -353,12 +356,12 @@ class TrackMotionReference:
     """A reference with headings that the user names: motion capture, a total station with a compass, another estimator."""
 
     def __init__(self, track: ReferenceTrack, window_s: float, sigmas: tuple[float, float] | None = None) -> None:
-        """``sigmas``: noise of its poses [m, rad]; by default its covariances, or `_REFERENCE_SIGMA_M` and `_REFERENCE_SIGMA_RAD`.
+        """``sigmas``: noise of its poses [m, rad]; by default its covariances, or `REFERENCE_SIGMA_M` and `_REFERENCE_SIGMA_RAD`.
 
         Raises `EvaluationError` for a reference of positions only, and for negative ``sigmas``.
         """
         given = track if sigmas is None else replace(track, covariances=None)
-        noise = with_noise(given, *(sigmas or (_REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD))).covariances
+        noise = with_noise(given, *(sigmas or (REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD))).covariances
         assert noise is not None
         self._track = Trajectory(track.stamps_ns, track.poses, covariances_in_body(noise, track.poses[:, 2]))
         self._warnings = (*track.warnings, *([] if sigmas is not None else [_describe_noise(track, noise)]))
@@ -366,8 +369,8 @@ class TrackMotionReference:
         self._start_ns: int | None = None
         self._stamps = track.stamps_ns
         period_s = float(np.median(np.diff(track.stamps_ns))) * _NS if len(track.stamps_ns) > 1 else 0.0
-        self._is_sparse = period_s > _MAX_REFERENCE_GAP_S
-        self._max_gap_s = max(_MAX_REFERENCE_GAP_S, _MAX_GAP_OVER_PERIOD * period_s)
+        self._is_sparse = period_s > MAX_REFERENCE_GAP_S
+        self._max_gap_s = max(MAX_REFERENCE_GAP_S, MAX_GAP_OVER_PERIOD * period_s)
 
     def spans(self, event: Event, wheels: Wheels) -> Iterator[Span]:
         """See `MotionReference.spans`."""

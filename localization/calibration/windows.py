@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -79,13 +80,13 @@ def cut(
         window = _window(history, span, around)
         if window is None:
             return 1
-        dt, rates, cg, lead, n = window
+        dt, rates, cg, lead, middle, n = window
         rolled = robot.geometry.wheel_radius_m * np.abs(rates[lead : lead + n]).T @ dt[lead : lead + n]
         if np.max(rolled) < config.least_m:
             short += 1
         elif span.is_valid:
             end = np.array([n], dtype=np.int64)
-            found.append((span, Maneuver(dt, rates, span.measured[None], end, cg, span.cov, lead=lead)))
+            found.append((span, Maneuver(dt, rates, span.measured[None], end, cg, span.cov, lead=lead, middle=middle)))
         else:
             return 1
         return 0
@@ -113,18 +114,22 @@ def cut(
     return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()))
 
 
-def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int] | None:
-    """Intervals (n,), rates (n, 2) and CG (n, 2) around a span, how many lie before it, and how many in it; None where some are missing."""
+def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int, int] | None:
+    """Intervals (n,), rates (n, 2) and CG (n, 2) around a span; how many lie before it, in it before its middle, and in it. None where some
+    are missing."""
+    middle_ns = span.start_ns if span.middle_ns is None else span.middle_ns
+    edges = (span.start_ns - around, span.start_ns, middle_ns, span.end_ns, span.end_ns + around)
     parts = []
-    for begin, end in ((span.start_ns - around, span.start_ns), (span.start_ns, span.end_ns), (span.end_ns, span.end_ns + around)):
+    for begin, end in itertools.pairwise(edges):
         dt, rates, cg, missing = history.window(begin, end, HOLD_S)
-        if missing:
-            if begin == span.start_ns:
+        if missing and begin < end:
+            if span.start_ns <= begin < span.end_ns:
                 return None
             dt, rates, cg = _NOTHING, np.zeros((0, 2)), np.zeros((0, 2))  # at the log's ends, no clock is looked for
         parts.append((dt, rates, cg))
     dt, rates, cg = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return dt, rates, cg, len(parts[0][0]), len(parts[1][0])
+    lead, first, second, _ = (len(part[0]) for part in parts)
+    return dt, rates, cg, lead, first, first + second
 
 
 def driven(maneuvers: Sequence[Maneuver], wheel_radius_m: float, track_width_m: float) -> tuple[float, float, float]:

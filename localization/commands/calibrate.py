@@ -60,9 +60,13 @@ class Calibrate:
     motion_reference: Annotated[MotionReferenceName, tyro.conf.arg(aliases=["--witness"])] = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
-    """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
+    """Topic or file (TUM, EuRoC, KITTI, CSV with a header, g2o, GPX, NMEA) as the motion reference: poses, or positions alone (GPS of
+    centimetres). Never used unless named."""
     reference_sigma: tuple[float, float] | None = None
     """Noise of the reference's poses [m, deg], as 0.002 0.1; by default its covariances, and 0.02 m and 0.57 deg without any."""
+    antenna: tuple[float, float] | None = None
+    """Where the antenna of positions alone sits in the body's frame [m]; by default where /tf_static has it, else it is estimated, and what
+    it cannot be told from (the centre of rotation) is held."""
     window_s: float = 2.0
     """Length of the maneuvers that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -135,7 +139,7 @@ class Calibrate:
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         if kind == "log":
             config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
-            return cut_log(path, robot, self.topic, self.motion_reference, self.reference, config, sigmas)
+            return cut_log(path, robot, self.topic, self.motion_reference, self.reference, config, sigmas, self.antenna)
         if kind == "rotations":
             table = read_rotation_table(path)
             return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")

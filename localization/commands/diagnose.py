@@ -64,9 +64,12 @@ class Diagnose:
     motion_reference: Annotated[MotionReferenceName, tyro.conf.arg(aliases=["--witness"])] = "auto"
     """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
     reference: str | None = None
-    """Topic or TUM file with positions and headings, as the motion reference. Never used unless named."""
+    """Topic or file (TUM, EuRoC, KITTI, CSV with a header, g2o, GPX, NMEA) as the motion reference: poses, or positions alone (GPS of
+    centimetres). Never used unless named."""
     reference_sigma: tuple[float, float] | None = None
     """Noise of the reference's poses [m, deg], as 0.002 0.1; by default its covariances, and 0.02 m and 0.57 deg without any."""
+    antenna: tuple[float, float] | None = None
+    """Where the antenna of positions alone sits in the body's frame [m]; by default where /tf_static has it, else it is estimated."""
     healthy: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
     """Log of the same robot without a fault, about two minutes of arcs and turns: causes then count from how it moved there, and not from
     the robot file."""
@@ -116,9 +119,11 @@ class Diagnose:
             return self._drive_of_log(self.source, robot)
         if self.healthy is not None:
             raise CalibrationError(f"{name} is a table: --healthy takes the log of another drive to compare a log with.")
-        if self.reference is not None or self.reference_sigma is not None or self.motion_reference != "auto":
+        given = (self.reference, self.reference_sigma, self.antenna)
+        if any(option is not None for option in given) or self.motion_reference != "auto":
             raise CalibrationError(
-                f"{name} is a table, which has the measured motion: --reference, --reference-sigma and --motion-reference are for logs."
+                f"{name} is a table, which has the measured motion: --reference, --reference-sigma, --antenna and --motion-reference are"
+                " for logs."
             )
         columns = table_columns(self.source)
         if "vision_error_m" in columns:
@@ -131,7 +136,7 @@ class Diagnose:
     def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
         log = open_wired(path, robot, self.topic.scored_against(self.reference))
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
-        return drive_of_log(log, self.motion_reference, self.reference, config, sigmas)
+        return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
 
     def _with_suited_model(self, found: DiagnosisResult, drive: Drive) -> DiagnosisResult:
         """``found`` with what the model that suits the robot would find, where a simpler one was chosen and differs from the drive."""

@@ -60,6 +60,10 @@ class Weigh:
         with console.status("reading"):
             log = open_wired(self.log, robot, self.topic.scored_against(self.reference))
             drive = drive_of_log(log, self.motion_reference, self.reference, reference_sigmas=in_radians(self.reference_sigma))
+        if not drive.has_headings:
+            raise CalibrationError(
+                f"{self.reference} has positions alone; weighing needs headings: leave --reference out, with a LiDAR or gyro."
+            )
         with console.status("weighing"):
             found, predictor = weigh(drive)
         print_weighing(console, found, self.at)

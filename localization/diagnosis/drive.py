@@ -16,8 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from localization.calibration.calibrate import MotionReferenceName, make_motion_reference
+from localization.calibration.calibrate import MotionReferenceName, estimate_antenna, make_motion_reference
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, Span, Wheels
+from localization.calibration.position_reference import PositionMotionReference
 from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.gyro import GyroRecord
@@ -103,12 +104,19 @@ class Drive:
     """Frame of the scans that were matched."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
     """Where it sits, by its transform [m]; the body's origin where a reference measured the motion."""
+    antenna: tuple[float, float] = (0.0, 0.0)
+    """Where in the body frame positions without headings were measured [m]."""
     warnings: tuple[str, ...] = ()
 
     @property
     def has_positions(self) -> bool:
         """Whether the motion reference measured positions anywhere, and not headings alone."""
         return any(bool(np.isfinite(m.cov[..., 0, 0]).any()) for m in self.maneuvers)
+
+    @property
+    def has_headings(self) -> bool:
+        """Whether the motion reference measured headings, and not positions alone."""
+        return not any(m.middle for m in self.maneuvers)
 
 
 class _Recorder:
@@ -190,8 +198,10 @@ def drive_of_log(
     reference: str | None = None,
     config: WindowConfig | None = None,
     reference_sigmas: tuple[float, float] | None = None,
+    antenna: tuple[float, float] | None = None,
 ) -> Drive:
-    """Read ``log`` once; ``reference_sigmas`` is the noise of the reference's poses [m, rad], by default what it gives itself.
+    """Read ``log`` once; ``reference_sigmas`` is the noise of the reference's poses [m, rad], by default what it gives itself, and
+    ``antenna`` as in `make_motion_reference`.
 
     Raises `CalibrationError` where it has no wheels, and for a ``motion_reference`` that it does not have.
     """
@@ -204,12 +214,18 @@ def drive_of_log(
     if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
         alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
-    inner = make_motion_reference(log, robot, motion_reference, reference, config, reference_sigmas)
+    inner = make_motion_reference(log, robot, motion_reference, reference, config, reference_sigmas, antenna)
     postures = None
     if log._arms is not None:
         postures = _Postures(log._arms)
         log._arms = postures  # type: ignore[assignment]
     drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
+    if isinstance(inner[0], PositionMotionReference) and not inner[0].is_antenna_known and drive.maneuvers:
+        (x, y), (sigma_x, sigma_y) = estimate_antenna(drive.maneuvers, robot)
+        inner = inner[0].with_guess((x, y)), inner[1]
+        note = f"the antenna was estimated at ({x:.3f} +- {sigma_x:.2g}, {y:.3f} +- {sigma_y:.2g}) m, and counts as known there."
+        drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
+        drive = dataclasses.replace(drive, warnings=(*drive.warnings, note))
     return dataclasses.replace(drive, warnings=(*drive.warnings, *log.warnings()))
 
 
@@ -244,7 +260,8 @@ def drive_of_events(
     left = _describe_windows(windows, spans, config)
     by_gyro, by_lidar = isinstance(inner, GyroMotionReference), isinstance(inner, LidarMotionReference)
     mount = mounts.get(frame, Mount()) if by_lidar else Mount()
-    has_gyro = bool(imu.stamps) and not by_gyro
+    by_positions = isinstance(inner, PositionMotionReference)
+    has_gyro = bool(imu.stamps) and not by_gyro and not by_positions  # it is compared with measured headings
     return Drive(
         name=name,
         robot=robot,
@@ -263,6 +280,7 @@ def drive_of_events(
         is_lidar_reference=by_lidar,
         lidar_frame=frame,
         lidar_at=(mount.x, mount.y),
+        antenna=inner.antenna if isinstance(inner, PositionMotionReference) else (0.0, 0.0),
         warnings=(left, *([_describe_gaps(imu.gyro)] if imu.gyro.gaps else []), *windows.warnings),
     )
 
@@ -277,7 +295,7 @@ def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -
     text = (
         f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.unmeasured} not measured."
     )
-    if length_s > 1.3 * config.window_s:
+    if length_s > 1.3 * config.window_s and not any(m.middle for m in windows.maneuvers):
         text += f" The motion reference is sparse, so that windows of {config.window_s:g} s were extended to its stamps."
     return text
 

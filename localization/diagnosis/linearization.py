@@ -260,6 +260,8 @@ def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ..
         out.add("encoder_dropout")
     if drive.is_gyro_reference:
         out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
+    if not drive.has_headings:
+        out.add("lidar_yaw")
     if drive.kind in ("rotations", "runs"):
         out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
     catalogue = {**CAUSES, "payload": payload(drive.robot.geometry.mass_kg), "track_width": track_width(drive.robot)}

@@ -141,6 +141,7 @@ class DrivePredictor:
         self._lost = find_dropouts(self.batch)
         rolls = np.abs(self.batch.wheels).max(axis=1) > REST_RATE_RAD_PER_S
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
+        self._base = quasi_static_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
         self._last = self.batch.ends[np.searchsorted(self.batch.owner, np.arange(len(first) - 1), side="right") - 1]
@@ -149,7 +150,6 @@ class DrivePredictor:
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
             self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._base = quasi_static_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
         self._kinematic_forces = self._accelerations()
         self._twists: dict[tuple[object, ...], FloatArray] = {}
 
@@ -181,7 +181,7 @@ class DrivePredictor:
         """By the gyro less its bias (and scale) against the motion reference; else by the reference's own turns, one after the other."""
         batch, drive = self.batch, self.drive
         last = np.r_[batch.owner[1:] != batch.owner[:-1], True]
-        yaw = batch.measured[last, 2]
+        yaw = batch.measured[last, 2] if drive.has_headings else self._turned()
         if drive.gyro is not None:
             turns = [drive.gyro.turn(int(a), int(b), float(t)) for (a, b), t in zip(drive.spans_ns, yaw, strict=True)]
             known = [(t.angle - y, y, t.duration) for t, y in zip(turns, yaw, strict=True) if t is not None]
@@ -196,6 +196,13 @@ class DrivePredictor:
                 turned = [y if t is None else (t.angle - bias * t.duration) / (1.0 + scale) for t, y in zip(between, yaw[:-1], strict=True)]
                 return np.array([0.0, *itertools.accumulate(turned)])
         return np.asarray(np.cumsum(yaw) - yaw)
+
+    def _turned(self) -> FloatArray:
+        """(W,) turn of each maneuver by the nominal friction model [rad]."""
+        batch = self.batch
+        total = np.r_[0.0, np.cumsum(self._base[:, 2] * batch.dt)]
+        starts = batch.first[:-1] + batch.lead
+        return np.asarray(total[starts + [int(m.ends[-1]) for m in self.drive.maneuvers]] - total[starts])
 
     def _accelerations(self) -> FloatArray:
         """(W, 2) mean specific force of the motion itself, by the wheels [m/s^2]."""
@@ -275,7 +282,8 @@ class DrivePredictor:
         reference it is the frame that this tracks."""
         (x, y), (dx, dy, yaw) = self.drive.lidar_at, hypothesis.lidar_offset
         c, s = math.cos(yaw), math.sin(yaw)
-        return dx + x - (c * x - s * y), dy + y - (s * x + c * y), yaw
+        at_x, at_y = self.drive.antenna
+        return dx + at_x + x - (c * x - s * y), dy + at_y + y - (s * x + c * y), yaw
 
     def corrected_twist(self, hypothesis: Hypothesis) -> FloatArray:
         """(N, 3) the model's twists in every interval under ``hypothesis`` [m/s, m/s, rad/s]."""

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
-from localization.diagnosis.drive import drive_of_table
+from localization.diagnosis.drive import drive_of_table, path_of
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
 from localization.diagnosis.linearization import Linearization, group_of, regression
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
 from localization.diagnosis.selection import max_statistic, p_value, price, statistics
+from motion_models import se2
+from motion_models.calibration.chords import chord_jacobians
 from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.se2 import FloatArray
 
@@ -42,12 +44,13 @@ def trend_motions(predictor: DrivePredictor) -> dict[str, FloatArray]:
     the component of the twist (last axis). On arcs a slip along x is seen in y as well, and one of the turning rate in all three."""
     batch, twist = predictor.batch, predictor.nominal_twist
     rows = []
-    for end, owner in zip(batch.ends, batch.owner, strict=True):
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
         a = batch.first[owner] + batch.lead[owner]
         t, dt = twist[a:end], batch.dt[a:end]
         turned = np.cumsum(t[:, 2] * dt) - 0.5 * t[:, 2] * dt
         heading, clock = predictor.headings[owner] + turned, predictor.drive.starts_s[owner]
-        rows.append(moved_by(t, dt, _increments(t, dt, batch.cg[a:end], heading, float(clock))))
+        increments = _increments(t, dt, batch.cg[a:end], heading, float(clock))
+        rows.append(_moved(t, dt, increments, int(batch.middle[i]) - a, predictor.drive.antenna))
     table = np.stack(rows)
     return {_TREND_NAMES[i]: table[..., i] for i in _distinct(table.reshape(-1, len(_TREND_NAMES)))}
 
@@ -88,6 +91,24 @@ def _increments(twist: FloatArray, dt: FloatArray, cg: FloatArray, heading: Floa
     )
     gains = np.diff(v, prepend=v[0]), np.diff(w, prepend=w[0])
     return np.column_stack([*(d * dt for d in density), *gains])
+
+
+def _moved(twist: FloatArray, dt: FloatArray, increments: FloatArray, middle: int, antenna: tuple[float, float]) -> FloatArray:
+    """`moved_by` of a window's last pose, or of its second chord by an ``antenna`` [m], where it has a ``middle`` position after so many
+    intervals."""
+    if middle <= 0:
+        return moved_by(twist, dt, increments)
+    at = np.array([*antenna, 0.0])
+    poses = path_of(twist * dt[:, None])[[middle - 1, len(dt) - 1]]
+    tracked = se2.compose(se2.compose(se2.inverse(at), poses), at)[:, :2]
+    by_middle, by_end = chord_jacobians(tracked[:1], tracked[1:])
+    lever = np.array([[1.0, 0.0, -at[1]], [0.0, 1.0, at[0]]])  # motion of the antenna by one of the body, in its frame
+    moved = np.zeros((3, 3, increments.shape[1]))
+    for n, pose, by in ((middle, poses[0], by_middle[0]), (len(dt), poses[1], by_end[0])):
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        turn = np.array([[c, -s], [s, c]])
+        moved += np.einsum("ij,jkm->ikm", by @ turn @ lever, moved_by(twist[:n], dt[:n], increments[:n]))
+    return moved
 
 
 def moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:

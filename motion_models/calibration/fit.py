@@ -44,7 +44,7 @@ class Fit:
     params: FloatArray
     """(k,) all of the model's parameters, fitted or not."""
     reference_params: FloatArray
-    """(5,) as `REFERENCE_PARAM_NAMES`."""
+    """(5,) as `REFERENCE_PARAM_NAMES`; of an antenna its place in the body frame, `FitConfig.reference_at` included."""
     cov: FloatArray
     """(c, c) of the free parameters. With more than ten groups beyond c, the sandwich over groups (CR1), which holds for residuals that
     are correlated within a group and for a wrong noise model; with fewer, the inverse information times the weighted mean square."""
@@ -199,6 +199,8 @@ class FitConfig:
     """How far free parameters may be from where they start, as one sigma; those not named may be anywhere."""
     sizes: Mapping[str, float] = field(default_factory=dict)
     """What counts as large for a parameter, and so as not revealed when its sigma is larger; else its nominal value, or 0.1 (SI)."""
+    reference_at: tuple[float, float] = (0.0, 0.0)
+    """Where in the body frame the motion reference measures positions without headings [m]; offsets that are fitted count from there."""
     strict: bool = True
     """Refuse to return numbers that the drive does not reveal."""
 
@@ -228,7 +230,7 @@ class Problem:
         self.combine = np.eye(len(names), len(names) + len(tied))
         for i, (master, factor) in enumerate(config.ties.values()):
             self.combine[names.index(master), len(names) + i] = factor
-        self.everything = np.concatenate([start, np.zeros(len(REFERENCE_PARAM_NAMES))])
+        self.everything = np.concatenate([start, [0.0, 0.0, *config.reference_at, 0.0]])
         self.start = self.everything[self.columns]
         nominal = dict(zip(model.param_names, np.abs(model.nominal), strict=True))
         self.sizes = np.array([config.sizes.get(name) or nominal.get(name) or _SMALL for name in names])

@@ -80,6 +80,10 @@ class Maneuver:
     start_s: float = 0.0
     """When it starts, after the drive's first wheel message [s]; for terms of a model that change with time."""
 
+    middle: int = 0
+    """Of a maneuver whose positions alone were measured, intervals driven until the one between start and end: the one pose measured is
+    that of the second chord relative to the first (`motion_models.calibration.chords`). 0 for measured poses."""
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -99,6 +103,8 @@ class Batch:
     """(M,) index after the last interval before each measured pose."""
     owner: IntArray
     """(M,) maneuver of each measured pose."""
+    middle: IntArray
+    """(M,) index after the last interval before the middle position, of chords; 0 for poses."""
     measured: FloatArray
     """(M, 3)"""
     cov: FloatArray
@@ -119,7 +125,7 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
         _check(m, i)
     lengths = np.array([len(m.dt) for m in maneuvers])
     first = np.concatenate([[0], np.cumsum(lengths)])
-    lead = np.array([m.lead for m in maneuvers])
+    lead, middles = (np.array([getattr(m, name) for m in maneuvers]) for name in ("lead", "middle"))
     counts = [len(m.ends) for m in maneuvers]
     owner = np.repeat(np.arange(len(maneuvers)), counts)
     names = {m.group: i for i, m in reversed(list(enumerate(maneuvers)))}
@@ -133,6 +139,7 @@ def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:
         lead=lead,
         ends=np.concatenate([m.ends for m in maneuvers]) + (first[:-1] + lead)[owner],
         owner=owner,
+        middle=np.where(middles > 0, middles + first[:-1] + lead, 0)[owner],
         measured=np.concatenate([m.measured for m in maneuvers]),
         cov=np.concatenate([np.broadcast_to(m.cov, (n, 3, 3)) for m, n in zip(maneuvers, counts, strict=True)]),
         group=np.array([index[m.group] for m in maneuvers])[owner],
@@ -182,6 +189,8 @@ def _check(m: Maneuver, index: int) -> None:
         raise CalibrationError(
             f"{_called(m, index)}: 'ends' must increase from at least 1 to at most the {n - m.lead} intervals after the start."
         )
+    if m.middle and not (poses == 1 and 0 < m.middle < ends[0]):
+        raise CalibrationError(f"{_called(m, index)}: 'middle' must lie between the start and the end of its only pose.")
 
 
 def table_columns(path: str | Path) -> tuple[str, ...]:
@@ -244,7 +253,12 @@ def _direction_error(maneuver: Maneuver, wheel_radius_m: float) -> float:
 
 
 def windows_text(maneuvers: Sequence[Maneuver]) -> str:
-    """``maneuvers`` as such a table; what is read back is the same, but for lead-in intervals, which a table does not have."""
+    """``maneuvers`` as such a table; what is read back is the same, but for lead-in intervals, which a table does not have.
+
+    Raises `CalibrationError` for maneuvers of positions alone, which a table cannot hold.
+    """
+    if any(m.middle for m in maneuvers):
+        raise CalibrationError("a table of windows has poses, and here positions alone were measured. Leave --windows out.")
     measured = any(np.isfinite(m.cov[..., 0, 0]).any() for m in maneuvers)
     pose = POSE if measured else ("yaw_rad",)
     sigmas = tuple(SIGMA) if measured else ("sigma_yaw_rad",)

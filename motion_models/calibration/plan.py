@@ -20,12 +20,16 @@ CLOCK_SIGMA_S = 0.1
 """How far the wheels' stamps may be off, as the prior of `CLOCK`."""
 _CG_MOVES_M = 0.01
 
-CLOCK_TEXT = "s: how late the wheels' stamps are against what measured the motion"
+_TEXTS_OF_REFERENCE = {
+    CLOCK: "s: how late the wheels' stamps are against what measured the motion",
+    "lidar_offset_x": "m: what the motion reference tracks, ahead of where it is taken to sit",
+    "lidar_offset_y": "m: the same to the left",
+}
 
 
 def text_of(model: MotionModel, name: str) -> str:
-    """Unit and meaning of the parameter ``name`` of ``model``, or of the clock; empty for others."""
-    return CLOCK_TEXT if name == CLOCK else next((p.text for p in model.params if p.name == name), "")
+    """Unit and meaning of the parameter ``name`` of ``model``, or of the motion reference; empty for others."""
+    return _TEXTS_OF_REFERENCE.get(name) or next((p.text for p in model.params if p.name == name), "")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 
 from motion_models import se2
 from motion_models.base import Twist
+from motion_models.calibration.chords import chord_jacobians, chord_poses
 from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.compiled import kernel
 from motion_models.extended_model import Series, in_series
@@ -89,6 +90,7 @@ def predict(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Predict every measured pose: poses (M, 3), their derivatives (M, 3, c) and covariances (M, 3, 3).
 
+    Of maneuvers with a `Maneuver.middle` it is the second chord relative to the first.
     ``reference_params`` (5,) as in `REFERENCE_PARAM_NAMES`; ``columns`` (c,) are the derivatives, indices into the model's k
     parameters followed by the reference's five. Derivatives and covariances are right perturbations; ``noise`` is the wheels' slip.
     """
@@ -110,13 +112,47 @@ def predict(
         elif column < k + 2:
             by[:, :, c] = np.einsum("nij,nj->ni", twist.d_wheels, by_offset if column == k else by_lag)
 
-    poses, cov = np.zeros((len(batch.ends), 3)), np.zeros((len(batch.ends), 3, 3))
-    d = np.zeros((len(batch.ends), 3, len(columns)))
-    spans = Spans(batch.first[:-1] + batch.lead, batch.ends, batch.owner)
+    chords = np.flatnonzero(batch.middle)
+    order = np.argsort(np.r_[batch.ends, batch.middle[chords]], kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    owner = np.r_[batch.owner, batch.owner[chords]][order]
+    ends = np.r_[batch.ends, batch.middle[chords]][order]
+    poses, cov = np.zeros((len(ends), 3)), np.zeros((len(ends), 3, 3))
+    d = np.zeros((len(ends), 3, len(columns)))
+    spans = Spans(batch.first[:-1] + batch.lead, ends, owner)
     _integrate_all(batch.dt, twist.value, by, noise_vector(noise), spans, Motions(poses, cov, d))
     if np.any(reference_params[2:] != 0.0) or bool(np.any(columns >= k + 2)):
         poses, d = _track(poses, d, reference_params[2:], columns - (k + 2))
-    return poses, d, cov
+    end, middle = place[: len(batch.ends)], place[len(batch.ends) :]
+    found = poses[end], d[end], cov[end]
+    if len(chords):
+        A = se2.adjoint(se2.inverse(reference_params[2:]))  # slip of the body, seen at the tracked point
+        of_chords = _chords(Motions(poses, A @ cov @ A.T, d), middle, end[chords])
+        for whole, part in zip(found, of_chords, strict=True):
+            whole[chords] = part
+    return found
+
+
+def _chords(motions: Motions, middle: IntArray, end: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Second chords relative to the first: poses (C, 3), derivatives (C, 3, c) and covariances (C, 3, 3), of the ``motions`` from the start
+    to the positions ``middle`` and ``end`` (C,)."""
+    poses, P = motions.poses, motions.covs
+    by_middle, by_end = chord_jacobians(poses[middle, :2], poses[end, :2])
+    by_middle, by_end = by_middle @ _turn(poses[middle, 2]), by_end @ _turn(poses[end, 2])
+    d = by_middle @ motions.derivatives[middle, :2] + by_end @ motions.derivatives[end, :2]
+    # the end's perturbation is the middle's, moved there, and that of the way between: Cov(middle, end) = P_middle A^T
+    A = se2.adjoint(se2.inverse(se2.between(poses[middle], poses[end])))
+    cross = (P[middle] @ np.swapaxes(A, 1, 2))[:, :2, :2]
+    mixed = by_middle @ cross @ np.swapaxes(by_end, 1, 2)
+    own = [g @ P[i][:, :2, :2] @ np.swapaxes(g, 1, 2) for g, i in ((by_middle, middle), (by_end, end))]
+    return chord_poses(poses[middle, :2], poses[end, :2]), d, own[0] + own[1] + mixed + np.swapaxes(mixed, 1, 2)
+
+
+def _turn(yaws: FloatArray) -> FloatArray:
+    """(C, 2, 2) rotations by ``yaws`` (C,)."""
+    c, s = np.cos(yaws), np.sin(yaws)
+    return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
 def series_of(batch: Batch) -> Series:

@@ -421,7 +421,7 @@ def test_calibrate_without_a_motion_reference_is_refused(tmp_path: Path, capsys:
     scans = [("/scan", bags.laser_scan(START + i * S), START + i * S) for i in range(3)]
     assert "has no wheels" in refused(capsys, bags.write_mcap(tmp_path / "scans.mcap", scans), "--robot", "vaultbot")
     assert "has no LiDAR" in refused(capsys, HUSKY, "--witness", "lidar")
-    assert "positions only" in refused(capsys, HUSKY, "--reference", "/fix")
+    assert "too coarse: they err by 0.8 m" in refused(capsys, HUSKY, "--reference", "/fix")
     assert "no topic '/mocap'" in refused(capsys, HUSKY, "--reference", "/mocap")
     assert "has no reference topic /ground_truth/odom" in refused(capsys, bag, "--robot", "vaultbot", "--witness", "reference")
 
