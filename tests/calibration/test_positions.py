@@ -27,7 +27,8 @@ from motion_models.calibration.prediction import predict
 from motion_models.errors import CalibrationError
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
-from motion_models.robot import WheelNoise, load_robot
+from motion_models.robot import WheelNoise
+from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.wiring import CASES, ROBOT_TOML
 
