@@ -8,9 +8,9 @@ import math
 import pytest
 
 from localization.calibration.windows import WindowConfig
+from localization.core.motion import FilterConfig
 from localization.diagnosis.diagnose import DiagnosisConfig
 from localization.errors import SettingError
-from localization.estimators.filter import FilterConfig
 from localization.evaluation.metrics import EvaluateConfig
 from localization.lidar import LidarConfig
 from localization.pipeline import ReplayConfig

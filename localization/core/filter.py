@@ -72,6 +72,10 @@ class Innovation:
         """Normalised innovation squared, residual^T S^-1 residual: chi-square with m degrees of freedom."""
         return float(self.residual @ np.linalg.solve(self.S, self.residual))
 
+    def component(self, i: int) -> tuple[float, float]:
+        """Component ``i`` of the residual and its variance."""
+        return float(self.residual[i]), float(self.S[i, i])
+
 
 def propagate(state: State, transition: Transition) -> State:
     """The state after ``transition``: P' = F P F^T + Q. Raises `EstimatorError` for numbers that would spoil the state for good."""

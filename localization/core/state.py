@@ -101,6 +101,11 @@ class Layout:
         ends = np.cumsum([group.dim for group in self.groups.values()]).tolist()
         return {name: slice(end - group.dim, end) for (name, group), end in zip(self.groups.items(), ends, strict=True)}
 
+    @property
+    def dim(self) -> int:
+        """Rows in all."""
+        return sum(group.dim for group in self.groups.values())
+
     def indices(self, names: Sequence[str]) -> IntArray:
         """(k,) rows of the variables ``names``, one after another."""
         return np.concatenate([np.arange(self.rows[name].start, self.rows[name].stop) for name in names])
@@ -122,6 +127,15 @@ class State:
         """Mean of the variable ``name``."""
         return self.means[name]
 
+    def number(self, name: str) -> float:
+        """Mean of a variable of one dimension."""
+        return float(self.means[name][0])
+
+    def variance(self, name: str) -> float:
+        """Variance of a variable of one dimension."""
+        row = self.layout.rows[name].start
+        return float(self.P[row, row])
+
     def cov(self, *names: str) -> FloatArray:
         """Joint covariance (k, k) of the errors of the variables ``names``."""
         if len(names) == 1:
@@ -135,8 +149,7 @@ class State:
 
     def difference_cov(self, one: str, other: str) -> FloatArray:
         """Covariance (k, k) of e_one - e_other, for errors in one tangent space."""
-        cross = self.cross_cov(one, other)
-        return clip_eigenvalues(self.cov(one) + self.cov(other) - cross - cross.T)
+        return clip_eigenvalues(self.cov(one) + self.cov(other) - self.cross_cov(one, other) - self.cross_cov(other, one))
 
     def between(self, start: str, end: str) -> tuple[FloatArray, FloatArray]:
         """``start``^-1 ``end`` of two variables of one group, and the covariance (k, k) of its right perturbation, to first order."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from localization.core.motion import FilterConfig
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator, LearnedParameter, Residuals
 from localization.estimators.baselines import DeadReckoning, LidarOdometry
-from localization.estimators.filter import FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap

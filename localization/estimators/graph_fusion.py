@@ -16,7 +16,6 @@ from scipy.linalg import block_diag
 
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate
-from localization.estimators.filter import KEY, PARAMS, RADIUS, START
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.events import PositionSample, Step
@@ -94,14 +93,13 @@ class GraphFusion(FilteredOdometry):
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""
         self.run_deferred()
-        ekf = self.odometry.filter
-        estimate = self.odometry.step(step)
+        estimate, wheels = self.odometry.step(step), self.odometry.wheels
         self._is_matched, self._end_ns = estimate.nis is not None, step.end_ns
-        self._wheels.add(self.odometry.wheel_motion, self._corrections, self.odometry.is_turning, self.odometry.used_corrections)
+        self._wheels.add(wheels.motion, self._corrections, wheels.is_turning, wheels.corrections)
         self._moving_s += 0.0 if step.is_standing else step.duration
         delta, cov = self._moved = self._motion_since_keyframe()
         if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
-            self._steps.extend(ekf.pose)
+            self._steps.extend(estimate.pose)
             self._covs_since.extend(cov.ravel())
             self._stamps_ns.append(step.end_ns)
         moved = max(math.hypot(delta[0], delta[1]) / self._config.keyframe_distance_m, abs(delta[2]) / self._config.keyframe_angle_rad)
@@ -109,7 +107,7 @@ class GraphFusion(FilteredOdometry):
         self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan) or self._is_found_again()
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
-        pose = se2.compose(self._map_T_odom, ekf.pose)
+        pose = se2.compose(self._map_T_odom, estimate.pose)
         odometry = estimate.pose, estimate.covariance
         return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + cov, odometry=odometry, map_T_odom=self._map_T_odom)
 
@@ -126,53 +124,55 @@ class GraphFusion(FilteredOdometry):
 
     def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the last keyframe, and its covariance (3, 3): by the sum of the steps, where that had no matched scan."""
-        ekf = self.odometry.filter
+        state = self.odometry.state
         if self._key >= self.graph.count - 1:
-            return ekf.motion_since(KEY)
-        step, step_cov = ekf.motion_since(START)
+            return state.between("key", "pose")
+        step, step_cov = state.between("start", "pose")
         A = se2.adjoint(se2.inverse(step))
-        return se2.between(self._loops.keyframes[-1].odometry, ekf.pose), A @ self._moved[1] @ A.T + step_cov
+        return se2.between(self._loops.keyframes[-1].odometry, state["pose"]), A @ self._moved[1] @ A.T + step_cov
 
     def _is_found_again(self) -> bool:
         """Whether a scan has shown where the robot is on the map from before its LiDAR was lost."""
-        P = self.odometry.filter.P
-        return self._is_matched and float(P[0, 0] + P[1, 1]) < _FOUND_SHARE * self._lost_variance
+        return self._is_matched and self._position_variance() < _FOUND_SHARE * self._lost_variance
+
+    def _position_variance(self) -> float:
+        return float(np.trace(self.odometry.state.cov("pose")[:2, :2]))
 
     def _add_keyframe(self) -> None:
-        ekf, k = self.odometry.filter, self.graph.count
-        update = GraphUpdate(ekf.pose)
+        odometry, pose, k = self.odometry, self.odometry.state["pose"], self.graph.count
+        update = GraphUpdate(pose)
         if k:
-            wheels = self._wheels.with_corrections(ekf.corrections)
+            wheels = self._wheels.with_corrections(odometry.state["corrections"])
             between = self._between(k, wheels)
             update = GraphUpdate(se2.compose(self.graph.pose(between.a), between.delta), wheels, self._epoch_cov(), (between,))
         self.graph.apply(update)
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
-        self._lost_variance = float(ekf.P[0, 0] + ekf.P[1, 1])
+        self._lost_variance = self._position_variance()
         if self._is_matched or self.lost is None or not k:
-            ekf.start_key()
+            odometry.start_key()
             self._key, self._lost_variance = k, 0.0
         self._moved = np.zeros(3), np.zeros((3, 3))
         self._wheels = MotionPreintegration(len(self._corrections.names))
-        self._close_loop(Keyframe(ekf.pose, self.odometry.scan_points, self._end_ns, self.odometry.lidar_position))
+        self._close_loop(Keyframe(pose, odometry.scan_points, self._end_ns, odometry.lidar_position))
         self._align_positions()
         if len(self._corrections.names) and k:
             mean, cov = self.graph.corrections()
-            ekf.set_corrections(mean[:-1], cov[:-1, :-1])
-        self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(ekf.pose))
+            odometry.set_corrections(mean[:-1], cov[:-1, :-1])
+        self._map_T_odom = se2.compose(self.graph.pose(k), se2.inverse(pose))
         self._key_cov = self.graph.marginal(k)
 
     def _between(self, k: int, wheels: PreintegratedMotion) -> BetweenMeasurement:
         """Motion by gyro and scans to the next keyframe ``k``, from the one before; from the last with a matched scan, if a scan has shown
         where the robot is after keyframes without: their poses are uncertain, and what it shows is not about them."""
-        ekf = self.odometry.filter
+        state = self.odometry.state
         if self._is_found_again():
-            delta, cov = ekf.motion_since(KEY)
+            delta, cov = state.between("key", "pose")
             return BetweenMeasurement(self._key, k, delta, np.asarray(np.linalg.inv(cov)))
         delta, cov = self._moved
-        D, states = wheels.by_corrections, np.r_[PARAMS : len(ekf.P), RADIUS]
-        by_wheels = wheels.delta * [1.0 + ekf.radius_scale, 1.0 + ekf.radius_scale, 1.0]
-        wheel_cov = wheels.cov + D @ ekf.P[np.ix_(states, states)] @ D.T
+        D, radius = wheels.by_corrections, 1.0 + state.number("radius")
+        by_wheels = wheels.delta * [radius, radius, 1.0]
+        wheel_cov = wheels.cov + D @ state.cov("corrections", "radius") @ D.T
         if self._is_matched and cov[0, 0] > _OPEN_SHARE * wheel_cov[0, 0]:  # the way is the wheels' alone: it does not show their radius
             return BetweenMeasurement(k - 1, k, delta, block_diag(_NO_INFORMATION, np.linalg.inv(cov[1:, 1:])))
         return BetweenMeasurement(k - 1, k, *subtract_information(delta, cov, by_wheels, wheel_cov))
@@ -196,7 +196,7 @@ class GraphFusion(FilteredOdometry):
 
     def _place_positions(self, step: Step) -> None:
         """Positions up to the end of ``step`` are taken from the newest keyframe."""
-        ekf = self.odometry.filter
+        state = self.odometry.state
         while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
             sample = self._waiting.pop(0)
             if not self.graph.count:
@@ -205,7 +205,7 @@ class GraphFusion(FilteredOdometry):
                 self._n_late += 1
                 continue
             part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
-            pose = se2.interpolate(ekf.start, ekf.pose, np.array(part))
+            pose = se2.interpolate(state["start"], state["pose"], np.array(part))
             offset = se2.between(self._loops.keyframes[-1].odometry, pose)
             moved_cov = 0.5 * np.trace(self._moved[1][:2, :2]) * np.eye(2)  # any heading: that of the map may not be known
             self._positions.append((self.graph.count - 1, offset, sample.position, sample.covariance + moved_cov))

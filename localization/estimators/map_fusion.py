@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from localization.estimators.base import Estimate, Estimator
-from localization.estimators.filter import KEY, START
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.events import Step
 from localization.maps.grid import Grid
@@ -52,7 +51,6 @@ class MapFusion(FilteredOdometry):
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""
         self.run_deferred()
-        ekf = self.odometry.filter
         estimate = self.odometry.step(step)
         self._count(step.duration)
         self._waiting_s += step.duration
@@ -61,7 +59,7 @@ class MapFusion(FilteredOdometry):
         is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
         self._is_keyframe_due = (is_far or not self._has_key) and len(self.odometry.scan_points) > 0
         A = se2.adjoint(se2.inverse(delta))
-        pose, covariance = se2.compose(self._map_T_odom, ekf.pose), A @ self._key_cov @ A.T + cov
+        pose, covariance = se2.compose(self._map_T_odom, estimate.pose), A @ self._key_cov @ A.T + cov
         return replace(
             estimate, pose=pose, covariance=covariance, odometry=(estimate.pose, estimate.covariance), map_T_odom=self._map_T_odom
         )
@@ -74,17 +72,17 @@ class MapFusion(FilteredOdometry):
             self._take_pose()
         if self._is_keyframe_due:
             self._is_keyframe_due, self._has_key = False, True
-            ekf, was_localized = self.odometry.filter, self.localizer.state == "localized"
-            self.localizer.add(ekf.pose, self.odometry.scan_points, *self._motion_since_keyframe())
-            ekf.start_key()
+            was_localized = self.localizer.state == "localized"
+            self.localizer.add(self.odometry.state["pose"], self.odometry.scan_points, *self._motion_since_keyframe())
+            self.odometry.start_key()
             self._summed_cov = np.zeros((3, 3))
             self._n_losses += was_localized and self.localizer.state == "lost"
             self._take_pose()
 
     def _add_step(self) -> None:
         """Sum the covariance of the motion, step by step: the filter's, or that of the wheels where that is smaller."""
-        step, cov = self.odometry.filter.motion_since(START)
-        by_wheels = self.odometry.wheel_motion.cov
+        step, cov = self.odometry.state.between("start", "pose")
+        by_wheels = self.odometry.wheels.motion.cov
         cov = by_wheels if np.trace(by_wheels) < np.trace(cov) else cov
         A = se2.adjoint(se2.inverse(step))
         self._summed_cov = A @ self._summed_cov @ A.T + cov
@@ -92,19 +90,18 @@ class MapFusion(FilteredOdometry):
     def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the last keyframe and its covariance (3, 3): by the sum of the steps where that is smaller: after the
         filter has lost its place, its clones are as uncertain as the place."""
-        delta, cov = self.odometry.filter.motion_since(KEY)
+        delta, cov = self.odometry.state.between("key", "pose")
         return delta, cov if np.trace(cov) <= np.trace(self._summed_cov) else self._summed_cov
 
     def set_pose(self, pose: Pose2, cov: Cov3) -> None:
         """Search near the present ``pose`` (3,) in the map, with covariance ``cov`` (3, 3), as a person gives it. Odometry goes on."""
-        ekf = self.odometry.filter
-        delta = se2.between(ekf.key, ekf.pose)
+        delta, _ = self.odometry.state.between("key", "pose")
         self.localizer.set_pose(se2.compose(pose, se2.inverse(delta)), cov)
         self._take_pose()
 
     def _take_pose(self) -> None:
         """The map's frame is where the localizer has the last keyframe."""
-        self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(self.odometry.filter.key))
+        self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(self.odometry.state["key"]))
         self._key_cov = self.localizer.covariance
 
     def _count(self, duration_s: float) -> None:

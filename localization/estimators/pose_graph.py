@@ -17,8 +17,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from localization.core.measurements.position import predict_position
+from localization.core.measurements.relative_pose import motion_residual
 from localization.errors import EstimatorError
-from localization.estimators.measurement_models import motion_residual, transform_point
 from motion_models import se2
 from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import Cov3, FloatArray, Pose2
@@ -243,14 +244,10 @@ def position_factor(position: PositionMeasurement) -> gtsam.CustomFactor:
 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
         enu_T_map, map_T_key, lever = _array(values.atPose2(_ALIGNMENT)), _array(values.atPose2(key)), np.asarray(values.atPoint2(_LEVER))
-        in_key, _, by_lever = transform_point(position.offset, lever)
-        in_map, by_key, in_map_by_point = transform_point(map_T_key, in_key)
-        in_enu, by_alignment, in_enu_by_point = transform_point(enu_T_map, in_map)
+        predicted, *jacobians = predict_position(enu_T_map, map_T_key, position.offset, lever)
         if H is not None:
-            H[0] = np.asfortranarray(by_alignment)
-            H[1] = np.asfortranarray(in_enu_by_point @ by_key)
-            H[2] = np.asfortranarray(in_enu_by_point @ in_map_by_point @ by_lever)
-        return np.asarray(in_enu - position.position)
+            H[0], H[1], H[2] = map(np.asfortranarray, jacobians)
+        return np.asarray(predicted - position.position)
 
     return _robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from localization.cli import main
+from localization.core.motion import FilterConfig
 from localization.errors import OutputError, SettingError
-from localization.estimators.filter import FilterConfig
 from localization.estimators.graph_fusion import GraphConfig
 from localization.output import check_outputs, whole_file, write_text_file
 from localization.trajectory import Trajectory, write_tum

@@ -285,7 +285,7 @@ def drive(group, rng, steps=9):
 @pytest.mark.parametrize("group", [SE2, SE3], ids=IDS[:2])
 def test_filter_is_consistent_over_many_drives(group):
     """Mean NEES of pose and bias, within the 99 % band of as many independent drives."""
-    runs, n = 100, group.dim + 1
+    runs, n = 60, group.dim + 1
     found = [drive(group, np.random.default_rng(seed)) for seed in range(runs)]
     low, high = chi2.ppf([0.005, 0.995], runs * n) / runs
     assert low < np.mean(found) < high

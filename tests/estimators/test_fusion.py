@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from localization.core.policies.slip import SlipChanges
 from localization.errors import EstimatorError
 from localization.estimators import EstimatorConfig
 from localization.estimators.base import Estimate
-from localization.estimators.fusion import _SlipChanges
 from localization.evaluation.consistency import nees
 from localization.events import Event, ImuSample, Scan, Step, WheelSample
 from localization.lidar import LidarConfig
@@ -465,7 +465,7 @@ def test_ekf_with_dying_lidar_is_lost_until_the_end(driven: rooms.Drive) -> None
 
 def slip_rate(slips: FloatArray, scan_sigma: float = 1e-9, seed: int = 0, sweep_s: float = 0.0) -> FloatArray:
     """(3,) after steps of 0.1 s whose motion is off by ``slips`` (n, 3), measured by scans with noise ``scan_sigma`` [m, m, rad]."""
-    rng, changes = np.random.default_rng(seed), _SlipChanges()
+    rng, changes = np.random.default_rng(seed), SlipChanges()
     motion = Motion(np.array([0.05, 0.0, 0.0]), np.diag(_STEP_SIGMA**2), np.zeros((3, 0)))
     step = Step(0, S // 10, motion, np.zeros(3), np.zeros(3), False, True)
     measured = slips + np.diff(rng.normal(0.0, scan_sigma, (len(slips) + 1, 3)), axis=0)

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from localization.core.motion import FilterConfig
 from localization.errors import EstimatorError
 from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate, EstimatorConfig
-from localization.estimators.filter import FilterConfig
 from localization.estimators.graph_fusion import subtract_information
 from localization.estimators.pose_graph import PoseGraph
 from localization.evaluation.consistency import nees

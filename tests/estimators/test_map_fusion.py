@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from localization.estimators import MapFusion, PriorMap
-from localization.estimators.filter import KEY
 from localization.logs import open_log
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial, replay
@@ -87,7 +86,7 @@ def test_map_fusion_pose_given_between_keyframes_is_of_that_moment():
     assert isinstance(pipeline.estimator, MapFusion)
     pose = np.array([1.0, 2.0, 0.5])
     pipeline.estimator.set_pose(pose, 0.01 * np.eye(3))
-    delta, _ = pipeline.estimator.odometry.filter.motion_since(KEY)
+    delta, _ = pipeline.estimator.odometry.state.between("key", "pose")
     assert np.abs(delta).max() > 0.01
     estimates = [estimate for event in drive()[1000:1100] for estimate in pipeline.process(event)]
     assert estimates[0].pose == pytest.approx(pose, abs=0.1)

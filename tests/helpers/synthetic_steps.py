@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from localization.core.motion import FilterConfig
 from localization.estimators.base import Estimator
-from localization.estimators.filter import BIAS, POSE, FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.events import Scan, Step, Turn
 from localization.lidar import LostScans, ScanMatch
@@ -219,9 +219,8 @@ def run(estimator, sensor, seed=0, steps=60, **world):
 
 def slow_states(estimator: EkfFusion) -> tuple[np.ndarray, np.ndarray]:
     """Means (m,) of gyro bias and scale, clock offset, radius, corrections, and the joint covariance (3 + m, 3 + m) of pose and these."""
-    ekf = estimator.filter
-    index = np.r_[POSE, BIAS : len(ekf.P)]
-    return np.concatenate([[ekf.bias, ekf.scale, ekf.clock_offset, ekf.radius_scale], ekf.corrections]), ekf.P[np.ix_(index, index)]
+    names = "gyro_bias", "gyro_scale", "clock", "radius", "corrections"
+    return np.concatenate([estimator.state[name] for name in names]), estimator.state.cov("pose", *names)
 
 
 def squared_errors(seed, steps, noise, model="skid_steer", form="constant"):

@@ -27,13 +27,18 @@ from unittest import mock
 import numba
 import numpy as np
 
-from localization.estimators import filter as filter_module
+from localization.core.filter import Measurement, Transition, set_marginal
+from localization.core.measurements.scan import key_scan_transition, measure_scan
+from localization.core.policies import wheel_noise
+from localization.core.policies.excitation import Excitation
+from localization.core.policies.slip import SlipChanges
+from localization.core.state import State
 from localization.estimators import fusion, graph_fusion, pose_graph
-from localization.estimators.filter import MAP, Filter
 from localization.estimators.fusion import EkfFusion
 from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
+from localization.events import Step
 from localization.lidar import scan_matcher
 from localization.lidar.loop_detection import LoopDetector
 from localization.lidar.scan_matcher import ScanMatcher
@@ -78,16 +83,17 @@ def _wrap(owner: Any, name: str, change: Callable[..., Any]) -> Patch:
     return lambda: mock.patch.object(owner, name, lambda *a, **k: change(original, *a, **k))
 
 
-def _independent(original: Callable[..., None], ekf: Filter, *rest: Any) -> None:
+def _independent(original: Callable[..., Any], self: EkfFusion, state: State, step: Step) -> Any:
     """The submap's error is drawn anew for each scan."""
-    own = ekf.P[MAP, MAP].copy()
-    ekf.P[MAP, :] = ekf.P[:, MAP] = 0.0
-    ekf.P[MAP, MAP] = own
-    original(ekf, *rest)
+    return original(self, set_marginal(state, "map", state["map"], state.cov("map")), step)
 
 
-def _without_new(original: Callable[..., None], ekf: Filter, error: scan_matcher.KeyScanError) -> None:
-    original(ekf, replace(error, new_cov=np.zeros((3, 3))))
+def _without_new(state: State, error: scan_matcher.KeyScanError) -> Transition:
+    return key_scan_transition(state, replace(error, new_cov=np.zeros((3, 3))))
+
+
+def _of_least_variance(*arguments: Any) -> Measurement:
+    return replace(measure_scan(*arguments), relative=None)
 
 
 @numba.njit(cache=True)
@@ -134,7 +140,7 @@ PATCHES: Mapping[str, Patch] = {
     "old key scans that fit": _wrap(
         ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
     ),
-    "slip that changes within a sweep": _attribute(fusion._SlipChanges, "rate", lambda *a: np.zeros((3, 3))),
+    "slip that changes within a sweep": _attribute(SlipChanges, "rate", lambda *a: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
     "slip in the deskewing twist": _wrap(
         ScanMatchingSensor,
@@ -156,12 +162,12 @@ PATCHES: Mapping[str, Patch] = {
     "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
     "size of the residuals": lambda: _together(*_ASSUMED_NOISE),
     "correlation of neighbouring residuals": _attribute(ScanMatcher, "_block_variance", property(lambda self: self._residual_variance)),
-    "submap's error": _attribute(Filter, "insert_key_scan", lambda self, error: None),
-    "submap's error as consider state (independent noise, instead)": _wrap(Filter, "predict", _independent),
-    "pose kept on the submap": _wrap(Filter, "_update", lambda original, self, *measurement, **_: original(self, *measurement)),
-    "new surfaces' error of key scans": _wrap(Filter, "insert_key_scan", _without_new),
-    "scale of the wheel noise": _attribute(filter_module, "_MAX_NOISE_SCALE", 1.0),
-    "excitation gate of corrections": _attribute(EkfFusion, "_is_turning", lambda self, motion: True),
+    "submap's error": _attribute(fusion, "key_scan_transition", lambda state, error: Transition()),
+    "submap's error as consider state (independent noise, instead)": _wrap(EkfFusion, "_update_scan", _independent),
+    "pose kept on the submap": _attribute(fusion, "measure_scan", _of_least_variance),
+    "new surfaces' error of key scans": _attribute(fusion, "key_scan_transition", _without_new),
+    "scale of the wheel noise": _attribute(wheel_noise, "_MAX_NOISE_SCALE", 1.0),
+    "excitation gate of corrections": _attribute(Excitation, "start_step", lambda self, motion: None),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
@@ -171,7 +177,7 @@ GRAPH_PATCHES: Mapping[str, Patch] = {
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
     "ways that the scene leaves open as the wheels' alone": _attribute(graph_fusion, "_OPEN_SHARE", math.inf),
-    "corrections of the graph in the filter": _attribute(Filter, "set_corrections", lambda self, mean, cov: None),
+    "corrections of the graph in the filter": _attribute(EkfFusion, "set_corrections", lambda self, mean, cov: None),
     "random walk of the corrections": _attribute(graph_fusion, "_CORRECTION_EPOCH_S", math.inf),
 }
 SETTINGS: Mapping[str, Mapping[str, Any]] = {

@@ -27,8 +27,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.core.motion import FilterConfig
 from localization.estimators import ESTIMATORS, ESTIMATORS_WITH_CORRECTIONS, EstimatorConfig
-from localization.estimators.filter import FilterConfig
 from localization.evaluation.consistency import nees
 from localization.evaluation.metrics import align, relation_errors
 from localization.evaluation.reference_files import read_reference_file

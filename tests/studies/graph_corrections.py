@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.estimators.filter import FilterConfig
+from localization.core.motion import FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.evaluation.metrics import evaluate

@@ -10,11 +10,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from localization.estimators.measurement_models import motion_residual, predict_turn, submap_residual, transform_point
+from localization.core.measurements.position import transform_point
+from localization.core.measurements.relative_pose import motion_residual
+from localization.core.measurements.scan import measure_scan
+from localization.core.measurements.turn import measure_turn
+from localization.core.state import SE2, Layout, State, Vector
 from localization.events import Turn
 from motion_models import se2
 
 POSES = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)
+
+
+def predict_turn(start, pose, turn, bias, scale):
+    """What the gyro measures [rad], and its derivatives by pose (3,), start (3,), bias and scale."""
+    groups = {"pose": SE2, "start": SE2, "gyro_bias": Vector(1), "gyro_scale": Vector(1)}
+    means = dict(zip(groups, (pose, start, np.array([bias]), np.array([scale])), strict=True))
+    found = measure_turn(State(Layout(groups), means, np.eye(8)), turn)
+    by = found.jacobians
+    return turn.angle - found.residual[0], by["pose"][0], by["start"][0], by["gyro_bias"][0, 0], by["gyro_scale"][0, 0]
+
+
+def submap_residual(pose, measured):
+    """Residual (3,) and its derivatives (3, 3) by the errors of pose and submap."""
+    state = State(Layout({"pose": SE2, "map": Vector(3)}), {"pose": pose, "map": np.zeros(3)}, np.eye(6))
+    found = measure_scan(state, measured, np.eye(3))
+    return found.residual, found.jacobians["pose"], found.jacobians["map"]
 
 
 def differences(f: Callable, pose: np.ndarray, h: float = 1e-6) -> np.ndarray:

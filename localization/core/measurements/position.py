@@ -1,0 +1,28 @@
+"""The position of an antenna, as by GPS."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from motion_models import se2
+from motion_models.se2 import FloatArray, Pose2
+
+
+def transform_point(a_T_b: Pose2, point: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``point`` (2,) of frame b in frame a, with its Jacobians by the pose (2, 3) and by the point (2, 2)."""
+    c, s = np.cos(a_T_b[2]), np.sin(a_T_b[2])
+    R = np.array([[c, -s], [s, c]])
+    return se2.transform(a_T_b, point), np.column_stack([R, R @ [-point[1], point[0]]]), R
+
+
+def predict_position(
+    enu_T_map: Pose2, map_T_key: Pose2, offset: Pose2, lever: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Position (2,) of an antenna at ``lever`` l (2,) of a body at ``offset`` (3,) from a keyframe: enu_T_map map_T_key (offset l).
+
+    Returns it with its Jacobians by ``enu_T_map`` (2, 3), ``map_T_key`` (2, 3) and ``lever`` (2, 2).
+    """
+    in_key, _, by_lever = transform_point(offset, lever)
+    in_map, by_key, in_map_by_point = transform_point(map_T_key, in_key)
+    in_enu, by_alignment, in_enu_by_point = transform_point(enu_T_map, in_map)
+    return in_enu, by_alignment, in_enu_by_point @ by_key, in_enu_by_point @ in_map_by_point @ by_lever

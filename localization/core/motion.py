@@ -1,0 +1,94 @@
+"""Motion of the robot from step to step: what the wheels predict, process noise, and the state before the first step.
+
+    x = [ pose, start, map, key, gyro_bias, gyro_scale, clock, radius, corrections ]
+
+`start` and `key` are clones of the pose at the start of the step and at the last keyframe. `map` is the error of the submap around the
+robot, as a right perturbation of the pose: scans that are matched to one submap share it. `clock` is the offset of the wheels' stamps [s],
+`radius` the relative error of the radius of all wheels, and `corrections` are added to the parameters of the motion model along their
+directions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.core.filter import Transition
+from localization.core.state import SE2, Group, Layout, State, Vector
+from localization.events import Step
+from localization.settings import Settings
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections
+from motion_models.robot import GyroNoise
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True)
+class FilterConfig(Settings):
+    """Prior and process noise of the filter."""
+
+    clock_sigma_s: float = 0.1
+    """Sigma of the offset between the clocks of the wheels and of LiDAR or gyro at first [s]; 0 takes them as one."""
+    clock_walk_s_per_sqrt_s: float = 1e-4
+    """Random walk of the clock offset."""
+    wheel_radius_sigma: float = 0.03
+    """Prior sigma of the radius of all wheels, relative: wear, pressure and load of tyres; 0 takes the robot file's. It takes a LiDAR."""
+    standstill_m2_per_s: float = 1e-6
+    """Variance of the position while no wheel moves, per second: a push, a slope [m^2/s]."""
+    standstill_rad2_per_s: float = 1e-6
+    """Variance of the yaw while no wheel moves, per second: a push, a slope [rad^2/s]."""
+
+
+def initial_state(gyro: GyroNoise, corrections: Corrections, config: FilterConfig) -> State:
+    """At the origin of the odometry frame, where the pose and the submap are known exactly."""
+    one, unknown = Vector(1), np.zeros((1, 1))
+    priors: dict[str, tuple[Group, FloatArray]] = {
+        "pose": (SE2, np.zeros((3, 3))),
+        "start": (SE2, np.zeros((3, 3))),
+        "map": (Vector(3), np.zeros((3, 3))),
+        "key": (SE2, np.zeros((3, 3))),
+        "gyro_bias": (one, unknown + gyro.bias_sigma_rad_per_s**2),
+        "gyro_scale": (one, unknown + gyro.scale_sigma**2),
+        "clock": (one, unknown + config.clock_sigma_s**2),
+        "radius": (one, unknown + config.wheel_radius_sigma**2),
+        "corrections": (Vector(len(corrections.names)), corrections.cov),
+    }
+    layout = Layout({name: group for name, (group, _) in priors.items()})
+    P = np.zeros((layout.dim, layout.dim))
+    for name, (_, cov) in priors.items():
+        P[layout.rows[name], layout.rows[name]] = cov
+    return State(layout, {name: np.zeros(group.dim) for name, group in layout.groups.items()}, P)
+
+
+def wheel_transition(
+    state: State, step: Step, motion: Motion, gyro: GyroNoise, corrections: Corrections, config: FilterConfig
+) -> Transition:
+    """The wheels' ``motion`` in ``step``, and process noise of what changes meanwhile:
+
+    e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d radius) e_radius + (d delta / d params) e_corrections + slip.
+
+    Ways scale with the wheels' radius; turns have a scale of their own among the parameters.
+    """
+    dt, radius = step.duration, 1.0 + state.number("radius")
+    delta = motion.delta * [radius, radius, 1.0]
+    A = se2.adjoint(se2.inverse(delta))
+    jacobians = {
+        ("pose", "pose"): A,
+        ("pose", "clock"): step.d_clock[:, None],
+        ("pose", "radius"): np.append(-se2.inverse(motion.delta)[:2], 0.0)[:, None],  # R^T (x, y)
+        ("pose", "corrections"): motion.d_params @ corrections.directions,
+        ("map", "map"): A,  # the same error of the submap, as a perturbation of the present pose
+    }
+    noise = {"pose": motion.cov, "gyro_bias": np.array([[gyro.bias_walk_rad_per_s_sqrt_s**2 * dt]])}
+    if state.variance("clock"):  # else there is one clock
+        noise["clock"] = np.array([[config.clock_walk_s_per_sqrt_s**2 * dt]])
+    if step.is_standing:
+        rates = config.standstill_m2_per_s, config.standstill_m2_per_s, config.standstill_rad2_per_s
+        noise["pose"] = motion.cov + np.diag(rates) * dt
+    else:
+        noise["corrections"] = corrections.process_noise * dt
+        noise["radius"] = np.array([[config.wheel_radius_sigma**2 / PRIOR_RETURNS_AFTER_S * dt]])
+    what = f"the motion of the wheels until stamp {step.end_ns} ns"
+    return Transition({"pose": se2.compose(state["pose"], delta)}, jacobians, noise, what)

@@ -1,0 +1,46 @@
+"""Which variables a step does not excite: they are considered in its updates, not estimated."""
+
+from __future__ import annotations
+
+import math
+
+from localization.core.state import State
+from motion_models.base import Motion
+from motion_models.se2 import Cov3
+
+
+class Excitation:
+    """`start_step` with the wheels' motion, `start_scan` with each scan; `considered` for every update.
+
+    Errors of the submap and of the last keyframe are never estimated: the submap stays where it is drawn, and motions from keyframe to
+    keyframe add up to the filter's own trajectory. Motion that is nearly straight does not excite the corrections of the motion model. The
+    wheels' radius is not excited while scans leave the way open, as along a bare corridor, where noise of normals would be taken for a
+    measurement of it.
+    """
+
+    def __init__(self, track_m: float, min_track_over_radius: float) -> None:
+        """``min_track_over_radius``: track over turning radius from which a motion excites the corrections."""
+        self._track_m, self._min_track_over_radius = track_m, min_track_over_radius
+        self.is_turning = True
+        """Whether the motion of the step excites the corrections."""
+        self._is_way_open = False
+
+    def start_step(self, motion: Motion) -> None:
+        """The wheels predict ``motion``."""
+        d = motion.delta
+        self.is_turning = bool(abs(d[2]) * self._track_m >= self._min_track_over_radius * math.hypot(d[0], d[1]))
+
+    def start_scan(self, state: State, R: Cov3) -> None:
+        """A scan with covariance ``R`` (3, 3) follows. The way is open where the scan knows less of it than ``state``, until the next
+        scan."""
+        prior = state.cov("pose")[0, 0] + state.cov("map")[0, 0] - 2.0 * state.cross_cov("pose", "map")[0, 0]
+        self._is_way_open = bool(R[0, 0] > prior)
+
+    def considered(self) -> set[str]:
+        """Names of the variables that have no gain."""
+        names = {"map", "key"}
+        if not self.is_turning:
+            names.add("corrections")
+        if self._is_way_open:
+            names.add("radius")
+        return names
