@@ -28,7 +28,7 @@ from localization.commands.common import in_radians, write_json
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
-from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_turned_frames
+from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_foreign_frames
 from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
 from motion_models.center_of_gravity.files import arms_model, arms_postures
@@ -143,7 +143,7 @@ class Calibrate:
         if kind == "rotations":
             table = read_rotation_table(path)
             return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")
-        maneuvers, notes = without_turned_frames(read_windows(path), robot.geometry.wheel_radius_m)
+        maneuvers, notes = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)
         return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows", tuple(notes))
 
     def _regressions(self, console: Console, robot: Robot) -> tuple[Robot, dict[str, float], dict[str, Any]]:

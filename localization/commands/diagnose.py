@@ -37,7 +37,7 @@ from localization.diagnosis.prediction import with_sizes
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
-from motion_models.calibration.maneuvers import read_windows, table_columns
+from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
@@ -131,7 +131,9 @@ class Diagnose:
         if "rotation_ratio" in columns:
             maneuvers = rotations_as_maneuvers(read_rotation_table(self.source), robot)
             return drive_of_table(name, robot, maneuvers, "rotations")
-        return drive_of_table(name, robot, read_windows(self.source), "windows")
+        maneuvers, notes = without_foreign_frames(read_windows(self.source), robot.geometry.wheel_radius_m)
+        found = drive_of_table(name, robot, maneuvers, "windows")
+        return dataclasses.replace(found, warnings=(*notes, *found.warnings))
 
     def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
         log = open_wired(path, robot, self.topic.scored_against(self.reference))

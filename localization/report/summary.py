@@ -306,14 +306,12 @@ def _unscored(lines: Sequence[PlottedRun]) -> list[str]:
         line = lines[0]
         driven = metres(line.result.run.trajectory.distance(0.05))
         return [f"No reference was given: {line.words} drove {driven}, its accuracy is unknown.", advice]
-    ends = {line.number: _end(line) for line in lines}
-    pairs = [(a, b) for i, a in enumerate(lines) for b in lines[i + 1 :] if ends[a.number] is not None and ends[b.number] is not None]
+    found = [(gap, a, b) for i, a in enumerate(lines) for b in lines[i + 1 :] if (gap := _separation(a, b)) is not None]
     apart = []
-    if pairs:
-        gaps = [math.dist(ends[a.number] or (), ends[b.number] or ()) for a, b in pairs]
-        far = max(range(len(gaps)), key=gaps.__getitem__)
+    if found:
+        gap, a, b = max(found, key=lambda each: each[0])
         driven = metres(max(line.result.run.trajectory.distance(0.05) for line in lines))
-        apart = [f"After {driven} at most, {pairs[far][0].words} and {pairs[far][1].words} end farthest apart, by {metres(gaps[far])}."]
+        apart = [f"After {driven} at most, {a.words} and {b.words} are farthest apart, by {metres(gap)} at the last moment of both."]
     return ["No reference was given, so which run is right is unknown.", *apart, advice]
 
 
@@ -322,9 +320,13 @@ def _most_informed(lines: Sequence[PlottedRun]) -> PlottedRun:
     return max(lines, key=lambda x: (x.result.run.trajectory.covariances is not None, x.result.nis_mean is not None, x.number))
 
 
-def _end(line: PlottedRun) -> tuple[float, float] | None:
-    poses = line.result.run.trajectory.poses
-    return (float(poses[-1, 0]), float(poses[-1, 1])) if len(poses) else None
+def _separation(a: PlottedRun, b: PlottedRun) -> float | None:
+    """Distance of two runs at the last moment that both have [m]; None without such."""
+    both = [line.result.run.trajectory for line in (a, b)]
+    if not all(len(t) for t in both):
+        return None
+    (first,), (second,) = (t.at([min(int(t.stamps_ns[-1]) for t in both)]) for t in both)
+    return None if np.isnan(first[0] + second[0]) else math.dist(first[:2], second[:2])
 
 
 def _error(line: PlottedRun) -> float:

@@ -52,6 +52,9 @@ not show when it was made. Of 431 windows of DRIVE's Husky that moved so far, no
 _MAX_TURNED_SHARE, _MIN_COMPARED = 1.0 / 3.0, 5
 """Share of turned windows among those compared beyond which the table as a whole is in another frame, and how many that takes."""
 
+_MAX_WAY_RATIO = 1.5
+"""Way over that of the wheels which a wrong radius or sliding explains."""
+
 Row = tuple[int, dict[str, str]]
 """Line number and cells by column."""
 
@@ -213,25 +216,46 @@ def read_windows(path: str | Path) -> list[Maneuver]:
     return [_maneuver(list(of), columns, path) for _, of in itertools.groupby(rows, key=lambda row: row[1]["window"])]
 
 
-def without_turned_frames(maneuvers: Sequence[Maneuver], wheel_radius_m: float) -> tuple[list[Maneuver], list[str]]:
+def without_foreign_frames(maneuvers: Sequence[Maneuver], wheel_radius_m: float) -> tuple[list[Maneuver], list[str]]:
     """``maneuvers`` without those whose positions are in another frame than that of the body at their start; and notes for the user.
 
     A position must lie where the wheels drove. Where its frame is turned (world frame, mean of wrapped headings, sensor's axes), it lies
-    elsewhere, while the distance is right. Raises `CalibrationError` where more than a third of the windows are like that.
+    elsewhere, while the distance is right; where its frame begins elsewhere (at the drive's start), it lies farther off than the wheels
+    rolled. Raises `CalibrationError` where more than a third of the windows are like that.
     """
     off = np.array([_direction_error(m, wheel_radius_m) for m in maneuvers])
     turn = np.array([abs(float(m.measured[-1, 2])) for m in maneuvers])
-    is_turned = np.abs(off) > _MAX_TURN_RAD + _PER_TURN * turn  # false for NaN
-    n, compared = int(is_turned.sum()), int(np.isfinite(off).sum())
-    if n == 0:
-        return list(maneuvers), []
-    text = f"the measured positions of {n} of {compared} windows lie off the direction of their wheels, by up to "
-    text += f"{np.degrees(np.nanmax(np.abs(off[is_turned]))):.0f} deg"
+    excess, distance = np.array([_excess(m, wheel_radius_m) for m in maneuvers]).reshape(-1, 2).T
+    is_far = excess > 0.0  # false for NaN
+    is_turned = ~is_far & (np.abs(off) > _MAX_TURN_RAD + _PER_TURN * turn)
     rule = "x_m and y_m must be in the frame of the body at the start of the window, x ahead and y to the left"
-    if compared >= _MIN_COMPARED and n > _MAX_TURNED_SHARE * compared:
-        raise CalibrationError(f"{text}: {rule}.")
-    groups = ", ".join(dict.fromkeys(m.group for m, turned in zip(maneuvers, is_turned, strict=True) if turned))
-    return [m for m, turned in zip(maneuvers, is_turned, strict=True) if not turned], [f"{text}, and were left out ({groups}): {rule}."]
+    notes = []
+    for is_foreign, compared, where in (
+        (is_far, int(np.isfinite(excess).sum()), f"up to {np.max(distance[is_far], initial=0.0):.1f} m from the start of their windows, "
+         "farther than their wheels rolled"),
+        (is_turned, int(np.isfinite(off).sum()), "off the direction of their wheels, by up to "
+         f"{np.degrees(np.max(np.abs(off[is_turned]), initial=0.0)):.0f} deg"),
+    ):  # fmt: skip
+        n = int(is_foreign.sum())
+        if n == 0:
+            continue
+        text = f"the measured positions of {n} of {compared} windows lie {where}"
+        if compared >= _MIN_COMPARED and n > _MAX_TURNED_SHARE * compared:
+            raise CalibrationError(f"{text}: {rule}.")
+        groups = ", ".join(dict.fromkeys(m.group for m, foreign in zip(maneuvers, is_foreign, strict=True) if foreign))
+        notes.append(f"{text}, and were left out ({groups}): {rule}.")
+    return [m for m, foreign in zip(maneuvers, is_far | is_turned, strict=True) if not foreign], notes
+
+
+def _excess(maneuver: Maneuver, wheel_radius_m: float) -> tuple[float, float]:
+    """How much farther the last measured position is from the start than the wheels of the faster side and noise explain, and how far it is
+    [m]; NaN where no position was measured."""
+    if not np.isfinite(np.broadcast_to(maneuver.cov, (len(maneuver.ends), 3, 3))[-1, :2, :2]).all():
+        return math.nan, math.nan
+    inside = slice(maneuver.lead, maneuver.lead + int(maneuver.ends[-1]))
+    rolled = wheel_radius_m * float((np.abs(maneuver.wheels[inside]).max(axis=1) * maneuver.dt[inside]).sum())
+    distance = math.hypot(float(maneuver.measured[-1, 0]), float(maneuver.measured[-1, 1]))
+    return distance - _MAX_WAY_RATIO * rolled - _MIN_CHORD_M, distance
 
 
 def _direction_error(maneuver: Maneuver, wheel_radius_m: float) -> float:

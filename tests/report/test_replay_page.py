@@ -81,6 +81,15 @@ def test_summary_without_reference_names_no_best():
     assert f"by {farthest:.{2 if farthest > 0.995 else 3}f} m" in text
 
 
+def test_summary_without_reference_compares_runs_at_equal_times():
+    """A run that ends 2 s before the other is not 2 s of driving away from it."""
+    first = run(noise=0.0)
+    short = dataclasses.replace(
+        first, model="skid_steer", trajectory=Trajectory(first.trajectory.stamps_ns[:-20], first.trajectory.poses[:-20])
+    )
+    assert "farthest apart, by 0.000 m at the last moment of both" in verdict(score([first, short], None), None)
+
+
 def test_summary_of_one_run_names_no_best():
     text = verdict(score([run(noise=0.1)], track()), track())
     assert "Nothing else was run" in text
