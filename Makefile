@@ -4,7 +4,7 @@ BIN := .venv/bin
 DEMO := demo-out
 DATA := tests/data
 
-.PHONY: demo demo-buildings test test-extended test-all test-ros2 check benchmark clean
+.PHONY: demo demo-buildings test test-extended test-all test-ros2 check docs benchmark clean
 
 .venv/ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
@@ -52,10 +52,16 @@ check: .venv/ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+# The site, in site/.
+docs: .venv/ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "Open site/index.html in a browser."
 
 benchmark: .venv/ready
 	$(BIN)/python -m tests.benchmarks.all
 
 clean:
-	rm -rf .venv .ros2 $(DEMO)
+	rm -rf .venv .ros2 site $(DEMO)
 	find . \( -name "*.nbi" -o -name "*.nbc" \) -delete

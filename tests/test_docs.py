@@ -16,6 +16,7 @@ DOCUMENTS = sorted(
     for path in (
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
+        *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "localization").rglob("README.md"),
         *(ROOT / "motion_models").rglob("README.md"),
         ROOT / "tests/README.md",
@@ -23,7 +24,7 @@ DOCUMENTS = sorted(
     if path.exists()
 )
 COMMANDS = [
-    line
+    pytest.param(line, marks=() if path.name == "README.md" else pytest.mark.extended)
     for path in DOCUMENTS
     for block in re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     for line in block.splitlines()

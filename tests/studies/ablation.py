@@ -7,7 +7,7 @@ reference's instants), laps simulated by the physics of the tyres with nominal s
 twice as noisy as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected).
 Mechanisms of matcher and filter are measured by the EKF, those of the graph by its smoothed trajectory. Cells are stored in a file as
 they are computed: called again, the study goes on where it was stopped, or where `--minutes` ended. `--write` puts the table into
-`localization/estimators/README.md`.
+`docs/lab/estimators.md`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from motion_models.robot_file import load_robot
 from motion_models.se2 import triple
 from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 
-README = Path(__file__).parents[2] / "localization/estimators/README.md"
+JOURNAL = Path(__file__).parents[2] / "docs/lab/estimators.md"
 CELLS = Path(tempfile.gettempdir()) / "skidloc_ablation.json"
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 _NO_PRIOR = 1e6 * np.eye(3)
@@ -263,7 +263,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=300.0, help="of each drive")
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which no further cell is begun")
     parser.add_argument("--cells", type=Path, default=CELLS, help="file of the cells that are computed already")
-    parser.add_argument("--write", action="store_true", help="write the table into the README of the estimators")
+    parser.add_argument("--write", action="store_true", help="write the table into the lab journal")
     options = parser.parse_args()
     names = options.only.split(";")
     if unknown := [name for name in names if name not in MECHANISMS]:
@@ -273,7 +273,7 @@ def main() -> None:
     lines = table(names, cells)
     print("\n".join(lines))
     if options.write:
-        README.write_text(write_into(README.read_text(encoding="utf-8"), lines), encoding="utf-8")
+        JOURNAL.write_text(write_into(JOURNAL.read_text(encoding="utf-8"), lines), encoding="utf-8")
 
 
 if __name__ == "__main__":

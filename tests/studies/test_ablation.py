@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.studies.ablation import BEGIN, END, GRAPH_PATCHES, PATCHES, README, SETTINGS, write_into
+from tests.studies.ablation import BEGIN, END, GRAPH_PATCHES, JOURNAL, PATCHES, SETTINGS, write_into
 from tests.studies.buildings import BUILDINGS, Drive
 
 _SECONDS = 25.0
@@ -52,7 +52,7 @@ def test_setting_changes_poses(name: str, drive: Drive, poses: np.ndarray) -> No
 
 
 def test_table_is_written_between_the_markers() -> None:
-    text = README.read_text(encoding="utf-8")
+    text = JOURNAL.read_text(encoding="utf-8")
     found = write_into(text, ["| a |", "|---|"])
     assert found.split(BEGIN)[0] == text.split(BEGIN)[0]
     assert found.split(END)[1] == text.split(END)[1]

@@ -1,0 +1,103 @@
+"""What the site makes from the code: equations as MathML, lines of code beside them, and the texts of all warnings.
+
+In a page `{code: PATH :: TEXT}` becomes the number and the text of the line of the file PATH that contains TEXT, which must be one line;
+`<!-- messages: PATH -->` becomes the list of the warnings of that module.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from html import escape, unescape
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+CODE = re.compile(r"\{code: (?P<path>\S+) :: (?P<text>[^\n]+?)\}(?=\s|$)")
+MESSAGES = re.compile(r"<!-- messages: (?P<path>\S+) -->")
+_EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_LEAST_LENGTH = 25
+"""Of a text that is a sentence and not a part of one."""
+
+
+class Line(NamedTuple):
+    """A line of a file."""
+
+    path: str
+    number: int
+    text: str
+
+
+def find_line(path: str, text: str) -> Line:
+    """The only line of the file ``path`` that contains ``text``. Raises `ValueError` where there is none, or are several."""
+    lines = (ROOT / path).read_text(encoding="utf-8").splitlines()
+    found = [Line(path, i, line.strip()) for i, line in enumerate(lines, start=1) if text in line]
+    if len(found) != 1:
+        raise ValueError(f"{path} has {len(found)} lines with '{text}': name a part of one.")
+    return found[0]
+
+
+def messages(path: str) -> list[str]:
+    """Texts of the warnings of a module, in the order of its lines; expressions in them are an ellipsis."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    found = {text: None for node in _warning_nodes(tree) for text in _texts(node) if " " in text and len(text) >= _LEAST_LENGTH}
+    return list(found)
+
+
+def modules_with_messages() -> list[str]:
+    """Paths of all modules that warn users about their data."""
+    return [str(p.relative_to(ROOT)) for p in sorted((ROOT / "localization").rglob("*.py")) if messages(str(p.relative_to(ROOT)))]
+
+
+def _warning_nodes(tree: ast.AST) -> Iterator[ast.AST]:
+    """Expressions that become warnings: of a `Fault`, of functions and variables with that word in their name."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and any(word in node.name for word in ("warning", "contradiction")):
+            docstring = ast.get_docstring(node) is not None
+            yield from node.body[docstring:]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Fault":
+            yield from node.args[:1]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("append", "extend"):
+            if "warning" in ast.unparse(node.func.value):
+                yield from node.args
+        elif isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any("warnings" in ast.unparse(target) for target in targets):
+                yield node.value
+
+
+def _texts(node: ast.AST) -> Iterator[str]:
+    """Whole texts in an expression."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield re.sub(r"\{[^}]*\}", "…", node.value)
+    elif isinstance(node, ast.JoinedStr):
+        yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+    else:
+        for child in ast.iter_child_nodes(node):
+            yield from _texts(child)
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Lines of code and warnings, before the page is rendered."""
+
+    def show_line(found: re.Match[str]) -> str:
+        line = find_line(found["path"], found["text"])
+        return f'<small class="code-line">{line.path}:{line.number} <code>{escape(line.text)}</code></small>'
+
+    def show_messages(found: re.Match[str]) -> str:
+        return "\n".join(f"- {escape(text.strip())}" for text in messages(found["path"]))
+
+    return MESSAGES.sub(show_messages, CODE.sub(show_line, markdown))
+
+
+def on_page_content(html: str, **_: object) -> str:
+    """Equations as MathML, which browsers typeset without scripts."""
+    if 'class="arithmatex"' not in html:
+        return html
+    from latex2mathml.converter import convert  # of the extra docs
+
+    def typeset(found: re.Match[str]) -> str:
+        return str(convert(unescape(found[3]), display="inline" if found[2] == "(" else "block"))
+
+    return _EQUATION.sub(typeset, html)
