@@ -65,7 +65,7 @@ class Node:
         self._stats = MessageStats()
         self._stream = LiveStream(discovered, run.robot, self._stats, transport.epoch_ns, is_ros1=transport.is_ros1)
         self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
-        self._predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s) if run.node.predict else None
+        self._predictor = _predictor(trial, run) if run.node.predict else None
         self._commands = OperatorCommands(self, transport, names, report)
         self._problems: set[str] = set()  # that were reported
         self._entrance: LidarEntrance | None = None
@@ -376,6 +376,10 @@ class Node:
                 self._publisher.publish_map(self.session.pipeline.estimator.map_points(), stamp_ns)
             else:
                 self._publisher.publish_grid(grid, stamp_ns, self.session.state.start.map_T_start)
+
+
+def _predictor(trial: Trial, run: LiveRun) -> Predictor:
+    return Predictor(trial.model, run.robot, run.config.step.max_hold_s, run.node.predict_hz)
 
 
 class StopSignal:

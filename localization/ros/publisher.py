@@ -49,6 +49,8 @@ _CELL_M, _MAX_CELLS = 0.1, 4_000_000
 
 _NO_OFFSET = np.zeros(3)
 _NS = 1e-9
+_JITTER = 0.25
+"""Share of the period by which a wheel message may come early and still be predicted to."""
 _KEEP_S = 2.0
 """Wheel samples are stored for this long [s]."""
 _MAX_HORIZON_S = 1.0
@@ -198,9 +200,10 @@ class Predictor:
     predicted pose changes by that estimate's correction and by nothing else, for the same motion of wheels and gyro is applied to both.
     """
 
-    def __init__(self, model: MotionModel, robot: Robot, max_hold_s: float) -> None:
-        """``max_hold_s``: gaps between wheel samples that are longer end the prediction [s]."""
+    def __init__(self, model: MotionModel, robot: Robot, max_hold_s: float, max_rate_hz: float = math.inf) -> None:
+        """``max_hold_s``: gaps between wheel samples that are longer end the prediction [s]. ``max_rate_hz``: more are not made [Hz]."""
         self._model, self._noise, self._max_hold_s = model, robot.wheel_noise, max_hold_s
+        self._period_ns, self._due_ns = 1.0 / (max_rate_hz * _NS), -math.inf
         self._params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity, _KEEP_S)
         self._last: Estimate | None = None
@@ -208,13 +211,20 @@ class Predictor:
         self._clock_offset_ns = 0
 
     def insert(self, event: Event) -> bool:
-        """Store what ``event`` contributes; returns whether a new prediction is possible."""
+        """Store what ``event`` contributes; returns whether a new prediction is possible, and due."""
         if isinstance(event, CgSample):
             self._wheels.set_cg(event)
         if not isinstance(event, WheelSample):
             return False
         self._wheels.insert(event)
-        return self._last is not None
+        return self._last is not None and self._is_due(event.stamp_ns)
+
+    def _is_due(self, stamp_ns: int) -> bool:
+        """Whether a period has passed, but for the jitter of the wheels' stamps; the mean rate is kept."""
+        if stamp_ns < self._due_ns - _JITTER * self._period_ns:
+            return False
+        self._due_ns = (self._due_ns if stamp_ns - self._due_ns < self._period_ns else stamp_ns) + self._period_ns
+        return True
 
     def reset(self, estimate: Estimate, params: FloatArray | None, clock_offset_s: float, gyro: GyroCalibration | None = None) -> None:
         """Predict from ``estimate`` on, with ``params`` (k,) of the motion model (None: the nominal ones).

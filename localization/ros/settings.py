@@ -130,8 +130,10 @@ class NodeConfig(Settings):
     tf: bool = True
     """Publish the transforms `odom_frame` -> `base_link_frame` and, of a graph, `map_frame` -> `odom_frame`; false where others do."""
     predict: bool = True
-    """Publish transforms and `~/odometry_predicted` with every wheel message, predicted from the last estimate by the motion model; false:
+    """Publish transforms and `~/odometry_predicted` with the wheels' messages, predicted from the last estimate by the motion model; false:
     transforms with each estimate alone."""
+    predict_hz: Positive = 50.0
+    """Largest rate of predictions [Hz]: of wheels that come more often, messages in between are left out."""
     max_latency_s: Positive = 0.1
     """Diagnostics warn where estimates come later than this after their scan [s], and report an error at ten times as much."""
     path_period_s: float = 5.0

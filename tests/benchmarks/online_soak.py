@@ -15,6 +15,7 @@ import numpy as np
 
 from localization.logs.message_templates import Message, MessageLayout, Template
 from localization.pipeline import Trial
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
 from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
@@ -129,7 +130,9 @@ def drive(hours: float, beams: int, estimator: str = "ekf") -> list[Row]:
     with tempfile.TemporaryDirectory() as folder:
         files = Files(Path(folder) / "soak.tum", Path(folder) / "state")
         pair = Trial(make_model("skid_steer", robot), estimator)
-        node = Node.start(transport, LiveRun(robot, lambda has_lidar: pair, files, node=NodeConfig(wait_s=0.0)), print)
+        run = LiveRun(robot, lambda has_lidar: pair, files, node=NodeConfig(wait_s=0.0))
+        WarmUp(run).wait()
+        node = Node.start(transport, run, print)
         start = np.append(transport.truth, 0.0)
 
         def look() -> bool:

@@ -21,6 +21,7 @@ from localization.logs.reader import open_source
 from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Pipeline, Trial
 from localization.ros.discovery import TF
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
 from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files, View
@@ -154,6 +155,7 @@ def run_node(
         topics or TopicOverrides(),
         node=config or NodeConfig(wait_s=0.0, predict=False),
     )
+    WarmUp(run).wait()  # the transport has no time: everything would come while the node compiles
     node = Node.start(transport, run, reports.append, view=view)
     node.spin(transport.is_empty)
     return node, reports

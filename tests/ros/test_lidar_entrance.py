@@ -10,6 +10,7 @@ import pytest
 from localization.logs import open_log
 from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Trial
+from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
 from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
@@ -31,6 +32,7 @@ def test_live_lidar_turned_by_180_deg_is_corrected_from_the_start_on() -> None:
         TopicOverrides(),
         node=NodeConfig(wait_s=0.0, predict=False),
     )
+    WarmUp(run).wait()  # the transport has no time: everything would come while the node compiles
     node = Node.start(transport, run, reports.append)
     node.spin(transport.is_empty)
     assert sum("the yaw of 'laser' is wrong by 180 deg" in report for report in reports) == 1

@@ -195,3 +195,14 @@ def test_predict_after_stop_gives_none():
     insert_wheels(predictor, S, 6)
     predictor.stop()
     assert predictor.predict() is None
+
+
+@pytest.mark.parametrize(("wheels_hz", "predicted_hz"), [(500.0, 50.0), (100.0, 50.0), (50.0, 50.0), (40.0, 40.0), (120.0, 50.0)])
+def test_predictions_of_fast_wheels_come_at_the_set_rate(wheels_hz, predicted_hz):
+    """With stamps that jitter by 2 ms: the mean rate is that of the setting, or of slower wheels."""
+    rng = np.random.default_rng(0)
+    predictor = Predictor(make_model("diff_drive", ROBOT), ROBOT, 0.5, 50.0)
+    predictor.reset(Estimate(0, np.zeros(3), np.zeros(3), None, None), None, 0.0)
+    stamps = np.sort(np.arange(0.0, 10.0, 1.0 / wheels_hz) + rng.uniform(0.0, 0.002, round(10.0 * wheels_hz)))
+    due = [predictor.insert(WheelSample(round(t * S), np.ones(2), np.full(2, t))) for t in stamps]
+    assert sum(due) / 10.0 == pytest.approx(predicted_hz, rel=0.03)
