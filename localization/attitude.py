@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.events import ImuSample
+from localization.events import Gravity, ImuSample
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
 from motion_models.robot import GyroNoise, Mount
@@ -131,6 +131,8 @@ class AttitudeFilter:
         self._split, self._split_cov = np.zeros(4), np.diag([_MOUNT_SIGMA**2] * 2 + [_GROUND_SIGMA**2] * 2)
         self._has_started, self._tilts = False, False
         self._downhill = np.zeros(2)
+        self.gravity: Gravity | None = None
+        """By the window that ended in the last `advance`; None where none did."""
 
     @property
     def has_attitude(self) -> bool:
@@ -221,6 +223,7 @@ class AttitudeFilter:
 
         The tilt since the last call, where the ground tilts; else None.
         """
+        self.gravity = None
         if not self._n or self._problem:
             return None
         wheels = np.ascontiguousarray(dt_s), np.ascontiguousarray(rates)
@@ -254,6 +257,7 @@ class AttitudeFilter:
             self._start(gravity)
         else:
             _update_vertical(state, cov, gravity, _EXPLAINED if is_explained else _UNEXPLAINED)
+            self.gravity = Gravity(gravity, max(float(state[6]), (_EXPLAINED if is_explained else _UNEXPLAINED) ** 2))
             _separate(self._split, self._split_cov, state, cov, float(turn), float(way))
             ground, cov = self._split[2:], self._split_cov[2:, 2:]
             if not self._tilts and np.hypot(ground[0], ground[1]) > _LEVEL:
@@ -272,6 +276,7 @@ class AttitudeFilter:
         self._split_cov[2:] = self._split_cov[:, 2:] = 0.0
         self._split_cov[2, 2] = self._split_cov[3, 3] = _GROUND_SIGMA**2
         self._has_started, self._downhill = True, -up[:2] / up[2]
+        self.gravity = Gravity(gravity, (GRAVITY * sigma) ** 2)
 
     def _is_above(self, up_z: float) -> bool:
         """Whether the vertical by the mount is above the robot; where it is below, the wheels' turns show why."""

@@ -157,6 +157,29 @@ class Turn:
     """Time from the newest sample to the end, where that is later: the rate is the sample's [s]."""
 
 
+@dataclass(frozen=True)
+class BodyTurn:
+    """Turn about the body's three axes, integrated from a gyro's rates; biases and scale are still in it."""
+
+    angles: FloatArray
+    """(3,) rotation vector [rad]."""
+    variance: float
+    """[rad^2], of white noise about each axis; without biases and scale."""
+    duration: float
+    """[s]"""
+    rate: FloatArray
+    """(3,) at its end [rad/s]."""
+
+
+class Gravity(NamedTuple):
+    """Gravity in body axes at the end of a step: mean specific force over the last second, less what the wheels' motion explains."""
+
+    force: FloatArray
+    """(3,) upwards [m/s^2]."""
+    variance: float
+    """Along each axis, by what is not explained [m^2/s^4]."""
+
+
 def turn_twist(turn: Turn | None) -> Twist2:
     """(3,) mean twist of a step whose wheels are not used: zero but for the turn rate by the gyro."""
     return np.array([0.0, 0.0, 0.0 if turn is None else turn.angle / turn.duration])
@@ -191,6 +214,10 @@ class Step:
     scan: Scan | None = None
     cg_cov: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
     """(2, 2) covariance of the centre of gravity [m^2]."""
+    body_turn: BodyTurn | None = None
+    """About all axes; None without a gyro, and for estimators in the plane."""
+    gravity: Gravity | None = None
+    """None where it was not measured in this step, and for estimators in the plane."""
     is_scan_excluded: bool = False
     """A scan came, and a sensor check left it out."""
 

@@ -50,11 +50,11 @@ class Lifting:
         """
         if self._planar is None:
             self._position[:2], self._rotation = planar[:2], _yaw(float(planar[2]))
-            self._rotation = self._rotation @ _aligning(ground_up, np.array([0.0, 0.0, 1.0]))
+            self._rotation = self._rotation @ aligning(ground_up, np.array([0.0, 0.0, 1.0]))
         else:
             dx, dy, turn = se2.between(self._planar, planar).tolist()
             before, turned = self._rotation, self._rotation @ _yaw(turn)
-            self._rotation = turned @ _aligning(ground_up, turned[2])
+            self._rotation = turned @ aligning(ground_up, turned[2])
             along = np.array([dx, dy, 0.0])
             self._position = self._position + 0.5 * (before @ along + self._rotation @ (_yaw(-turn) @ along))
             self._way += math.hypot(dx, dy)
@@ -79,7 +79,7 @@ def _yaw(angle: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _aligning(a: FloatArray, b: FloatArray) -> FloatArray:
+def aligning(a: FloatArray, b: FloatArray) -> FloatArray:
     """(3, 3) the smallest rotation that turns the unit vector ``a`` into ``b``, not its opposite (Rodrigues)."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -119,8 +119,13 @@ class Trajectory3:
     """(N, 3) [m]."""
     quaternions: FloatArray
     """(N, 4) x, y, z, w."""
-    sigmas: FloatArray
-    """(N, 6) of x, y, z, roll, pitch, yaw [m, rad]."""
+    covariances: FloatArray
+    """(N, 6, 6) of x, y, z, roll, pitch, yaw in the world's axes [m, rad]."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(N, 6) of x, y, z, roll, pitch, yaw [m, rad]."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0))
 
 
 class AttitudeTable:
@@ -144,10 +149,40 @@ class AttitudeTable:
         covariances = np.zeros((len(planar), 3, 3)) if planar.covariances is None else planar.covariances
         for pose, cov, row in zip(planar.poses[known], covariances[known], rows[at], strict=True):
             found = lifting.add(pose, cov, row[:3], (float(row[3]), float(row[4])))
-            sigmas = np.sqrt(np.maximum(np.diagonal(found.covariance), 0.0))
-            numbers.append([*found.position, *quaternion(found.rotation), *sigmas])
-        table = np.array(numbers).reshape(-1, 13)
-        return Trajectory3(planar.stamps_ns[known], table[:, :3], table[:, 3:7], table[:, 7:])
+            numbers.append(_row_of(found))
+        return _trajectory(planar.stamps_ns[known], np.array(numbers))
+
+
+class SpaceTable:
+    """Poses in space by stamp; one that is not later than the last is left out."""
+
+    def __init__(self) -> None:
+        self._stamps, self._numbers = array("q"), array("d")
+
+    def __len__(self) -> int:
+        """Poses so far."""
+        return len(self._stamps)
+
+    def add(self, stamp_ns: int, pose: Pose3) -> None:
+        """Append a pose."""
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            return
+        self._stamps.append(stamp_ns)
+        self._numbers.frombytes(_row_of(pose).tobytes())
+
+    def trajectory(self) -> Trajectory3:
+        """All poses so far."""
+        return _trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._numbers))
+
+
+def _row_of(pose: Pose3) -> FloatArray:
+    """(43,) position, quaternion, covariance."""
+    return np.concatenate([pose.position, quaternion(pose.rotation), pose.covariance.ravel()])
+
+
+def _trajectory(stamps_ns: IntArray, numbers: FloatArray) -> Trajectory3:
+    table = numbers.reshape(-1, 43)
+    return Trajectory3(stamps_ns, table[:, :3], table[:, 3:7], table[:, 7:].reshape(-1, 6, 6))
 
 
 def write_tum3(path: Path, trajectory: Trajectory3 | None) -> None:

@@ -25,11 +25,12 @@ from localization.estimators import (
     EstimatorConfig,
     MapFusion,
     PriorMap,
+    SpaceFusion,
     make_estimator,
 )
 from localization.events import Event, ImuSample, PositionSample, Step
 from localization.lidar.losses import LidarLosses
-from localization.lifting import AttitudeTable, Trajectory3
+from localization.lifting import AttitudeTable, SpaceTable, Trajectory3
 from localization.maps import KeyframeMap
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
@@ -78,12 +79,16 @@ class Pipeline:
         self.is_localizing = trial.estimator in ESTIMATORS_WITH_MAP
         self.mounts = dict(mounts)
         """Known mounts by frame, shared with the synchronizer and the estimator."""
-        model = add_correction_parameters(trial.model, trial.corrections) if trial.estimator in ESTIMATORS_WITH_CORRECTIONS else trial.model
+        is_in_space = trial.estimator == "ekf" and not config.step.planar
+        has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not is_in_space
+        model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         name = trial.estimator if trial.prior is None else "ekf"
-        self.estimator: Estimator = make_estimator(
-            name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing
-        )
+        self.estimator: Estimator
+        if is_in_space:
+            self.estimator = SpaceFusion(robot, self.mounts, config.estimator.lidar, config.estimator.space)
+        else:
+            self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
             self.estimator = MapFusion(self.estimator, trial.prior)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
@@ -206,7 +211,7 @@ class Run:
     localization: Mapping[str, Any] | None = None
     """State, probability and times of the estimator that localizes in a saved map."""
     in_space: Trajectory3 | None = None
-    """``trajectory`` in space, with height, roll and pitch, where an IMU shows that the ground tilts."""
+    """``trajectory`` in space, with height, roll and pitch: of an estimator in space, or where an IMU shows that the ground tilts."""
     parameter_history: Mapping[str, FloatArray] = field(default_factory=dict)
     """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
 
@@ -263,7 +268,7 @@ class _Replay:
 
     def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
         self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
-        self._attitudes = AttitudeTable()
+        self._attitudes, self._in_space = AttitudeTable(), SpaceTable()
         self._parameters: dict[str, list[tuple[float, float, float]]] = {}
         self._next_ns = 0
 
@@ -280,7 +285,9 @@ class _Replay:
                 for name, (mean, sigma) in self._pipeline.estimator.parameters().items():
                     self._parameters.setdefault(name, []).append((estimate.stamp_ns * 1e-9, mean, sigma))
             attitude = self._pipeline.attitude
-            if attitude is not None:
+            if estimate.in_space is not None:
+                self._in_space.add(estimate.stamp_ns, estimate.in_space)
+            elif attitude is not None:
                 self._attitudes.add(estimate.stamp_ns, attitude)
 
     def finish(self) -> Run:
@@ -294,6 +301,7 @@ class _Replay:
         smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)
         attitude, final = self._pipeline.attitude, filtered if smoothed is None else smoothed
         in_space = self._attitudes.lift(final) if attitude is not None and attitude.is_tilting else None
+        in_space = self._in_space.trajectory() if len(self._in_space) else in_space
         self._seconds += time.perf_counter() - begin
         return Run(
             self._trial.model.name,

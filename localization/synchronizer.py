@@ -5,13 +5,15 @@ from __future__ import annotations
 import bisect
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 
 from localization.attitude import AttitudeFilter, Tilt
+from localization.body_rates import BodyRates
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, Turn, WheelSample, turn_twist
 from localization.gyro import GyroBuffer
 from localization.lidar.frames import LidarFrames
@@ -20,10 +22,12 @@ from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.extended_model import Series, in_series
+from motion_models.friction.model import BoolArray
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import Cov3, FloatArray, Twist2
+from motion_models.slope import SlopeTwist
 
 _MIN_REPORTED_S = 0.05
 """Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
@@ -49,6 +53,8 @@ class StepConfig(Settings):
     """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
     slopes: bool = True
     """Model gravity on slopes where the IMU's accelerometer shows that the ground tilts; false takes all ground as level."""
+    planar: bool = True
+    """Estimate poses in the plane; false: in space, which takes an IMU with an accelerometer and a 3D LiDAR."""
 
 
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
@@ -105,9 +111,11 @@ class Synchronizer:
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
         self.attitude: AttitudeFilter | None = None
         """The vertical; None for models of robots that do not skid, and where `StepConfig.slopes` is off."""
-        if self.config.slopes and model.traits.is_level:
+        has_slopes = self.config.slopes and model.traits.is_level
+        self._slope_effect = SlopeEffect.from_robot(robot) if has_slopes else None
+        self._body_rates = None if self.config.planar else BodyRates(robot.gyro_noise, mounts)
+        if self._slope_effect is not None or self._body_rates is not None:
             self.attitude = AttitudeFilter(robot.gyro_noise, mounts, robot.geometry.wheel_radius_m)
-            self._slope_effect = SlopeEffect.from_robot(robot)
         self.frames = LidarFrames(mounts)
         """Frames of the scans, with their mounts."""
         self._has_lidar = has_lidar
@@ -146,6 +154,8 @@ class Synchronizer:
             self._gyro.insert(event)
             if self.attitude is not None:
                 self.attitude.insert(event)
+            if self._body_rates is not None:
+                self._body_rates.insert(event)
         elif isinstance(event, CgSample):
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
@@ -251,7 +261,10 @@ class Synchronizer:
         if has_wheels:
             self._velocity.set_measured(last)
         twist = last if has_wheels else turn_twist(turn)
-        return Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, self._wheels.cg_cov)
+        body_turn, gravity = None, None
+        if self._body_rates is not None and self.attitude is not None:
+            body_turn, gravity = self._body_rates.turn(start_ns, end_ns), self.attitude.gravity
+        return Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, self._wheels.cg_cov, body_turn, gravity)
 
     def _integrate(
         self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt | None
@@ -268,22 +281,24 @@ class Synchronizer:
         rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
         since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self._first_wheel_ns or start_ns)) * 1e-9
         model = in_series(self.model, Series(np.r_[np.zeros(n), dt], since))
-        if tilt is None:
+        if tilt is None or self._slope_effect is None:
             twist = model.twist(rates, cg, self.params)
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
             motion = integrate_twists(dt, inside, self._wheel_noise)
         else:
-            twist, motion = self._integrate_on_slope(model, dt, rates, cg, tilt)
+            found = partial(self._slope_effect.twist, model, rates, cg, self.params)
+            twist, motion = self._integrate_on_slope(found, dt, n, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 
     def _integrate_on_slope(
-        self, model: MotionModel, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt
+        self, effect: Callable[[FloatArray], tuple[SlopeTwist, BoolArray]], dt: FloatArray, m: int, tilt: Tilt
     ) -> tuple[Twist, Motion]:
-        """Twists at ``rates`` (m + n, 2), and the motion over the n intervals, with what is uncertain about the slope in its covariance."""
-        m, whole, k = len(rates) - len(dt), float(dt.sum()), len(self.params)
+        """Twists by ``effect`` at ``m`` samples before and n in the step, and the motion over its intervals ``dt`` (n,), with what is
+        uncertain about the slope in its covariance."""
+        whole, k = float(dt.sum()), len(self.params)
         downhill = np.vstack([np.tile(tilt.before, (m, 1)), tilt.at((np.cumsum(dt) - 0.5 * dt) / whole)])
-        found, is_limited = self._slope_effect.twist(model, rates, cg, self.params, downhill)
+        found, is_limited = effect(downhill)
         twist = found.twist
         by = np.concatenate([twist.d_params, found.d_downhill], axis=-1)
         motion = integrate_twists(dt, Twist(twist.value[m:], twist.d_wheels[m:], twist.d_cg[m:], by[m:]), self._wheel_noise)

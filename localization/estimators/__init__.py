@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from localization.core.motion import FilterConfig
+from localization.core.space import SpaceConfig
 from localization.errors import EstimatorError
 from localization.estimators.base import Estimate, Estimator, LearnedParameter, Residuals
 from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap
+from localization.estimators.space_fusion import SpaceFusion
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
@@ -29,6 +31,7 @@ __all__ = [
     "MapFusion",
     "PriorMap",
     "Residuals",
+    "SpaceFusion",
     "check_estimator",
     "make_estimator",
 ]
@@ -41,6 +44,7 @@ class EstimatorConfig:
     ekf: FilterConfig = field(default_factory=FilterConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
+    space: SpaceConfig = field(default_factory=SpaceConfig)
 
 
 ESTIMATORS = ("odometry", "lidar", "ekf", "graph")

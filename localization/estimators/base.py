@@ -11,6 +11,7 @@ import numpy as np
 
 from localization.events import PositionSample, Step, Turn
 from localization.lidar import LostScans
+from localization.lifting import Pose3
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid
 from localization.trajectory import Trajectory
@@ -39,6 +40,8 @@ class Estimate:
     """``odom_T_body`` (3,) and its covariance (3, 3), where ``pose`` is ``map_T_body``: it never jumps."""
     map_T_odom: Pose2 | None = None
     """(3,) what loop closures and positions have corrected; None where ``pose`` is in the odometry frame."""
+    in_space: Pose3 | None = None
+    """``odom_T_body`` of an estimator of poses in space, of which ``pose`` is the one seen from above."""
 
 
 class LearnedParameter(NamedTuple):

@@ -53,6 +53,14 @@ class Sweep:
         _move(self.points, self.times, twist, points)
         return points
 
+    def deskew_in_space(self, twist: FloatArray) -> FloatArray:
+        """(N, 3) as `deskew`, of a body that moves with constant ``twist`` (6,) of SE(3) [m/s, rad/s]."""
+        if not len(self.times) or not np.any(twist):
+            return self.points
+        points = np.empty_like(self.points)
+        _move_in_space(self.points, self.times, twist, points)
+        return points
+
     def project(self, points: FloatArray) -> FloatArray:
         """(M, 2) what of the deskewed ``points`` (N, 3) is matched in the plane: a planar scan as it is, of a cloud the walls."""
         return self.project_with_times(points)[0]
@@ -105,3 +113,17 @@ def _move(points: FloatArray, times: FloatArray, twist: Twist2, out: FloatArray)
         out[i, 0] = x + c * points[i, 0] - s * points[i, 1]
         out[i, 1] = y + s * points[i, 0] + c * points[i, 1]
         out[i, 2] = points[i, 2]
+
+
+@kernel
+def _move_in_space(points: FloatArray, times: FloatArray, twist: FloatArray, out: FloatArray) -> None:
+    """Fill ``out`` (N, 3) with ``points`` after the motion at ``twist`` (6,) for ``times`` (N,), to second order in the turn."""
+    for i in range(points.shape[0]):
+        t = times[i]
+        x, y, z, a, b, c = t * twist[0], t * twist[1], t * twist[2], t * twist[3], t * twist[4], t * twist[5]
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        qx, qy, qz = b * pz - c * py, c * px - a * pz, a * py - b * px
+        rx, ry, rz = b * qz - c * qy, c * qx - a * qz, a * qy - b * qx
+        out[i, 0] = px + qx + 0.5 * rx + x + 0.5 * (b * z - c * y)
+        out[i, 1] = py + qy + 0.5 * ry + y + 0.5 * (c * x - a * z)
+        out[i, 2] = pz + qz + 0.5 * rz + z + 0.5 * (a * y - b * x)

@@ -7,7 +7,7 @@ share nothing with the friction model. Needs the extra `mujoco`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -16,13 +16,10 @@ from localization.events import Event, ImuSample, WheelSample
 from motion_models.robot import Mount, Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from tests.helpers.hills import HillDrive, gradient, terrain
 
 _STEP_S, _IMU_EVERY, _WHEELS_EVERY, _GROUND_EVERY = 0.001, 10, 20, 2
 _FIELD_M = 40.0
-_WAVES = ((9.0, 0.3, 0.9), (13.0, 1.4, 2.1), (17.0, 2.6, 4.0), (11.0, 3.9, 5.2), (15.0, 5.1, 0.4))
-"""Wavelength [m], direction and phase [rad] of the hills' waves, of equal steepness."""
-_WAVE_SLOPE = math.tan(math.radians(4.2))
-"""Of each at most; the median of all is 5.8 degrees."""
 _WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, -1.0))
 _CONTACT = 'solref="0.01 1" solimp="0.05 0.05 0.001" solreffriction="0.016 1"'
 _FLATTENING = 0.0034
@@ -33,44 +30,11 @@ _START_S = 1.0
 """In which the robot settles, before the drive."""
 
 
-@dataclass(frozen=True)
-class HillDrive:
-    """What robot and truth say."""
-
-    robot: Robot
-    mounts: dict[str, Mount]
-    events: list[Event]
-    stamps_ns: np.ndarray
-    positions: FloatArray
-    """(N, 3) true, of the body's origin on the ground [m]."""
-    rotations: FloatArray
-    """(N, 3, 3) true ``world_R_body``."""
-
-
 def robot_of(mu: float, cg_height_m: float = 0.4) -> Robot:
     """A Husky whose friction and CG's height are known."""
     robot = load_robot("husky_a200")
     models = {**robot.models, "friction": {**robot.models.get("friction", {}), "mu": mu}}
     return replace(robot, geometry=replace(robot.geometry, cg_height_m=cg_height_m), models=models)
-
-
-def terrain(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Height of the hills [m]."""
-    total = np.zeros(np.broadcast(x, y).shape)
-    for wavelength, direction, phase in _WAVES:
-        k = 2.0 * math.pi / wavelength
-        total = total + _WAVE_SLOPE / k * np.sin(k * (math.cos(direction) * x + math.sin(direction) * y) + phase)
-    return np.asarray(total)
-
-
-def gradient(x: float, y: float) -> tuple[float, float]:
-    """Slope of the hills along x and y [-]."""
-    dx = dy = 0.0
-    for wavelength, direction, phase in _WAVES:
-        c, s = math.cos(direction), math.sin(direction)
-        steep = _WAVE_SLOPE * math.cos(2.0 * math.pi / wavelength * (c * x + s * y) + phase)
-        dx, dy = dx + c * steep, dy + s * steep
-    return dx, dy
 
 
 def turn_in_place(t: float, position: FloatArray, heading: float) -> tuple[float, float]:

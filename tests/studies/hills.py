@@ -24,7 +24,8 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
-from tests.helpers.mujoco_hills import HillDrive, Wander, drive, steady, turn_in_place
+from tests.helpers.hills import HillDrive
+from tests.helpers.mujoco_hills import Wander, drive, steady, turn_in_place
 
 _RADIUS_M, _STEP_S = 0.165, 0.02
 _MODEL = FrictionModel.from_robot(load_robot("husky_a200"))

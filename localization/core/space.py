@@ -1,0 +1,131 @@
+"""Motion and measurements of a pose in space: the wheels' planar motion lifted into the body's plane, the gyro's turns and gravity.
+
+    x = [ pose, start, map, gyro_bias, gyro_scale, accelerometer ]
+
+`start` is a clone of the pose at the start of the step. `map` is the error of the submap around the robot, as a right perturbation of the
+pose: clouds that are matched to one submap share it. `accelerometer` is its bias with what its mount is off [m/s^2], constant in the body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from localization.attitude import GRAVITY
+from localization.core.filter import Measurement, Transition
+from localization.core.state import Layout, State, Vector
+from localization.events import BodyTurn, Gravity, Step
+from localization.settings import Settings, at_least
+from motion_models import se3
+from motion_models.robot import GyroNoise
+from motion_models.se2 import FloatArray
+from motion_models.se3 import Transform3
+
+
+@dataclass(frozen=True)
+class PoseInSpace:
+    """SE(3): homogeneous matrices (4, 4) (`motion_models.se3`)."""
+
+    dim = 6
+    compose = staticmethod(se3.compose)
+    inverse = staticmethod(se3.inverse)
+    exp = staticmethod(se3.exp)
+    log = staticmethod(se3.log)
+    adjoint = staticmethod(se3.adjoint)
+
+
+SE3 = PoseInSpace()
+_LIFT = np.zeros((6, 3))
+"""From planar tangents (x, y, yaw) to those of SE(3)."""
+_LIFT[[0, 1, 5], [0, 1, 2]] = 1.0
+_RATE_WITHOUT_GYRO = 0.5
+"""Sigma of roll and pitch rates of a robot on hills, which the gyro measures [rad/s]."""
+_FIRST_TILT_SIGMA = np.radians(10.0)
+"""Before gravity is measured for the first time [rad]."""
+
+
+@dataclass(frozen=True)
+class SpaceConfig(Settings):
+    """Prior and process noise of poses in space."""
+
+    terrain_m_per_sqrt_s: Annotated[float, at_least(1e-4)] = 0.02
+    """Random walk of the body across its own plane: bumps, tyres that give way [m/sqrt(s)]."""
+    accelerometer_m_s2: Annotated[float, at_least(1e-3)] = 0.2
+    """Sigma of the accelerometer's bias with a mount that is off by 1.2 deg [m/s^2]."""
+    standstill_m2_per_s: float = 1e-6
+    """Variance of the position while no wheel moves, per second [m^2/s]."""
+
+
+def initial_space_state(gyro: GyroNoise, bias_sigma: float, config: SpaceConfig) -> State:
+    """At the origin of the odometry frame, level within 10 degrees; ``bias_sigma`` of the gyro's axes across the vertical [rad/s]."""
+    layout = Layout(
+        {"pose": SE3, "start": SE3, "map": Vector(6), "gyro_bias": Vector(3), "gyro_scale": Vector(1), "accelerometer": Vector(3)}
+    )
+    n = sum(group.dim for group in layout.groups.values())
+    P = np.zeros((n, n))
+    P[3, 3] = P[4, 4] = _FIRST_TILT_SIGMA**2
+    P[layout.rows["gyro_bias"], layout.rows["gyro_bias"]] = np.diag([bias_sigma**2, bias_sigma**2, gyro.bias_sigma_rad_per_s**2])
+    P[layout.rows["gyro_scale"], layout.rows["gyro_scale"]] = gyro.scale_sigma**2
+    P[layout.rows["accelerometer"], layout.rows["accelerometer"]] = config.accelerometer_m_s2**2 * np.eye(3)
+    means = {name: np.eye(4) if group is SE3 else np.zeros(group.dim) for name, group in layout.groups.items()}
+    return State(layout, means, P)
+
+
+def lift(planar: FloatArray) -> Transform3:
+    """(4, 4) of a planar motion (3,)."""
+    x, y, yaw = planar.tolist()
+    out = np.eye(4)
+    out[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    out[0, 3], out[1, 3] = x, y
+    return out
+
+
+def lifted_transition(state: State, step: Step, gyro: GyroNoise, config: SpaceConfig) -> Transition:
+    """The wheels' planar motion in the body's plane, which the terrain tilts and moves along its normal meanwhile:
+
+    e_pose' = Ad(delta^-1) e_pose + L slip + B (n_z, n_roll, n_pitch)
+
+    Turns by the terrain are constant in a step: a turn a over the way d moves the end by a x d / 2.
+    """
+    dt, delta = step.duration, lift(step.predicted.delta)
+    A = se3.adjoint(se3.inverse(delta))
+    end = -se3.inverse(delta)[:3, 3]  # the way, in the body's axes at the end
+    B = np.zeros((6, 3))
+    B[2, 0] = B[3, 1] = B[4, 2] = 1.0
+    B[:3, 1:] = -0.5 * se3.cross(end)[:, :2]
+    turn = (_RATE_WITHOUT_GYRO * dt) ** 2
+    if step.is_standing:
+        still = config.standstill_m2_per_s * dt
+        terrain, slip = np.diag([still, turn, turn]), step.cov + np.diag([still, still, still])
+    else:
+        terrain, slip = np.diag([config.terrain_m_per_sqrt_s**2 * dt, turn, turn]), step.cov
+    noise = {
+        "pose": _LIFT @ slip @ _LIFT.T + B @ terrain @ B.T,
+        "gyro_bias": gyro.bias_walk_rad_per_s_sqrt_s**2 * dt * np.eye(3),
+    }
+    return Transition({"pose": state["pose"] @ delta}, {("pose", "pose"): A, ("map", "map"): A}, noise, "the motion of the wheels")
+
+
+def measure_body_turn(state: State, turn: BodyTurn) -> Measurement:
+    """A gyro's turn between the poses "start" and "pose": z = (1 + gyro_scale) log(R_start^T R_pose) + gyro_bias dt + n [rad]."""
+    turned = se3.rotation_vector(state["start"][:3, :3].T @ state["pose"][:3, :3])
+    scale, half = 1.0 + float(state["gyro_scale"][0]), 0.5 * se3.cross(turned)
+    nothing = np.zeros((3, 3))
+    jacobians: dict[str, FloatArray] = {
+        "pose": np.hstack([nothing, scale * (np.eye(3) + half)]),  # inverse right Jacobian of SO(3), to first order
+        "start": np.hstack([nothing, -scale * (np.eye(3) - half)]),
+        "gyro_bias": turn.duration * np.eye(3),
+        "gyro_scale": turned[:, None],
+    }
+    residual = turn.angles - scale * turned - turn.duration * state["gyro_bias"]
+    return Measurement(residual, jacobians, turn.variance * np.eye(3), what="a turn by the gyro")
+
+
+def measure_gravity(state: State, gravity: Gravity) -> Measurement:
+    """Gravity in body axes: z = g R^T e_z + accelerometer + n [m/s^2]."""
+    up = state["pose"][2, :3]
+    jacobians = {"pose": np.hstack([np.zeros((3, 3)), GRAVITY * se3.cross(up)]), "accelerometer": np.eye(3)}
+    residual = gravity.force - GRAVITY * up - state["accelerometer"]
+    return Measurement(residual, jacobians, gravity.variance * np.eye(3), what="gravity")

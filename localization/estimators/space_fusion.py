@@ -1,0 +1,177 @@
+"""Odometry in space: wheels, gyro, gravity and a 3D LiDAR in a filter on SE(3), and the submap that its poses draw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from localization.core.filter import clone, propagate, update
+from localization.core.measurements.scan import key_scan_transition, measure_scan
+from localization.core.space import (
+    SpaceConfig,
+    initial_space_state,
+    lifted_transition,
+    measure_body_turn,
+    measure_gravity,
+)
+from localization.core.state import State
+from localization.estimators.base import NO_POINTS, Estimate, Estimator, twist_at_end
+from localization.events import Gravity, Step
+from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size
+from localization.lidar.cloud_map import CloudMap, thin
+from localization.lifting import Pose3, aligning
+from motion_models import se3
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray, Points2
+from motion_models.se3 import Transform3
+
+_PLANAR = [0, 1, 5]
+_BIAS_SIGMA = 0.01
+"""Sigma of the biases of a gyro's axes that are not zeroed [rad/s]."""
+_MIN_POINTS_MAPPED = 50
+"""Points with a surface in the submap, below which a cloud is lost. The first cloud of a standing robot has surfaces for a sixth of it."""
+
+
+class SpaceFusion(Estimator):
+    """`step` after `step`: predict by the wheels, update by gyro and gravity, match the cloud, update by it; the submap grows afterwards.
+
+    Until gravity is measured for the first time, nothing is matched.
+    """
+
+    def __init__(self, robot: Robot, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
+        self._gyro, self._mounts, self._lidar, self._config = robot.gyro_noise, mounts, lidar, config
+        self.state = initial_space_state(robot.gyro_noise, _BIAS_SIGMA, config)
+        self._has_vertical = False
+        self._map: CloudMap | None = None
+        self._odom_T_map = np.eye(4)
+        self._cloud: FloatArray | None = None  # of the last step, deskewed, in the body frame
+        self._last_key: Transform3 | None = None
+        self._lost = LostScans()
+        self._counts = dict.fromkeys(("scans", "matched", "standing"), 0)
+
+    def step(self, step: Step) -> Estimate:
+        """Predict, update by gyro and gravity, update by the cloud."""
+        self.run_deferred()
+        self._counts["standing"] += step.is_standing
+        state = propagate(clone(self.state, "pose", "start"), lifted_transition(self.state, step, self._gyro, self._config))
+        if step.body_turn is not None and step.turn is not None:  # a sensor check may have left the gyro out
+            state, _ = update(state, measure_body_turn(state, step.body_turn), ("map",))
+        if step.gravity is not None:
+            if not self._has_vertical:
+                state, self._has_vertical = _align(state, step.gravity), True
+            state, _ = update(state, measure_gravity(state, step.gravity))
+            state = self._tilt_map(state)
+        self.state = state
+        return self._estimate(step, self._update_cloud(step))
+
+    def _tilt_map(self, state: State) -> State:
+        """Move the submap by its estimated error, a right perturbation of the pose: it shares the pose's error of roll and pitch."""
+        pose = state["pose"]
+        self._odom_T_map = pose @ se3.exp(state["map"]) @ se3.inverse(pose) @ self._odom_T_map
+        return State(state.layout, {**state.means, "map": np.zeros(6)}, state.P)
+
+    def run_deferred(self) -> None:
+        """The last cloud enters the submap, if it is a key cloud. Deferred until its estimate is out."""
+        cloud, self._cloud = self._cloud, None
+        if cloud is None or self._map is None:
+            return
+        pose, c = self.state["pose"], self._lidar
+        if self._last_key is not None:
+            moved = se3.log(se3.inverse(self._last_key) @ pose)
+            if math.hypot(*moved[:3]) < c.key_distance_m and math.hypot(*moved[3:]) < c.key_angle_rad:
+                return
+        self._last_key = pose
+        share = self._map.insert(se3.inverse(self._odom_T_map) @ pose, cloud)
+        self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(share, np.zeros((6, 6)))))
+
+    def _update_cloud(self, step: Step) -> float | None:
+        """Match the cloud of ``step`` and update by it; its NIS (6 degrees of freedom), or None where there is no cloud or no match."""
+        if step.scan is None or not self._has_vertical:
+            self._lost.add(step.end_ns, "excluded") if step.is_scan_excluded else self._lost.add_no_scan(step.end_ns)
+            return None
+        self._counts["scans"] += 1
+        c = self._lidar
+        mount = self._mounts.get(step.scan.frame_id, Mount())
+        sweep = Sweep.from_scan(step.scan, mount).within(c.min_range_m, c.max_range_m)
+        if len(sweep.points) < MIN_POINTS:
+            self._lost.add(step.end_ns, "sparse")
+            return None
+        points = sweep.deskew_in_space(self._twist_of(step))
+        if self._map is None:
+            self._map = CloudMap(c.voxel_size_m or choose_voxel_size(points), c.range_noise_m)
+            self._cloud = thin(points, self._map.cell)
+            self._lost.add_matched(step.end_ns)
+            return None
+        self._cloud = thin(points, self._map.cell)
+        prior = se3.inverse(self._odom_T_map) @ self.state["pose"]
+        match = self._map.match(self._cloud, prior, self.state.difference_cov("pose", "map"))
+        if match.mapped < _MIN_POINTS_MAPPED or match.overlap < c.lost_below:
+            self._lost.add(step.end_ns, "lost")
+            return None
+        self._lost.add_matched(step.end_ns)
+        self._counts["matched"] += 1
+        measured = self._odom_T_map @ match.measured
+        self.state, innovation = update(self.state, measure_scan(self.state, measured, match.cov), ("map",))
+        return innovation.nis
+
+    def _twist_of(self, step: Step) -> FloatArray:
+        """(6,) at the end of ``step``, the middle of the sweep: by the wheels, and turns by the gyro."""
+        twist = np.zeros(6)
+        twist[_PLANAR] = step.twist
+        if step.body_turn is not None:
+            twist[3:] = step.body_turn.rate - self.state["gyro_bias"]
+        return twist
+
+    def _estimate(self, step: Step, nis: float | None) -> Estimate:
+        pose, P = self.state["pose"], self.state.cov("pose")
+        yaw = math.atan2(pose[1, 0], pose[0, 0])
+        world = np.zeros((6, 6))
+        world[:3, :3] = world[3:, 3:] = pose[:3, :3]
+        covariance = world @ P @ world.T
+        c, s = math.cos(yaw), math.sin(yaw)
+        to_body = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        planar_cov = to_body @ covariance[np.ix_(_PLANAR, _PLANAR)] @ to_body.T
+        twist, twist_cov = step.twist, None
+        if step.duration > 0.0:
+            delta, cov = self.state.between("start", "pose")
+            mean, mean_cov = se3.log(delta)[_PLANAR] / step.duration, cov[np.ix_(_PLANAR, _PLANAR)] / step.duration**2
+            measured_over = math.inf if nis is not None or not step.has_wheels else step.duration
+            twist, twist_cov = twist_at_end(mean, mean_cov, step.twist_change, measured_over)
+        planar, in_space = np.array([pose[0, 3], pose[1, 3], yaw]), Pose3(pose[:3, 3], pose[:3, :3], covariance)
+        return Estimate(step.end_ns, planar, planar_cov, twist, twist_cov, nis, in_space=in_space)
+
+    @property
+    def lost(self) -> LostScans:
+        """Clouds that could not be matched."""
+        return self._lost
+
+    def parameters(self) -> Mapping[str, tuple[float, float]]:
+        """Mean and sigma of what the filter estimated besides the pose, by name."""
+        sigmas = np.sqrt(np.diagonal(self.state.cov("gyro_bias")))
+        return {
+            f"gyro_bias_{axis}_rad_per_s": (float(bias), float(sigma))
+            for axis, bias, sigma in zip("xyz", self.state["gyro_bias"], sigmas, strict=True)
+        }
+
+    def counts(self) -> Mapping[str, int]:
+        """Number of occurrences by name: scans, matched, and those of lost scans by cause."""
+        return {**self._counts, **self._lost.causes}
+
+    def map_points(self) -> Points2:
+        """(M, 2) points of the map seen from above [m]."""
+        return NO_POINTS if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
+
+
+def _align(state: State, gravity: Gravity) -> State:
+    """The pose turned about a level axis, so that ``gravity`` is vertical; its heading and covariance stay."""
+    pose = state["pose"].copy()
+    yaw = math.atan2(pose[1, 0], pose[0, 0])
+    upright = aligning(gravity.force / np.linalg.norm(gravity.force), np.array([0.0, 0.0, 1.0]))
+    pose[:3, :3] = _turn(yaw - math.atan2(upright[1, 0], upright[0, 0])) @ upright
+    return State(state.layout, {**state.means, "pose": pose}, state.P)
+
+
+def _turn(yaw: float) -> FloatArray:
+    return se3.rotation(np.array([0.0, 0.0, yaw]))

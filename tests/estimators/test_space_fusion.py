@@ -1,0 +1,71 @@
+"""Odometry in space: a robot that rolls over waves among trees, over open ground and without a LiDAR."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from localization.pipeline import Trial, replay
+from motion_models.registry import make_model
+from tests.helpers.hill_scans import MOUNT, make_scene, scans
+from tests.helpers.hills import rolling_drive
+from tests.helpers.in_space import IN_SPACE, in_order, run_in_space
+
+
+@pytest.fixture(scope="module")
+def rolled():
+    return rolling_drive(5.5)
+
+
+@pytest.fixture(scope="module")
+def among_trees(rolled):
+    return list(scans(rolled, make_scene(rolled, 3)))
+
+
+def test_space_fusion_among_trees_is_within_centimetres(rolled, among_trees):
+    found, pipeline = run_in_space(rolled, among_trees, "diff_drive")
+    assert np.degrees(np.arccos(found.true[:, 2, 2])).max() > 5.0
+    assert found.ate < 0.02
+    assert np.abs(found.errors[20:, :3]).max() < 0.05
+    assert np.abs(found.errors[20:, 3:]).max() < math.radians(0.5)
+    counts = pipeline.estimator.counts()
+    assert counts["matched"] == counts["scans"] - 1
+
+
+def test_space_fusion_without_matches_is_by_wheels_gyro_and_gravity(rolled, among_trees):
+    """Two points a cloud: nothing to match."""
+    bare = [dataclasses.replace(scan, points=scan.points[:2], offsets=scan.offsets[:2]) for scan in among_trees]
+    found, pipeline = run_in_space(rolled, bare, "diff_drive")
+    assert np.abs(found.errors[-1, :3]).max() < 0.15
+    assert np.sqrt(found.covariances[-1, 0, 0]) > 0.02
+    assert (found.nees[30:] < 30.0).all()
+    assert pipeline.lidar.share == pytest.approx(1.0)
+
+
+@pytest.mark.extended
+def test_space_fusion_survives_a_cloud_of_200000_points_and_nan_rings(rolled, among_trees):
+    last = among_trees[-1]
+    rng = np.random.default_rng(0)
+    many = rng.integers(0, len(last.points), 200_000)
+    huge = dataclasses.replace(last, points=last.points[many] + 0.01 * rng.normal(size=(200_000, 3)), offsets=last.offsets[many])
+    rings = [
+        dataclasses.replace(s, points=np.where(np.arange(len(s.points))[:, None] % 4 == 0, np.nan, s.points)) for s in among_trees[:-1]
+    ]
+    found, pipeline = run_in_space(rolled, [*rings, huge], "diff_drive")
+    counts = pipeline.estimator.counts()
+    assert counts["matched"] == counts["scans"] - 1
+    assert found.ate < 0.02
+
+
+@pytest.mark.extended
+def test_replay_in_space_gives_its_poses_with_six_by_six_covariances(rolled, among_trees):
+    trial = Trial(make_model("diff_drive", rolled.robot), "ekf")
+    mounts = {**rolled.mounts, "lidar_link": MOUNT}
+    (run,) = replay(in_order(rolled, among_trees[:30]), [trial], rolled.robot, mounts, True, IN_SPACE)
+    assert run.in_space is not None
+    np.testing.assert_array_equal(run.in_space.positions[:, :2], run.trajectory.poses[:, :2])
+    assert run.in_space.covariances.shape == (len(run.trajectory), 6, 6)
+    assert (np.linalg.eigvalsh(run.in_space.covariances) > -1e-9).all()

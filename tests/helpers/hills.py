@@ -1,0 +1,94 @@
+"""Hills: their height, a drive over them with what the robot measures, and a robot that rolls over them without slip."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from localization.events import Event, ImuSample, WheelSample
+from motion_models import se3
+from motion_models.robot import Mount, Robot
+from motion_models.robot_file import load_robot
+from motion_models.se2 import FloatArray
+
+_WAVES = ((9.0, 0.3, 0.9), (13.0, 1.4, 2.1), (17.0, 2.6, 4.0), (11.0, 3.9, 5.2), (15.0, 5.1, 0.4))
+"""Wavelength [m], direction and phase [rad] of the hills' waves, of equal steepness."""
+_WAVE_SLOPE = math.tan(math.radians(4.2))
+"""Of each at most; the median of all is 5.8 degrees."""
+_GYRO_SIGMA, _FORCE_SIGMA, _BIAS = 0.01, 0.1, np.array([0.002, -0.003, 0.0002])
+_START_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class HillDrive:
+    """What robot and truth say."""
+
+    robot: Robot
+    mounts: dict[str, Mount]
+    events: list[Event]
+    stamps_ns: np.ndarray
+    positions: FloatArray
+    """(N, 3) true, of the body's origin on the ground [m]."""
+    rotations: FloatArray
+    """(N, 3, 3) true ``world_R_body``."""
+
+
+def terrain(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Height of the hills [m]."""
+    total = np.zeros(np.broadcast(x, y).shape)
+    for wavelength, direction, phase in _WAVES:
+        k = 2.0 * math.pi / wavelength
+        total = total + _WAVE_SLOPE / k * np.sin(k * (math.cos(direction) * x + math.sin(direction) * y) + phase)
+    return np.asarray(total)
+
+
+def gradient(x: float, y: float) -> tuple[float, float]:
+    """Slope of the hills along x and y [-]."""
+    dx = dy = 0.0
+    for wavelength, direction, phase in _WAVES:
+        c, s = math.cos(direction), math.sin(direction)
+        steep = _WAVE_SLOPE * math.cos(2.0 * math.pi / wavelength * (c * x + s * y) + phase)
+        dx, dy = dx + c * steep, dy + s * steep
+    return dx, dy
+
+
+def rolling_drive(seconds: float, speed: float = 0.7, turn_rate: float = 0.3, seed: int = 1) -> HillDrive:
+    """A Husky that stands for 2 s, then drives along an arc and back, tangent to the ground, without slip; IMU at 100 Hz, wheels at 50."""
+    robot, rng, h = load_robot("husky_a200"), np.random.default_rng(seed), 0.01
+    mount = Mount(0.1, 0.0, 0.2)
+    poses = _roll(round(seconds / h) + 2, h, speed, turn_rate)
+    places = poses[:, :3, 3] + poses[:, :3, :3] @ [mount.x, mount.y, mount.z]
+    events: list[Event] = []
+    angles, half_track, radius = np.zeros(2), 0.5 * robot.geometry.track_width_m, robot.geometry.wheel_radius_m
+    stamps = _START_NS + np.round(np.arange(len(poses)) * h * 1e9).astype(np.int64)
+    for i in range(1, len(poses) - 1):
+        tangent = se3.log(se3.inverse(poses[i - 1]) @ poses[i]) / h
+        middle = poses[i, :3, :3]
+        turn = se3.log(se3.inverse(poses[i - 1]) @ poses[i + 1])[3:] / (2.0 * h)
+        own = (places[i + 1] - 2.0 * places[i] + places[i - 1]) / h**2
+        force = middle.T @ (own + np.array([0.0, 0.0, 9.81]))
+        noise = rng.normal(size=6) * np.repeat([_GYRO_SIGMA, _FORCE_SIGMA], 3)
+        events.append(ImuSample(int(stamps[i]), turn + _BIAS + noise[:3], force + noise[3:], "imu_link"))
+        rates = (tangent[0] + half_track * tangent[5] * np.array([-1.0, 1.0])) / radius
+        angles = angles + h * rates
+        if i % 2 == 0:
+            events.append(WheelSample(int(stamps[i]), rates, angles))
+    return HillDrive(robot, {"base_link": Mount(), "imu_link": mount}, events, stamps, poses[:, :3, 3], poses[:, :3, :3])
+
+
+def _roll(n: int, h: float, speed: float, turn_rate: float) -> FloatArray:
+    """(n, 4, 4) poses, ``h`` [s] apart."""
+    x = y = yaw = 0.0
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    for pose, t in zip(poses, np.arange(n) * h, strict=True):
+        dx, dy = gradient(x, y)
+        up = np.array([-dx, -dy, 1.0]) / math.sqrt(1.0 + dx * dx + dy * dy)
+        ahead = np.array([math.cos(yaw), math.sin(yaw), dx * math.cos(yaw) + dy * math.sin(yaw)])
+        ahead /= np.linalg.norm(ahead)
+        pose[:3, :3] = np.column_stack([ahead, np.cross(up, ahead), up])
+        pose[:3, 3] = x, y, float(terrain(np.array([x]), np.array([y]))[0])
+        ramp = min(max(t - 2.0, 0.0), 1.0)
+        x, y, yaw = x + h * ramp * speed * ahead[0], y + h * ramp * speed * ahead[1], yaw + h * ramp * turn_rate
+    return poses
