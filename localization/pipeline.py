@@ -90,7 +90,7 @@ class Pipeline:
         else:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
-            self.estimator = MapFusion(self.estimator, trial.prior)
+            self.estimator = MapFusion(self.estimator, trial.prior, is_recording=is_smoothing)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""

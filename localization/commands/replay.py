@@ -23,6 +23,7 @@ from localization.calibration.wheel_wiring import open_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator
+from localization.estimators.map_merge import merge
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import (
     ReferenceTrack,
@@ -49,6 +50,7 @@ from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import make_model
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
+from motion_models.se2 import FloatArray
 
 _WHEELLESS = "lidar"
 _HELD_OUT = (
@@ -92,6 +94,8 @@ class Replay:
     """About where the drive begins in `--map` [m, m, deg], as 3.5 -1.2 90; without it the whole map is searched."""
     save_map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """New file for the map of the last `graph` pair: `office.skidmap`. `skidloc map` shows and exports it."""
+    extend_map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """New file for `--map` with what this drive has found new or changed in it. The map itself stays as it is."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
     timing: bool = False
@@ -104,7 +108,7 @@ class Replay:
     def run(self, console: Console) -> None:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
-        check_outputs(self.out, self.json, self.save_map)
+        check_outputs(self.out, self.json, self.save_map, self.extend_map)
         log, wiring = open_checked(self.log, robot, self.topic.scored_against(self.reference))
         robot = log.robot
         has_lidar = log.sources.lidar is not None
@@ -120,6 +124,8 @@ class Replay:
             for form in check_forms(forms)[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
         ]
         self._check_map(has_lidar)
+        if self.extend_map is not None and self.map is None:
+            raise EstimatorError("--extend-map adds to a saved map. Name it by --map, or write a new one by --save-map.")
         reference, positions = self._reference(log), self._positions(log)
         held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
         # the LiDAR alone uses no motion model: it runs once, and counts for each
@@ -156,7 +162,11 @@ class Replay:
         )
         self._write(head, results, reference)
         if self.save_map is not None:
-            save_map(self.save_map, saved_map(runs, head, mounts, dataclasses.asdict(self.config)))
+            save_map(
+                self.save_map, saved_map([run for run in runs if run.estimator != LOCALIZER], head, mounts, dataclasses.asdict(self.config))
+            )
+        if self.extend_map is not None:
+            console.print(self._extend(self.extend_map, runs, head, mounts), markup=False, soft_wrap=True)
         self._print(console, head, results, reference)
 
     def _write(self, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
@@ -190,8 +200,24 @@ class Replay:
             raise EstimatorError("--initial-pose is three numbers x y yaw [m, m, deg] in a saved map. Name the map by --map.")
         if self.map is None:
             return None
-        initial = None if pose is None else np.array([pose[0], pose[1], math.radians(pose[2])])
-        return PriorMap(PlaceMap(load_map(self.map).map, self.config.estimator.lidar.range_noise_m), initial)
+        return PriorMap(PlaceMap(load_map(self.map).map, self.config.estimator.lidar.range_noise_m), self._initial())
+
+    def _initial(self) -> FloatArray | None:
+        """(3,) `--initial-pose` [m, m, rad]."""
+        pose = self.initial_pose
+        return None if pose is None else np.array([pose[0], pose[1], math.radians(pose[2])])
+
+    def _extend(self, path: Path, runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount]) -> str:
+        """Write the map with what is new in the drive, and return a sentence on it. Raises `MapError` where the drive does not fit."""
+        assert self.map is not None
+        old = load_map(self.map)
+        of_graph = [run for run in runs if run.estimator != LOCALIZER]
+        drive = saved_map(
+            of_graph if any(run.keyframes is not None for run in of_graph) else runs, head, mounts, dataclasses.asdict(self.config)
+        )
+        found = merge(old.map, drive.map, self.config.estimator.lidar.range_noise_m, only_new=True, initial=self._initial())
+        save_map(path, SavedMap(found.map, {"extended_from": [dict(old.provenance), dict(drive.provenance)]}))
+        return f"map: {found.added} of {len(drive.map.poses)} keyframes are new in '{path}', {found.closed} were found in '{self.map}'"
 
     def _check_map(self, has_lidar: bool) -> None:
         """Refuse `--save-map` before the run, where there will be no map."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +15,19 @@ import numpy as np
 from localization.estimators.base import Estimate, Estimator
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.events import Step
+from localization.maps import KeyframeMap
+from localization.maps.changes import Changes, find_changes
 from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from motion_models import se2
-from motion_models.se2 import Cov3, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
 """A keyframe follows when the robot has moved this far: scans of less are nearly the same evidence."""
 _LISTED_PLACES = 5
+_LEAST_CHANGED = 0.05
+"""Share of the walls that are changed, from which on it is a note: halves of fr079 and MIT-CSAIL differ by 0.005 to 0.03, by doors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,22 +39,37 @@ class PriorMap:
     """(3,) ``map_T_body`` [m, m, rad]; None for anywhere."""
 
 
+@dataclass(frozen=True, eq=False)
+class _DriveKeyframe:
+    stamp_ns: int
+    odometry: Pose2
+    points: Points2
+    lidar: FloatArray
+    pose: Pose2 | None
+    """(3,) in the map; None while that was not known."""
+
+
 class MapFusion(FilteredOdometry):
     """`EkfFusion` with a `Localizer` behind it."""
 
-    def __init__(self, odometry: Estimator, prior: PriorMap) -> None:
-        """``odometry``: an `EkfFusion` with a LiDAR."""
+    def __init__(self, odometry: Estimator, prior: PriorMap, is_recording: bool = False) -> None:
+        """``odometry``: an `EkfFusion` with a LiDAR. With ``is_recording``, the keyframes of the drive are kept, and `finish` compares
+        them with the map."""
         assert isinstance(odometry, EkfFusion)
         self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial, is_background=True)
+        self._end_ns = 0
         self._is_keyframe_due, self._has_key, self._summed_cov = False, False, np.zeros((3, 3))
         self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
         self._first_s: float | None = None
         self._n_losses, self._waiting_s = 0, 0.0
+        self._drive: list[_DriveKeyframe] | None = [] if is_recording else None
+        self._changes: Changes | None = None
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""
         self.run_deferred()
+        self._end_ns = step.end_ns
         estimate = self.odometry.step(step)
         self._count(step.duration)
         self._waiting_s += step.duration
@@ -78,6 +97,14 @@ class MapFusion(FilteredOdometry):
             self._summed_cov = np.zeros((3, 3))
             self._n_losses += was_localized and self.localizer.state == "lost"
             self._take_pose()
+            self._record()
+
+    def _record(self) -> None:
+        if self._drive is not None:
+            pose = self.localizer.pose if self.localizer.state == "localized" else None
+            self._drive.append(
+                _DriveKeyframe(self._end_ns, self.odometry.filter.pose, self.odometry.scan_points, self.odometry.lidar_position, pose)
+            )
 
     def _add_step(self) -> None:
         """Sum the covariance of the motion, step by step: the filter's, or that of the wheels where that is smaller."""
@@ -113,6 +140,32 @@ class MapFusion(FilteredOdometry):
         """The trajectory stays as it was published: nothing is smoothed."""
         self.run_deferred()
         self.localizer.finish_search()
+        found = self._keyframes(True)
+        if found is not None and len(found.points):
+            self._changes = find_changes(self.localizer.places, found)
+
+    def keyframe_map(self) -> KeyframeMap | None:
+        """The drive's keyframes in the map's frame, by the odometry; None where they were not kept."""
+        return self._keyframes(False)
+
+    def _keyframes(self, is_localized: bool) -> KeyframeMap | None:
+        """Those that were localized at the places where they were, or all by the odometry."""
+        keys = [key for key in self._drive or () if key.pose is not None or not is_localized]
+        if not keys:
+            return None
+        poses = [key.pose if is_localized and key.pose is not None else se2.compose(self._map_T_odom, key.odometry) for key in keys]
+        return KeyframeMap(
+            stamps_ns=np.array([key.stamp_ns for key in keys], dtype=np.int64),
+            poses=np.array(poses),
+            covariances=np.zeros((len(keys), 3, 3)),
+            points=np.vstack([key.points for key in keys]).astype(np.float32),
+            counts=np.array([len(key.points) for key in keys], dtype=np.int64),
+            sensors=np.array([key.lidar for key in keys]),
+            edges=np.empty((0, 2), np.int64),
+            edge_deltas=np.empty((0, 3)),
+            edge_information=np.empty((0, 3, 3)),
+            edge_is_loop=np.empty(0, dtype=bool),
+        )
 
     def localization(self) -> Mapping[str, Any]:
         """State, probability and places in the saved map so far, as JSON holds them."""
@@ -125,6 +178,7 @@ class MapFusion(FilteredOdometry):
             "first_localized_s": self._first_s,
             "losses": self._n_losses,
             "places": [{"pose": place.pose.tolist(), "probability": place.probability} for place in places],
+            **({} if self._changes is None else _as_json(self._changes)),
         }
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
@@ -149,7 +203,7 @@ class MapFusion(FilteredOdometry):
                 f"the place in the map was lost {self._n_losses} times, for {unknown:.0f} of {total:.0f} s, and is {state} at the end: "
                 "poses of that time are by odometry alone. The robot was carried, or the map is out of date."
             )
-        return found
+        return [*found, *([] if self._changes is None else _describe(self._changes))]
 
     def occupancy(self) -> Grid:
         """The saved map."""
@@ -158,3 +212,20 @@ class MapFusion(FilteredOdometry):
     def map_points(self) -> Points2:
         """(M, 2) points of the saved map [m]."""
         return self.localizer.map_points()
+
+
+def _as_json(changes: Changes) -> dict[str, Any]:
+    return {"changed_share": changes.changed_share, "changes": [asdict(change) for change in changes.places]}
+
+
+def _describe(changes: Changes) -> list[str]:
+    """A sentence on the places where the map no longer fits, where they are more than scattered cells."""
+    if changes.changed_share < _LEAST_CHANGED:
+        return []
+    named = [f"{c.kind} at x {c.x:.1f} m, y {c.y:.1f} m ({c.size_m:.1f} m)" for c in changes.places[:_LISTED_PLACES]]
+    rest = len(changes.places) - len(named)
+    more = f", and {rest} more" if rest else ""
+    return [
+        f"the map no longer fits at {len(changes.places)} places, {100 * changes.changed_share:.0f} % of the walls that were seen: "
+        f"{'; '.join(named)}{more}. --extend-map writes a map with them."
+    ]

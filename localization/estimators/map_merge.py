@@ -1,17 +1,20 @@
-"""Join the map of a second drive to that of a first one: its keyframes are localized in the first map, and a graph ties them to it."""
+"""Join the map of a second drive to that of a first one, or what is new in it: its keyframes are localized in the first map, and a graph
+ties them to it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from localization.errors import MapError
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph
 from localization.maps import KeyframeMap
+from localization.maps.changes import adds_to, find_changes
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
+from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
@@ -33,11 +36,16 @@ class Merged:
     """(closed,) how far their scans are from the first map, where the merged map has them [m]."""
     bent: FloatArray
     """(closed,) how far the second map, moved as a whole, is from where the merged one has these keyframes [m]."""
+    added: int
+    """Keyframes of the second map that the merged one has."""
 
 
-def merge(first: KeyframeMap, second: KeyframeMap, range_noise_m: float) -> Merged:
-    """``second`` in the frame of ``first``. ``range_noise_m``: sigma of a range [m]. Raises `MapError` if they share no place."""
-    closures = _closures(PlaceMap(first, range_noise_m), second)
+def merge(first: KeyframeMap, second: KeyframeMap, range_noise_m: float, only_new: bool = False, initial: Pose2 | None = None) -> Merged:
+    """``second`` in the frame of ``first``. ``range_noise_m``: sigma of a range [m]. With ``only_new``, of the second its keyframes alone
+    that add to the first, with all ties among these. ``initial`` (3,): about where the second begins in the first. Raises `MapError` if
+    they share no place."""
+    places = PlaceMap(first, range_noise_m)
+    closures = _closures(places, second, initial)
     if len(closures) < _LEAST_CLOSURES:
         raise MapError(
             f"the second map could not be joined to the first: {len(closures)} of its {len(second.poses)} keyframes were found there, and "
@@ -49,14 +57,17 @@ def merge(first: KeyframeMap, second: KeyframeMap, range_noise_m: float) -> Merg
     moved = se2.align_points(second.poses[keys, :2], poses[keys, :2])
     errors = np.hypot(*(poses[keys, :2] - measured[:, :2]).T)
     bent = np.hypot(*(se2.transform(moved, second.poses[keys, :2]) - poses[keys, :2]).T)
-    return Merged(_join(first, second, poses, covs, closures), len(keys), errors, bent)
+    kept = _new_keyframes(places, second, poses) if only_new else np.arange(len(second.poses))
+    ties = {i: closures[k] for i, k in enumerate(kept.tolist()) if k in closures}
+    joined = _join(first, second.select(kept), poses[kept], covs[kept], ties)
+    return Merged(joined, len(keys), errors, bent, len(kept))
 
 
-def _closures(places: PlaceMap, second: KeyframeMap) -> dict[int, tuple[Pose2, Cov3]]:
+def _closures(places: PlaceMap, second: KeyframeMap, initial: Pose2 | None) -> dict[int, tuple[Pose2, Cov3]]:
     """Pose (3,) in the first map and covariance (3, 3), by keyframe of the ``second``: forwards, and for its beginning backwards."""
     scans, found = second.scans(), {}
-    for order in (range(len(scans)), range(len(scans) - 1, -1, -1)):
-        localizer, before = Localizer(places), second.poses[order[0]]
+    for order, near in ((range(len(scans)), initial), (range(len(scans) - 1, -1, -1), None)):
+        localizer, before = Localizer(places, near), second.poses[order[0]]
         for k in order:
             localizer.add(second.poses[k], scans[k], se2.between(before, second.poses[k]), _RELATIVE_COV)
             before = second.poses[k]
@@ -97,20 +108,29 @@ def _join(
     """Both as one, tied by ``closures`` to the nearest keyframes of the first."""
     n = len(first.poses)
     nearest = [int(np.argmin(np.hypot(*(first.poses[:, :2] - pose[:2]).T))) for pose, _ in closures.values()]
-    ties = [se2.between(first.poses[j], pose) for j, (pose, _) in zip(nearest, closures.values(), strict=True)]
-    map_covs = np.array([_at(first.poses[j], first.covariances[j], pose) for j, pose in zip(_nearest(first, poses), poses, strict=True)])
+    ties = np.array([se2.between(first.poses[j], pose) for j, (pose, _) in zip(nearest, closures.values(), strict=True)]).reshape(-1, 3)
+    information = np.array([np.linalg.inv(cov) for _, cov in closures.values()]).reshape(-1, 3, 3)
+    map_covs = [_at(first.poses[j], first.covariances[j], pose) for j, pose in zip(_nearest(first, poses), poses, strict=True)]
     return KeyframeMap(
         stamps_ns=np.r_[first.stamps_ns, second.stamps_ns],
         poses=np.vstack([first.poses, poses]),
-        covariances=np.vstack([first.covariances, covs + map_covs]),
+        covariances=np.vstack([first.covariances, covs + np.array(map_covs).reshape(-1, 3, 3)]),
         points=np.vstack([first.points, second.points]),
         counts=np.r_[first.counts, second.counts],
         sensors=np.vstack([first.sensors, second.sensors]),
-        edges=np.vstack([first.edges, second.edges + n, np.column_stack([nearest, np.array(list(closures)) + n])]),
+        edges=np.vstack(
+            [first.edges, second.edges + n, *(np.array([[j, k + n]], dtype=np.int64) for j, k in zip(nearest, closures, strict=True))]
+        ),
         edge_deltas=np.vstack([first.edge_deltas, second.edge_deltas, ties]),
-        edge_information=np.vstack([first.edge_information, second.edge_information, [np.linalg.inv(cov) for _, cov in closures.values()]]),
+        edge_information=np.vstack([first.edge_information, second.edge_information, information]),
         edge_is_loop=np.r_[first.edge_is_loop, second.edge_is_loop, np.ones(len(closures), dtype=bool)],
     )
+
+
+def _new_keyframes(places: PlaceMap, second: KeyframeMap, poses: FloatArray) -> IntArray:
+    """Keyframes of the ``second`` map, at ``poses`` (K, 3) in the first, that have what the first does not have."""
+    changes = find_changes(places, replace(second, poses=poses))
+    return np.array([k for k, scan in enumerate(second.scans()) if adds_to(places, changes, poses[k], scan)], dtype=np.int64)
 
 
 def _nearest(mapped: KeyframeMap, poses: FloatArray) -> list[int]:

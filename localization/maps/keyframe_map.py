@@ -46,3 +46,21 @@ class KeyframeMap:
         """(M, 2) all points in the map's frame [m]."""
         moved = [se2.transform(pose, scan) for pose, scan in zip(self.poses, self.scans(), strict=True) if len(scan)]
         return np.vstack(moved) if moved else np.empty((0, 2))
+
+    def select(self, kept: IntArray) -> KeyframeMap:
+        """The keyframes ``kept`` (N,) in their order, with the motions between these alone."""
+        number, scans = {int(k): i for i, k in enumerate(kept)}, self.scans()
+        is_kept = np.array([a in number and b in number for a, b in self.edges.tolist()], dtype=bool)
+        edges = [[number[a], number[b]] for a, b in self.edges[is_kept].tolist()]
+        return KeyframeMap(
+            stamps_ns=self.stamps_ns[kept],
+            poses=self.poses[kept],
+            covariances=self.covariances[kept],
+            points=np.vstack([np.empty((0, 2)), *(scans[k] for k in kept)]).astype(np.float32),
+            counts=self.counts[kept],
+            sensors=self.sensors[kept],
+            edges=np.array(edges, dtype=np.int64).reshape(-1, 2),
+            edge_deltas=self.edge_deltas[is_kept],
+            edge_information=self.edge_information[is_kept],
+            edge_is_loop=self.edge_is_loop[is_kept],
+        )

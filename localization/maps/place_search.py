@@ -24,7 +24,7 @@ CELL_M = 0.1
 """Cell of the search's image and of the grid that divides space into walls, free and unknown [m]."""
 _SURFACE_CELL_M = 0.08
 """Voxel of the surfaces that scans are aligned with [m]."""
-_CERTAINLY_FREE = 0.125
+CERTAINLY_FREE = 0.125
 """Probability below which a cell contradicts a tracked place: four passes. With two, walls that a map has by few, slanting beams have up to
 0.3 of the points of a right place in free space (ACES, halves); with four, 0.13."""
 _SEARCH_POINTS = 150
@@ -59,7 +59,7 @@ class Place:
     in_free: float
     """Share of the points that lie in space that is free in the map; the others are where the map is unknown."""
     contradicting: float
-    """Share of the points that lie in space that is free for certain (`_CERTAINLY_FREE`)."""
+    """Share of the points that lie in space that is free for certain (`CERTAINLY_FREE`)."""
 
     @property
     def residual_variance(self) -> float:
@@ -80,7 +80,8 @@ class PlaceMap:
         arrays = (keyframes.poses, keyframes.covariances, keyframes.points)
         self.fingerprint = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:12]
         self.grid: Grid = draw_grid(keyframes, CELL_M)
-        self._certain = draw_grid(keyframes, CELL_M, _CERTAINLY_FREE)
+        self.certain_grid: Grid = draw_grid(keyframes, CELL_M, CERTAINLY_FREE)
+        """The same, free where a tracked place is contradicted."""
         points = keyframes.points_in_map()
         index = np.floor((points - self.grid.origin) / CELL_M).astype(np.int64)
         walls = points[self.grid.cells[index[:, 1], index[:, 0]] == 100]  # without what moved
@@ -113,6 +114,11 @@ class PlaceMap:
         is_free = self._grid_values(centres).reshape(rows, columns) == 0
         scores = np.maximum(fine, np.where(is_free, 0.0, _UNKNOWN_SCORE).astype(fine.dtype))
         return scores, reduce_image(scores)
+
+    def is_unknown(self, points: Points2) -> NDArray[np.bool_]:
+        """(N,) whether each of ``points`` (N, 2) is in space that the map does not have, and not beside a wall."""
+        is_near = _look_up(self._walls.levels[0], points - self._walls.origin) >= _NEAR
+        return np.asarray((self._grid_values(points) == -1) & ~is_near)
 
     def _grid_values(self, points: Points2) -> FloatArray:
         return _look_up(self.grid.cells.T, points - self.grid.origin, -1)
@@ -175,7 +181,7 @@ class PlaceMap:
         moved = np.asarray(se2.transform(fit.pose, points))
         is_near = _look_up(self._walls.levels[0], moved - self._walls.origin) >= _NEAR
         values = self._grid_values(moved)
-        certain = _look_up(self._certain.cells.T, moved - self._certain.origin, -1)
+        certain = _look_up(self.certain_grid.cells.T, moved - self.certain_grid.origin, -1)
         shares = [float((~is_near & (cells == 0)).mean()) for cells in (values, certain)]
         return Place(fit.pose, fit, float(is_near.mean()), *shares)
 

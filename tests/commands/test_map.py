@@ -102,6 +102,28 @@ def test_replay_in_its_own_map_near_a_pose_is_localized(log: Path, saved: Path, 
     assert "localization" not in estimator
 
 
+def test_replay_extend_map_of_the_same_room_adds_little_and_keeps_the_old_file(log: Path, saved: Path, tmp_path: Path) -> None:
+    before, extended = saved.read_bytes(), tmp_path / "extended.skidmap"
+    assert (
+        replay(log, tmp_path / "out", "--estimator", "graph", "--map", saved, "--initial-pose", 0.3, 0.1, 6, "--extend-map", extended) == 0
+    )
+    old, new = load_map(saved).map, load_map(extended)
+    assert len(old.poses) <= len(new.map.poses) < 1.5 * len(old.poses)
+    assert len(new.provenance["extended_from"]) == 2
+    assert saved.read_bytes() == before
+    assert localization(tmp_path / "out")["changed_share"] < 0.05
+
+
+def test_replay_extend_map_by_another_building_writes_nothing(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    office, extended = tmp_path / "office.skidmap", tmp_path / "extended.skidmap"
+    save_map(office, SavedMap(floor_plan.make_map(), {}))
+    before = office.read_bytes()
+    assert replay(log, tmp_path / "out", "--estimator", "map", "--map", office, "--extend-map", extended) == 2
+    assert "could not be joined" in capsys.readouterr().err
+    assert office.read_bytes() == before
+    assert not extended.exists()
+
+
 def test_replay_in_another_buildings_map_is_never_localized(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_map(tmp_path / "office.skidmap", SavedMap(floor_plan.make_map(), {}))
     assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", tmp_path / "office.skidmap") == 0
@@ -117,6 +139,7 @@ def test_replay_in_another_buildings_map_is_never_localized(log: Path, tmp_path:
         (["--estimator", "map"], "--map"),
         (["--initial-pose", "1", "2", "3"], "--map"),
         (["--map", "missing.skidmap"], "no map 'missing.skidmap'"),
+        (["--extend-map", "more.skidmap"], "--map"),
     ],
 )
 def test_replay_without_a_map_to_localize_in_exits_with_2(

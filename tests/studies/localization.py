@@ -50,15 +50,6 @@ class Start:
     search_s: float
 
 
-def part(keyframes: KeyframeMap, ids: np.ndarray) -> KeyframeMap:
-    """The keyframes ``ids`` of a map, without edges."""
-    scans = keyframes.scans()
-    rows = {name: getattr(keyframes, name)[ids] for name in ("stamps_ns", "poses", "covariances", "counts", "sensors")}
-    edges = {"edges": np.empty((0, 2), np.int64), "edge_deltas": np.empty((0, 3)), "edge_information": np.empty((0, 3, 3))}
-    points = np.vstack([scans[i] for i in ids]).astype(np.float32)
-    return KeyframeMap(**rows, **edges, points=points, edge_is_loop=np.empty(0, bool))
-
-
 def dense_map(drive: Drive) -> KeyframeMap:
     """Keyframes every 0.3 m of the smoothed graph of the whole log."""
     pair = Trial(make_model("diff_drive", drive.robot), "graph")
@@ -101,7 +92,7 @@ def starts(maps: dict[str, KeyframeMap], map_name: str, name: str, n: int, secon
     """``n`` starts in each half of building ``name``, in the map of the other half of ``map_name``."""
     found, rng = [], np.random.default_rng(1)
     for i in (0, 1):
-        places = PlaceMap(part(maps[map_name], halves(maps[map_name])[i][::_MAP_STRIDE]), 0.02)
+        places = PlaceMap(maps[map_name].select(halves(maps[map_name])[i][::_MAP_STRIDE]), 0.02)
         keyframes, scans = maps[name], maps[name].scans()
         ids = halves(keyframes)[1 - i]
         for k in rng.integers(ids[0], ids[-1] - 20, size=n):
@@ -146,7 +137,7 @@ def reliability(found: Sequence[Start]) -> str:
 
 def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i, of which every 40 s the next 30 s are cut out: the robot is carried on meanwhile."""
-    places = PlaceMap(part(keyframes, halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
+    places = PlaceMap(keyframes.select(halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
     ids = halves(keyframes)[1 - i]
     begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
     pipeline = Pipeline(Trial(make_model("diff_drive", drive.robot), "map", prior=PriorMap(places)), drive.robot, drive.mounts, True)
@@ -183,7 +174,7 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
 
 def drive_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i: errors while localized, times, and the cost against the filter's alone."""
-    places = PlaceMap(part(keyframes, halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
+    places = PlaceMap(keyframes.select(halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
     ids = halves(keyframes)[1 - i]
     begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
     model = make_model("diff_drive", drive.robot)
