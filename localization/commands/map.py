@@ -63,6 +63,26 @@ class MapExport:
 
 
 @dataclass(frozen=True)
+class MapView:
+    """Write a page that shows a map in a browser: its grid, keyframes with their sigma, and loop closures."""
+
+    file: tyro.conf.Positional[Path]
+    """Map written by `skidloc replay --save-map`."""
+    out: Path
+    """New .html file, which needs no network."""
+
+    def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` for input that cannot be used."""
+        from localization.report.map_page import map_page
+        from localization.report.page import write_new
+
+        check_outputs(self.out)
+        saved = load_map(self.file)
+        write_new(self.out, map_page(self.file.name, saved.map, _lines(summary(saved)), saved.provenance).encode())
+        print_line(console, f"page: {self.out}")
+
+
+@dataclass(frozen=True)
 class MapMerge:
     """Join the map of a second drive to that of a first one, in whose frame it then is, and show how well both agree."""
 
@@ -89,11 +109,12 @@ class MapMerge:
 
 @dataclass(frozen=True)
 class Map:
-    """Show a saved map, export it for planners and viewers, or join two."""
+    """Show a saved map, in words or in a browser, export it for planners and viewers, or join two."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[MapInfo, tyro.conf.subcommand("info")]
         | Annotated[MapExport, tyro.conf.subcommand("export")]
+        | Annotated[MapView, tyro.conf.subcommand("view")]
         | Annotated[MapMerge, tyro.conf.subcommand("merge")]
     ]
 

@@ -21,7 +21,7 @@ from rich.table import Table
 from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
 from localization.calibration.wheel_wiring import open_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
-from localization.errors import EstimatorError, EvaluationError
+from localization.errors import EstimatorError, EvaluationError, MapError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator
 from localization.estimators.map_merge import merge
 from localization.evaluation.reference_files import load_reference
@@ -211,6 +211,8 @@ class Replay:
         """Write the map with what is new in the drive, and return a sentence on it. Raises `MapError` where the drive does not fit."""
         assert self.map is not None
         old = load_map(self.map)
+        if all(run.keyframes is None for run in runs):
+            raise MapError(f"nothing was added to the map '{self.map}': the drive was never localized in it. Give --initial-pose.")
         of_graph = [run for run in runs if run.estimator != LOCALIZER]
         drive = saved_map(
             of_graph if any(run.keyframes is not None for run in of_graph) else runs, head, mounts, dataclasses.asdict(self.config)

@@ -42,7 +42,6 @@ class PriorMap:
 @dataclass(frozen=True, eq=False)
 class _DriveKeyframe:
     stamp_ns: int
-    odometry: Pose2
     points: Points2
     lidar: FloatArray
     pose: Pose2 | None
@@ -102,9 +101,7 @@ class MapFusion(FilteredOdometry):
     def _record(self) -> None:
         if self._drive is not None:
             pose = self.localizer.pose if self.localizer.state == "localized" else None
-            self._drive.append(
-                _DriveKeyframe(self._end_ns, self.odometry.filter.pose, self.odometry.scan_points, self.odometry.lidar_position, pose)
-            )
+            self._drive.append(_DriveKeyframe(self._end_ns, self.odometry.scan_points, self.odometry.lidar_position, pose))
 
     def _add_step(self) -> None:
         """Sum the covariance of the motion, step by step: the filter's, or that of the wheels where that is smaller."""
@@ -140,27 +137,22 @@ class MapFusion(FilteredOdometry):
         """The trajectory stays as it was published: nothing is smoothed."""
         self.run_deferred()
         self.localizer.finish_search()
-        found = self._keyframes(True)
+        found = self.keyframe_map()
         if found is not None and len(found.points):
             self._changes = find_changes(self.localizer.places, found)
 
     def keyframe_map(self) -> KeyframeMap | None:
-        """The drive's keyframes in the map's frame, by the odometry; None where they were not kept."""
-        return self._keyframes(False)
-
-    def _keyframes(self, is_localized: bool) -> KeyframeMap | None:
-        """Those that were localized at the places where they were, or all by the odometry."""
-        keys = [key for key in self._drive or () if key.pose is not None or not is_localized]
+        """The drive's keyframes where they were localized in the map; None without such, or where they were not kept."""
+        keys = [(key, key.pose) for key in self._drive or () if key.pose is not None]
         if not keys:
             return None
-        poses = [key.pose if is_localized and key.pose is not None else se2.compose(self._map_T_odom, key.odometry) for key in keys]
         return KeyframeMap(
-            stamps_ns=np.array([key.stamp_ns for key in keys], dtype=np.int64),
-            poses=np.array(poses),
+            stamps_ns=np.array([key.stamp_ns for key, _ in keys], dtype=np.int64),
+            poses=np.array([pose for _, pose in keys]),
             covariances=np.zeros((len(keys), 3, 3)),
-            points=np.vstack([key.points for key in keys]).astype(np.float32),
-            counts=np.array([len(key.points) for key in keys], dtype=np.int64),
-            sensors=np.array([key.lidar for key in keys]),
+            points=np.vstack([key.points for key, _ in keys]).astype(np.float32),
+            counts=np.array([len(key.points) for key, _ in keys], dtype=np.int64),
+            sensors=np.array([key.lidar for key, _ in keys]),
             edges=np.empty((0, 2), np.int64),
             edge_deltas=np.empty((0, 3)),
             edge_information=np.empty((0, 3, 3)),

@@ -112,8 +112,8 @@ def _on_common_cells(*grids: Grid) -> list[NDArray[np.int8]]:
     last, found = grids[-1], []
     for grid in grids:
         dx, dy = (round((a - b) / CELL_M) for a, b in zip(last.origin, grid.origin, strict=True))
-        common = np.full(last.cells.shape, -1, np.int8)
-        rows, columns = np.arange(common.shape[0]) + dy, np.arange(common.shape[1]) + dx
+        common: NDArray[np.int8] = np.full(last.cells.shape, -1, np.int8)
+        rows, columns = (np.arange(n) + shift for n, shift in zip(last.cells.shape, (dy, dx), strict=True))
         in_rows, in_columns = (rows >= 0) & (rows < grid.cells.shape[0]), (columns >= 0) & (columns < grid.cells.shape[1])
         common[np.ix_(in_rows, in_columns)] = grid.cells[np.ix_(rows[in_rows], columns[in_columns])]
         found.append(common)
@@ -130,8 +130,8 @@ def _places(mask: NDArray[np.bool_], kind: Literal["new", "gone"], grid: Grid) -
     for i in range(1, n + 1):
         centres = _centres(mask & (labels == i), grid)
         if len(centres) >= _LEAST_CELLS:
-            (x, y), extent = centres.mean(axis=0), np.ptp(centres, axis=0) + CELL_M
-            found.append(Change(kind, round(float(x), 2), round(float(y), 2), round(float(np.hypot(*extent)), 2), len(centres)))
+            middle, extent = centres.mean(axis=0).round(2).tolist(), np.ptp(centres, axis=0) + CELL_M
+            found.append(Change(kind, middle[0], middle[1], round(float(np.hypot(*extent)), 2), len(centres)))
     return found
 
 

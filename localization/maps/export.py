@@ -25,7 +25,7 @@ def exports(grid: Grid, mapped: KeyframeMap) -> dict[str, bytes]:
     return {
         "map.pgm": b"P5\n# %.3f m/pix\n%d %d\n255\n" % (grid.resolution, width, height) + image.tobytes(),
         "map.yaml": _yaml("map.pgm", grid).encode(),
-        "map.png": _png(image),
+        "map.png": png(grid),
         "map.ply": _ply(mapped.points_in_map().astype("<f4")),
     }
 
@@ -52,8 +52,9 @@ def _yaml(image: str, grid: Grid) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _png(image: NDArray[np.uint8]) -> bytes:
+def png(grid: Grid) -> bytes:
     """Grey PNG of 8 bits (ISO 15948): each row begins with filter 0."""
+    image = _image(grid)
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

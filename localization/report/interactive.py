@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from localization.evaluation.references import ReferenceTrack, Relations
+from localization.maps.grid import Grid
 from localization.report.page import Explorer
 from localization.report.runs import PlottedRun, map_view, run_with_map, thin_series, timeline
 from localization.trajectory import IntArray
@@ -46,14 +47,14 @@ def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
         "runs": [_run(run, start_ns, most, track) for run in runs if len(run.result.run.trajectory)],
         "borders": _borders(runs, reference),
         "reference": None if track is None else _reference(track, start_ns),
-        "map": {"x": _numbers(points[:, 0], 2), "y": _numbers(points[:, 1], 2), "run": "" if drawn is None else drawn.label},
+        "map": {"x": numbers(points[:, 0], 2), "y": numbers(points[:, 1], 2), "run": "" if drawn is None else drawn.label},
     }
 
 
 def _borders(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> dict[str, list[float | None]]:
     """Part of the plane that the map shows at first [m]: runs that diverged do not set its scale."""
     view = map_view(runs, reference)
-    return {axis: _numbers([view.low[i], view.high[i]], 2) for i, axis in enumerate("xy")}
+    return {axis: numbers([view.low[i], view.high[i]], 2) for i, axis in enumerate("xy")}
 
 
 def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None) -> dict[str, Any]:
@@ -69,12 +70,12 @@ def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None
         "number": run.number,
         "colour": run.colour,
         "dash": ",".join(f"{1.8 * d:g}px" for d in run.dashes) or "solid",
-        "t": _numbers(t[keep], 2),
-        "x": _numbers(poses[keep, 0], _MILLIMETRES),
-        "y": _numbers(poses[keep, 1], _MILLIMETRES),
-        "heading": _numbers(np.degrees(poses[keep, 2]), _TENTHS),
-        "way": _numbers(way[keep], 2),
-        "sigma": None if sigma is None else _numbers(sigma[keep], 4),
+        "t": numbers(t[keep], 2),
+        "x": numbers(poses[keep, 0], _MILLIMETRES),
+        "y": numbers(poses[keep, 1], _MILLIMETRES),
+        "heading": numbers(np.degrees(poses[keep, 2]), _TENTHS),
+        "way": numbers(way[keep], 2),
+        "sigma": None if sigma is None else numbers(sigma[keep], 4),
         "errors": _errors(run, t, way, most, track),
         "nis": _innovations(run, t),
         "loops": _loops(run),
@@ -91,10 +92,10 @@ def _errors(run: PlottedRun, t: FloatArray, way: FloatArray, most: int, track: R
     keep = np.unique(np.r_[thin_series(line.position_m, most), len(line.seconds) - 1])
     seconds = line.seconds + t[0]
     return {
-        "t": _numbers(seconds[keep], 2),
-        "way": _numbers(np.interp(seconds[keep], t, way), 2),
-        "position": _numbers(line.position_m[keep], 4),
-        "heading": None if line.heading_deg is None else _numbers(np.abs(line.heading_deg[keep]), 3),
+        "t": numbers(seconds[keep], 2),
+        "way": numbers(np.interp(seconds[keep], t, way), 2),
+        "position": numbers(line.position_m[keep], 4),
+        "heading": None if line.heading_deg is None else numbers(np.abs(line.heading_deg[keep]), 3),
         "start": None if track is None or track.yaws is None else _start_errors(run, track, keep),
     }
 
@@ -107,8 +108,8 @@ def _start_errors(run: PlottedRun, track: ReferenceTrack, keep: IntArray) -> dic
     truth = track.poses[np.searchsorted(track.stamps_ns, series.stamps_ns)]
     aligned = se2.compose(se2.compose(truth[0], se2.inverse(series.estimate[0])), series.estimate)[keep]
     return {
-        "position": _numbers(np.hypot(*(aligned[:, :2] - truth[keep, :2]).T), 4),
-        "heading": _numbers(np.abs(np.degrees(se2.wrap_angle(aligned[:, 2] - truth[keep, 2]))), 3),
+        "position": numbers(np.hypot(*(aligned[:, :2] - truth[keep, :2]).T), 4),
+        "heading": numbers(np.abs(np.degrees(se2.wrap_angle(aligned[:, 2] - truth[keep, 2]))), 3),
     }
 
 
@@ -119,7 +120,7 @@ def _innovations(run: PlottedRun, t: FloatArray) -> dict[str, Any] | None:
     if not len(use):
         return None
     groups = np.array_split(use, min(_MOST_MEANS, len(use)))
-    return {"t": _numbers([t[g].mean() for g in groups], 2), "nis": _numbers([nis[g].mean() for g in groups], 3)}
+    return {"t": numbers([t[g].mean() for g in groups], 2), "nis": numbers([nis[g].mean() for g in groups], 3)}
 
 
 def _loops(run: PlottedRun) -> list[list[float | None]]:
@@ -131,7 +132,7 @@ def _loops(run: PlottedRun) -> list[list[float | None]]:
     edges = found.edges[found.edge_is_loop][:_MOST_LOOPS]
     poses = run.placed(found.poses)
     return [
-        [*_numbers(np.r_[poses[a, :2], poses[b, :2]], 2), round(float(found.stamps_ns[max(a, b)] - start_ns) * 1e-9, 2)] for a, b in edges
+        [*numbers(np.r_[poses[a, :2], poses[b, :2]], 2), round(float(found.stamps_ns[max(a, b)] - start_ns) * 1e-9, 2)] for a, b in edges
     ]
 
 
@@ -144,22 +145,22 @@ def _lost(run: PlottedRun, t: FloatArray) -> list[list[float | None]]:
     found = [[float(matched[i]), float(matched[i + 1])] for i in gaps]
     if t[-1] - matched[-1] > _LOST_AFTER_S:
         found.append([float(matched[-1]), float(t[-1])])
-    return [_numbers(np.array(pair), 2) for pair in found]
+    return [numbers(np.array(pair), 2) for pair in found]
 
 
 def _history(rows: FloatArray, start_ns: int) -> dict[str, list[float | None]]:
     """Mean and sigma over time of one estimated parameter; three digits of its final sigma."""
     rows = rows[_evenly(len(rows), _MOST_MEANS)]
     digits = int(np.clip(2.0 - np.floor(np.log10(max(float(rows[-1, 2]), 1e-9))), 0, 9))
-    return {"t": _numbers(rows[:, 0] - start_ns * 1e-9, 2), "mean": _numbers(rows[:, 1], digits), "sigma": _numbers(rows[:, 2], digits)}
+    return {"t": numbers(rows[:, 0] - start_ns * 1e-9, 2), "mean": numbers(rows[:, 1], digits), "sigma": numbers(rows[:, 2], digits)}
 
 
 def _reference(track: ReferenceTrack, start_ns: int) -> dict[str, Any]:
     keep = _evenly(len(track.stamps_ns), _MOST_POINTS // 2)
     return {
-        "t": _numbers((track.stamps_ns[keep] - start_ns) * 1e-9, 2),
-        "x": _numbers(track.positions[keep, 0], _MILLIMETRES),
-        "y": _numbers(track.positions[keep, 1], _MILLIMETRES),
+        "t": numbers((track.stamps_ns[keep] - start_ns) * 1e-9, 2),
+        "x": numbers(track.positions[keep, 0], _MILLIMETRES),
+        "y": numbers(track.positions[keep, 1], _MILLIMETRES),
     }
 
 
@@ -168,7 +169,13 @@ def _evenly(count: int, most: int) -> IntArray:
     return np.linspace(0, max(count - 1, 0), min(most, count)).astype(np.int64)
 
 
-def _numbers(values: ArrayLike, digits: int) -> list[float | None]:
+def grid_layer(grid: Grid, url: str) -> dict[str, Any]:
+    """The picture of ``grid`` at ``url``, as the map of the page is drawn over it."""
+    height, width = (cells * grid.resolution for cells in grid.cells.shape)
+    return {"source": url, "left": grid.origin[0], "top": grid.origin[1] + height, "width": width, "height": height}
+
+
+def numbers(values: ArrayLike, digits: int) -> list[float | None]:
     """Rounded; what is not finite is null."""
     rounded = np.round(np.asarray(values, dtype=float), digits)
     return [float(v) if np.isfinite(v) else None for v in rounded]

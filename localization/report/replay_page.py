@@ -16,6 +16,7 @@ from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
 from localization.report.interactive import explorer
+from localization.report.map_page import change_blocks, grid_figure, picture_grid
 from localization.report.page import (
     Block,
     Cell,
@@ -127,11 +128,21 @@ def _sections(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations 
         Section("Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), Paragraph(notes, is_small=True)]),
         Section("Explore", explore),
         Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
+        Section("Map", _grid_blocks(runs)),
         Section("Errors", _error_figure(runs, reference), is_static=bool(explore) and not isinstance(reference, Relations)),
         Section("Innovations: are the covariances consistent?", _nis_figure(runs), is_static=bool(explore)),
         Section("Estimated parameters", _with_note(parameter_table(runs), "Mean ± sigma at the end of the drive.")),
         Section("Counts", _with_note(count_table(runs), "")),
     ]
+
+
+def _grid_blocks(runs: Sequence[PlottedRun]) -> list[Block]:
+    """The grid of the last map of a graph, or of a drive in a saved map; and what of the saved map has changed."""
+    mapped = [run.result.run for run in runs if run.result.run.keyframes is not None and len(run.result.run.keyframes.points)]
+    if not mapped or mapped[-1].keyframes is None:
+        return []
+    found = mapped[-1].localization or {}
+    return [grid_figure(picture_grid(mapped[-1].keyframes), found.get("changes", ())), *change_blocks(found)]
 
 
 def _with_note(table: Table | None, note: str) -> list[Block]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +69,24 @@ def test_map_export_writes_a_folder_once(saved: Path, tmp_path: Path, capsys: py
     assert "exists already" in capsys.readouterr().err
 
 
+def test_map_view_is_one_page_with_grid_keyframes_and_loops(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "room.html"
+    assert main(["map", "view", str(saved), "--out", str(page)]) == 0
+    text = page.read_text()
+    assert not re.findall(r"<(?:script|link|img)[^>]* (?:src|href)=", text)
+    data = json.loads(text.split('id="explore-data">')[1].split("</script>")[0])
+    (drive,) = data["runs"]
+    expected = load_map(saved).map
+    np.testing.assert_allclose(drive["x"], expected.poses[:, 0], atol=1e-3)
+    assert len(drive["loops"]) == expected.edge_is_loop.sum()
+    picture = Image.open(io.BytesIO(base64.b64decode(data["grid"]["source"].split(",")[1])))
+    assert picture.width * 0.05 == pytest.approx(data["grid"]["width"])
+    assert {0, 205, 254} == set(np.unique(np.asarray(picture)).tolist())
+    capsys.readouterr()
+    assert main(["map", "view", str(saved), "--out", str(page)]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
 def test_map_of_a_truncated_file_exits_with_2(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = tmp_path / "cut.skidmap"
     cut.write_bytes(saved.read_bytes()[:1000])
@@ -112,6 +133,8 @@ def test_replay_extend_map_of_the_same_room_adds_little_and_keeps_the_old_file(l
     assert len(new.provenance["extended_from"]) == 2
     assert saved.read_bytes() == before
     assert localization(tmp_path / "out")["changed_share"] < 0.05
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "Occupancy grid of the map" in report
 
 
 def test_replay_extend_map_by_another_building_writes_nothing(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -119,7 +142,7 @@ def test_replay_extend_map_by_another_building_writes_nothing(log: Path, tmp_pat
     save_map(office, SavedMap(floor_plan.make_map(), {}))
     before = office.read_bytes()
     assert replay(log, tmp_path / "out", "--estimator", "map", "--map", office, "--extend-map", extended) == 2
-    assert "could not be joined" in capsys.readouterr().err
+    assert "nothing was added" in capsys.readouterr().err
     assert office.read_bytes() == before
     assert not extended.exists()
 

@@ -15,6 +15,10 @@
   const isStart = () => box("aligned").value === "start";
   const errors = run => isStart() ? run.errors && run.errors.start && {...run.errors, ...run.errors.start} : run.errors;
 
+  // The grid of a saved map, below everything else.
+  const picture = () => data.grid ? [{source: data.grid.source, xref: "x", yref: "y", x: data.grid.left, y: data.grid.top,
+    sizex: data.grid.width, sizey: data.grid.height, sizing: "stretch", layer: "below"}] : [];
+
   const mapTraces = () => {
     const traces = [{x: data.map.x, y: data.map.y, mode: "markers", type: "scatter", name: "scans", hoverinfo: "skip",
                      marker: {size: 2, color: colour("grey"), opacity: .6}, visible: data.map.x.length ? true : "legendonly"}];
@@ -101,7 +105,7 @@
   };
   const draw = () => {
     const size = Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
-    Plotly.react(box("map"), mapTraces(), layout({height: size, dragmode: "pan", uirevision: "map", xaxis: axis("x [m]", {range: data.borders.x}),
+    Plotly.react(box("map"), mapTraces(), layout({height: size, dragmode: "pan", uirevision: "map", images: picture(), xaxis: axis("x [m]", {range: data.borders.x}),
       yaxis: axis("y [m]", {range: data.borders.y, scaleanchor: "x", scaleratio: 1})}), config);
     const [traces, more] = timeFigure();
     Plotly.react(box("time"), traces, more, {...config, scrollZoom: false});
