@@ -119,6 +119,29 @@ class Imu:
 
 
 @dataclass(frozen=True)
+class Lidar:
+    """How the LiDAR measures distances; ranges are corrected when scans are decoded."""
+
+    range_scale: float = 1.0
+    """Measured ranges over the true ones, less what `range_offset_m` adds."""
+    range_offset_m: float = 0.0
+    """By how much all ranges are too long [m]."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether ranges are taken as they are."""
+        return self.range_scale == 1.0 and self.range_offset_m == 0.0
+
+
+@dataclass(frozen=True)
+class Tf:
+    """How the transforms of logs and topics are used."""
+
+    overridden: tuple[str, ...] = ()
+    """Frames whose [mounts] go before their transforms by /tf_static."""
+
+
+@dataclass(frozen=True)
 class Mount:
     """Where a sensor's frame sits in the body frame: x, y, z [m], then roll, pitch, yaw [rad] (fixed axes, as in URDF)."""
 
@@ -201,6 +224,8 @@ class Robot:
     topics: Topics = Topics()
     joints: Joints = Joints()
     imu: Imu = Imu()
+    lidar: Lidar = Lidar()
+    tf: Tf = Tf()
     mounts: Mapping[str, Mount] = field(default_factory=dict)
     wheel_noise: WheelNoise = WheelNoise()
     gyro_noise: GyroNoise = GyroNoise()
@@ -215,6 +240,11 @@ class Robot:
     """Arms that move the centre of gravity; None where it stays at that of `Geometry`."""
     folder: Path | None = field(default=None, compare=False)
     """Where the robot's file is, from which the paths in it start; None for a robot that is shipped. Not in the file."""
+
+    def with_mounts(self, transforms: Mapping[str, Mount]) -> dict[str, Mount]:
+        """Mounts by frame: those of ``transforms`` before those of the file, but for the frames of [tf] overridden."""
+        first = {frame: self.mounts[frame] for frame in self.tf.overridden if frame in self.mounts}
+        return {"base_link": Mount(), **self.mounts, **transforms, **first}
 
     @property
     def center_of_gravity(self) -> FloatArray:

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.errors import RobotError
 from motion_models.registry import MODELS, params_of, traits_of
-from motion_models.robot import DRIVES, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Mount, Robot, Topics, WheelNoise
+from motion_models.robot import DRIVES, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Lidar, Mount, Robot, Tf, Topics, WheelNoise
 from motion_models.terms import VARIABLES, parse_terms, terms_table
 from motion_models.text_files import read_text
 
@@ -47,6 +47,8 @@ _SECTIONS: tuple[tuple[str, type[Any]], ...] = (
     ("topics", Topics),
     ("joints", Joints),
     ("imu", Imu),
+    ("lidar", Lidar),
+    ("tf", Tf),
     ("mounts.FRAME", Mount),
     ("wheel_noise", WheelNoise),
     ("gyro_noise", GyroNoise),
@@ -138,6 +140,8 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         topics=_section(Topics, data, "topics", source),
         joints=_joints(data, source),
         imu=_imu(data, source),
+        lidar=_lidar(data, source),
+        tf=_tf(data, set(mounts), source),
         mounts=mounts,
         wheel_noise=_noise(WheelNoise, data, "wheel_noise", source),
         gyro_noise=_noise(GyroNoise, data, "gyro_noise", source),
@@ -180,6 +184,22 @@ def _imu(data: Mapping[str, Any], source: str) -> Imu:
     if imu.rate_unit_rad_s == 0.0:
         raise RobotError(f"{source}: imu.rate_unit_rad_s is 0; it is 1 for rad/s and 0.0174533 for degrees per second.")
     return imu
+
+
+def _lidar(data: Mapping[str, Any], source: str) -> Lidar:
+    lidar = _section(Lidar, data, "lidar", source)
+    if not 0.5 <= lidar.range_scale <= 2.0:
+        raise RobotError(f"{source}: lidar.range_scale is {lidar.range_scale:g}; it must be near 1: measured ranges over the true ones.")
+    if abs(lidar.range_offset_m) > 1.0:
+        raise RobotError(f"{source}: lidar.range_offset_m is {lidar.range_offset_m:g} m; it must be at most 1.")
+    return lidar
+
+
+def _tf(data: Mapping[str, Any], mounted: set[str], source: str) -> Tf:
+    tf = _section(Tf, data, "tf", source)
+    if absent := [frame for frame in tf.overridden if frame not in mounted]:
+        raise RobotError(f"{source}: tf.overridden names {', '.join(absent)}, of which there is no [mounts.{absent[0]}].")
+    return tf
 
 
 def _clock(data: Mapping[str, Any], source: str) -> Clock:
@@ -299,7 +319,7 @@ def robot_toml(robot: Robot, sigmas: Mapping[str, Mapping[str, float]] | None = 
         lines.append(f"drive = {_value(robot.drive)}")
     for name in ("geometry", "driver"):
         lines += _table(name, _not_default(getattr(robot, name)))
-    for name in ("topics", "joints", "imu", "wheel_noise", "gyro_noise", "clock"):
+    for name in ("topics", "joints", "imu", "lidar", "tf", "wheel_noise", "gyro_noise", "clock"):
         entries = _not_default(getattr(robot, name))
         lines += _table(name, entries) if entries else []
     if robot.arms is not None:

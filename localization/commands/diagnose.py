@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import in_radians, new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
-from localization.diagnosis.corrected_robot import correct_robot, is_held
+from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
 from localization.diagnosis.findings import (
@@ -32,9 +32,9 @@ from localization.diagnosis.findings import (
     is_contesting,
     unit_of,
 )
+from localization.diagnosis.handover import Reader, check_written_robot
 from localization.diagnosis.linearization import default_model
-from localization.diagnosis.prediction import with_sizes
-from localization.logs import TopicOverrides
+from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
 from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
@@ -44,7 +44,9 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
 
-NOT_BETTER = "the corrected robot is not better on the second half of the drive: robot.toml keeps the old values."
+NOT_BETTER = "the corrected robot is not better on the second half of the drive beyond its scatter: robot.toml keeps the old values."
+_WHOLE_SHARE = 0.9
+"""Share of a correction that a model holds, below which that is said."""
 
 
 @dataclass(frozen=True)
@@ -98,17 +100,21 @@ class Diagnose:
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
             found = self._with_suited_model(found, drive)
+        if self.out is not None:
+            with console.status("replaying with the corrected robot"):
+                found = self._with_written_robot(found)
         content = found.diagnosis.to_dict()
         if self.out is not None:
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
                 corrected, manual_steps = self._write_robot(folder, found, robot)
+                shares = held_shares(found.predictor, {f.definition: f.size for f in corrected}) if found.predictor and corrected else {}
                 write_diagnosis_report(folder / "diagnosis.html", found, is_interactive=not self.static)
         if self.json is not None:
             write_json(self.json, content)
         print_diagnosis(console, found.diagnosis)
         if self.out is not None:
-            print_handover(console, corrected, manual_steps)
+            print_handover(console, corrected, manual_steps, shares)
             console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
 
     def _drive(self, robot: Robot) -> Drive:
@@ -135,6 +141,9 @@ class Diagnose:
         found = drive_of_table(name, robot, maneuvers, "windows")
         return dataclasses.replace(found, warnings=(*notes, *found.warnings))
 
+    def _log(self, robot: Robot) -> Log:
+        return open_wired(self.source, robot, self.topic.scored_against(self.reference))
+
     def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
         log = open_wired(path, robot, self.topic.scored_against(self.reference))
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
@@ -150,6 +159,16 @@ class Diagnose:
         note = f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}."
         return dataclasses.replace(found, diagnosis=dataclasses.replace(d, warnings=(note, *d.warnings)))
 
+    def _with_written_robot(self, found: DiagnosisResult) -> DiagnosisResult:
+        """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""
+        d = found.diagnosis
+        if d.handover is None or found.predictor is None or found.linearization is None or self.source.suffix.lower() == ".csv":
+            return found
+        reader = Reader(lambda robot: self._drive_of_log(self.source, robot), self._log)
+        named = [f.definition.key for f in correctable_findings(d)]
+        handover = check_written_robot(reader, found.predictor, found.linearization, named)
+        return dataclasses.replace(found, diagnosis=dataclasses.replace(d, handover=handover or d.handover))
+
     def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> tuple[list[Finding], tuple[str, ...]]:
         """Write robot.toml; returns the findings that it corrects, and what is to be done elsewhere."""
         d, predictor = found.diagnosis, found.predictor
@@ -159,7 +178,7 @@ class Diagnose:
         held = [f for f in correctable if predictor is not None and is_held(predictor, f)]
         corrected = [] if is_worse else held
         if predictor is not None and (sizes := {f.definition: f.size for f in correctable if f in corrected or f not in held}):
-            patch = correct_robot(predictor, with_sizes(sizes))
+            patch = correct_robot(predictor, sizes)
             new, manual_steps = (patch.robot if corrected else robot), patch.manual_steps
         if is_worse:
             manual_steps = (NOT_BETTER, *manual_steps)
@@ -180,11 +199,14 @@ class Diagnose:
         return corrected, tuple(manual_steps)
 
 
-def print_handover(console: Console, corrected: Sequence[Finding], manual_steps: Sequence[str]) -> None:
-    """What robot.toml corrects, and what is to be done in drivers and elsewhere."""
+def print_handover(console: Console, corrected: Sequence[Finding], manual_steps: Sequence[str], shares: Mapping[str, float]) -> None:
+    """What robot.toml corrects, which ``shares`` of the change in motion each model holds, and what is to be done elsewhere."""
     labels = ", ".join(f.definition.label for f in corrected)
     if labels:
         console.print(f"in robot.toml: {labels}", markup=False, soft_wrap=True)
+    parts = [f"{model} can hold {max(100.0 * share, 0.0):.0f} % of it" for model, share in shares.items() if share < _WHOLE_SHARE]
+    if parts:
+        console.print(f"as coefficients: {', '.join(parts)}", markup=False, soft_wrap=True)
     for step in manual_steps:
         if step != NOT_BETTER:
             console.print(f"to do: {step}", markup=False, soft_wrap=True)

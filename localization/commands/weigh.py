@@ -16,7 +16,7 @@ from localization.calibration.wheel_wiring import open_wired
 from localization.commands.common import in_radians, write_json
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
-from localization.diagnosis.weigh import DrivenWeighing, corrected_hypothesis, weigh
+from localization.diagnosis.weigh import DrivenWeighing, weigh
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.weigh_page import weigh_rows, write_weigh_page
@@ -68,7 +68,7 @@ class Weigh:
             found, predictor = weigh(drive)
         print_weighing(console, found, self.at)
         if self.out is not None:
-            new = correct_robot(predictor, corrected_hypothesis(found))
+            new = correct_robot(predictor, found.sizes)
             (x, y), (sx, sy) = found.position, found.sigmas
             remarks = [
                 f"Weighed by skidloc on {found.log}, from {robot.name}: centre of gravity ({x:+.4f} +- {sx:.4f}, {y:+.4f} +- {sy:.4f}) m.",

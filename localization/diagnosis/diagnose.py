@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.calibration.calibrate import describe_clocks
-from localization.diagnosis.causes import MISSING_MESSAGES, Cause
+from localization.diagnosis.causes import MISSING_MESSAGES
+from localization.diagnosis.causes.cause import Cause, with_sizes
 from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import (
@@ -34,7 +35,7 @@ from localization.diagnosis.linearization import (
     make_predictor,
 )
 from localization.diagnosis.noise import slow_turn_sigmas
-from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
+from localization.diagnosis.prediction import Baseline, DrivePredictor
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -224,12 +225,10 @@ def _conclude(
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
         warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *drive.warnings),
-        hypothesis=with_sizes({causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)}),
         suspected=None if suspected is None else suspected[0],
     )
-    correctable = {f.definition: f.size for f in correctable_findings(result)}
-    handover = check_handover(predictor, linearization, [cause.key for cause in correctable] or [causes[i].key for i in chosen])
-    result = dataclasses.replace(result, handover=handover, hypothesis=with_sizes(correctable) if correctable else result.hypothesis)
+    named = [f.definition.key for f in correctable_findings(result)] or [causes[i].key for i in chosen]
+    result = dataclasses.replace(result, handover=check_handover(predictor, linearization, named))
     result = _with_data_errors(result, drive)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)

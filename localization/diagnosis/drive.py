@@ -102,6 +102,8 @@ class Drive:
     """Whether the LiDAR measured the motion: of tables, whose motion was measured by scan matching, too."""
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
+    lidar_mount: Mount | None = None
+    """Its mount; None for tables."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
     """Where it sits, by its transform [m]; the body's origin where a reference measured the motion."""
     antenna: tuple[float, float] = (0.0, 0.0)
@@ -279,6 +281,7 @@ def drive_of_events(
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standstills, spans) if imu.stamps else None,
         is_lidar_reference=by_lidar,
         lidar_frame=frame,
+        lidar_mount=mount if by_lidar else None,
         lidar_at=(mount.x, mount.y),
         antenna=inner.antenna if isinstance(inner, PositionMotionReference) else (0.0, 0.0),
         warnings=(left, *([_describe_gaps(imu.gyro)] if imu.gyro.gaps else []), *windows.warnings),

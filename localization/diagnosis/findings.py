@@ -10,10 +10,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES, WINDOW_CAUSES, Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES
+from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.drive import MessageLoss, StandstillTurn
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import CHANNELS
+from motion_models.calibration.cross_validation import Interval
 from motion_models.se2 import FloatArray
 
 Verdict = Literal["consistent", "explained", "ambiguous", "unexplained", "undecidable"]
@@ -21,6 +23,8 @@ MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.studies.unknown_effects --develop`)."""
 
+_MAX_GROWTH = 1.02
+"""Error of an estimator after a correction over that before: more is worse, whatever the model's own errors do."""
 _SHOWN_GAIN = 0.01  # smallest gain that a sentence reports: in short drives tolerated differences mask it
 
 _AND = " and "
@@ -208,20 +212,28 @@ class HandoverCheck:
     """Root mean square by component, as `prediction.CHANNELS`."""
     after: dict[str, float]
     windows: int
+    gain: Interval
+    """Share by which the windows' errors shrink, each component over its root mean square before; 95 % interval over blocks of windows."""
+    replays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Error of the motion in these windows by estimator, replayed with both files: root mean square before and after [m]."""
 
     @property
     def is_better(self) -> bool:
-        """Whether the product of all components' errors shrinks; a file that changes nothing is not better."""
-        return math.prod(self.after[c] / max(self.before[c], 1e-12) for c in self.before) < 1.0
+        """Whether errors shrink beyond what their scatter over the windows explains, and no estimator's grow by more than 2 %."""
+        return self.gain.low > 0.0 and all(after <= _MAX_GROWTH * before for before, after in self.replays.values())
 
     def describe(self) -> str:
         """Errors of the second half before and after, as a sentence without a stop."""
         rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in self.before)
-        return f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
+        text = f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
+        replayed = ", ".join(f"{name} {before:.3g} -> {after:.3g} m" for name, (before, after) in self.replays.items())
+        return f"{text}; replayed with the written file: {replayed} a window" if replayed else text
 
     def to_dict(self) -> dict[str, Any]:
         """For `diagnose --json`; root mean squares by component [m or rad]."""
-        return {"windows": self.windows, "rms_before": self.before, "rms_after": self.after, "is_better": self.is_better}
+        found = {"windows": self.windows, "rms_before": self.before, "rms_after": self.after, "is_better": self.is_better}
+        replays = {name: {"before_m": before, "after_m": after} for name, (before, after) in self.replays.items()}
+        return {**found, "gain": self.gain.value, "gain_interval": [self.gain.low, self.gain.high], "replays": replays}
 
 
 @dataclass(frozen=True)
@@ -256,7 +268,6 @@ class Diagnosis:
     warnings: tuple[str, ...] = ()
     too_little: str = ""
     """Why the drive was not searched for causes: too little was measured."""
-    hypothesis: Hypothesis = field(default_factory=Hypothesis)
     suspected: Finding | None = None
     """Where the verdict is consistent: the strongest cause, too weak to be named, but stronger than four in five healthy drives show."""
     handover: HandoverCheck | None = None
@@ -296,7 +307,7 @@ def evidence(cause: Cause, part: FloatArray, noise: Noise, twice_likelihood: flo
     order = np.argsort(-strength)
     places = [f"{_CHANNEL_WORDS[CHANNELS[c]]} ({100.0 * strength[c] / whole:.0f} %)" for c in order if strength[c] > 0.15 * whole]
     text = f"shows {', '.join(dict.fromkeys(places))}; log-likelihood +{twice_likelihood / 2.0:.0f}"
-    if cause.id == "friction_change" and cause.at_s is not None:
+    if cause.at_s is not None and not cause.axis:
         text += f"; from {cause.at_s:.0f} s on"
     return text
 
@@ -371,7 +382,7 @@ def describe_outliers(d: Diagnosis) -> list[str]:
 
 def unit_of(name: str) -> str:
     """The unit of a cause's size after a space; empty for ratios."""
-    cause = CAUSES.get(name) or WINDOW_CAUSES.get(name)
+    cause = CAUSES.get(name)
     return "" if cause is None or cause.unit == "1" else f" {cause.unit}"
 
 

@@ -24,7 +24,7 @@ from motion_models.errors import ModelError
 from motion_models.friction.contact import CREEP, rolling, tyre
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
 from motion_models.friction.equilibrium import Floor, motion, newton
-from motion_models.friction.model import FrictionModel, check_parameters, loads_at, pull_of, unit_rolls
+from motion_models.friction.model import FrictionModel, check_parameters, gripped, loads_at, pull_of, unit_rolls
 from motion_models.linear_equations import solve
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -43,7 +43,7 @@ _MIN_SPEED_M_PER_S = 0.005  # below it stiffness falls no further
 def quasi_static_twists(
     model: FrictionModel, params: FloatArray, wheels: FloatArray, cg: FloatArray, stiffness_exponent: float = 0.0
 ) -> FloatArray:
-    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and ``params`` (12,), by the contact law of ``model``; the
+    """Body twists (N, 3) of the tracked point for wheel rates (N, 2), CG (N, 2) and ``params`` (13,), by the contact law of ``model``; the
     slip stiffness grows with this power of the wheels' speed.
 
     Raises `CgError` and `ModelError` as `FrictionModel.twist` does.
@@ -80,7 +80,8 @@ def _solve_quasi_static(
             out[i] = 0.0
             continue
         floor = _floor_at(speed, rated, exponent)
-        load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, centripetal))
+        x, y, t = gripped(cg[i, 0], cg[i, 1], warp, params[12], floor)
+        load, _ = loads_at(x, y, t, floor, pull_of(speed, mu, centripetal))
         found = False
         if abs(roll_l - previous_l) < _MAX_ROLL_CHANGE and abs(roll_r - previous_r) < _MAX_ROLL_CHANGE:
             vx, vy, wz, found = newton(vx, vy, wz, roll_l, roll_r, load, floor, CREEP)
@@ -120,7 +121,7 @@ class ManeuverSamples(NamedTuple):
 
 
 def dynamic_twists(robot: Robot, model: FrictionModel, params: FloatArray, drive: ManeuverSamples, quasi_static: FloatArray) -> FloatArray:
-    """Body twists (N, 3) of the wheelbase's centre, with inertia, for ``params`` (12,) and the contact law of ``model``.
+    """Body twists (N, 3) of the wheelbase's centre, with inertia, for ``params`` (13,) and the contact law of ``model``.
 
     ``quasi_static`` (N, 3) are the twists without inertia: where each maneuver starts, and the result where no step is found. Raises
     `CgError` and `ModelError` as `FrictionModel` does.

@@ -8,20 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from localization.diagnosis.causes import (
-    CAUSES,
-    WINDOW_CAUSES,
-    Cause,
-    Hypothesis,
-    friction_change,
-    of_reference,
-    payload,
-    slope_across,
-    track_width,
-)
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with_sizes
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.noise import Noise, estimate_drive_noise
-from localization.diagnosis.prediction import Baseline, DrivePredictor, with_sizes
+from localization.diagnosis.prediction import Baseline, DrivePredictor
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel
 from motion_models.diff_drive import DiffDrive
@@ -36,18 +27,6 @@ MAX_TOLERANCE_SIGMAS = 1.0 / TOLERANCE
 _MAX_SWEEPS, _MAX_LAST_GAIN = 2000, 1e-8  # of the search for tolerated sizes, the latter in squares of whitened numbers
 _NO_SIZE = 1e-6  # sigma of a size that is not there, in units of its prior's
 _FREE_VARIANCE = 1e6  # of a size that may be any, in squares of its prior's sigma
-
-
-SKIDDING = frozenset(
-    {"track_width", "payload", "cg_offset_x", "cg_offset_y", "friction_anisotropy", "friction_change", "split_friction", "scrub"}
-    | {"lateral_force_law", "diagonal_load", "tread_asymmetry", "rolling_resistance", "slope", "rotation_slip_speed"}
-)
-"""Causes that act by the friction of wheels that skid: none of a robot with casters but the track, by which it turns."""
-_SHOWN_BY_HEADINGS = frozenset(
-    {"rotation_scale", "rotation_slip_speed", "rotation_slip_rate", "rotation_slip_curvature", "wheel_radius_difference"}
-    | {"wheel_time_offset", "gyro_time_offset", "gyro_bias", "gyro_scale", "encoder_dropout"}
-)
-"""Causes of a drive of which headings alone were measured: how far a robot turns has many physical reasons that only positions separate."""
 
 
 @dataclass(frozen=True)
@@ -239,50 +218,43 @@ def make_predictor(drive: Drive, model: MotionModel, baseline: Baseline | None =
         known = np.isfinite(rows).any(axis=0)
         squares.append(np.nanmedian(np.abs(rows[:, known]), axis=0))
     better = np.sum(np.log(np.maximum(squares[0], 1e-9)) - np.log(np.maximum(squares[1], 1e-9))) > 0.0
-    return with_inertia if better or model.name == "friction" else plain
+    return with_inertia if better or model.name == FrictionModel.name else plain
 
 
-_TRACK, _SCALE = "track_width", "rotation_scale"
-"""One and the same for a robot with casters, which turns by its track; that is what one measures."""
+_FEWEST_WITH_CHANGES = 24
+"""Windows of a drive in which a change of the floor is tried."""
+
+
+def setting_of(predictor: DrivePredictor, moments: int = 0) -> Setting:
+    """What the drive can show; a change of the floor at so many ``moments``."""
+    drive = predictor.drive
+    is_long = drive.kind == "log" and len(drive.maneuvers) >= _FEWEST_WITH_CHANGES
+    return Setting(
+        drive.robot,
+        drive.kind,
+        has_positions=drive.has_positions or drive.kind == "runs",
+        has_headings=drive.has_headings,
+        has_gyro=drive.gyro is not None or drive.is_gyro_reference,
+        has_ranges=drive.range_slopes is not None,
+        has_dropouts=predictor.has_dropouts,
+        skids=is_skid_steer(drive.robot),
+        is_friction_model=predictor.model.name == FrictionModel.name,
+        change_times_s=tuple(float(drive.starts_s[-1]) * q for q in np.linspace(0.2, 0.8, moments)) if is_long else (),
+    )
 
 
 def candidate_causes(predictor: DrivePredictor, moments: int) -> tuple[Cause, ...]:
     """Causes that this drive could show; a change of the floor at so many ``moments``."""
-    drive = predictor.drive
-    out = set()
-    if drive.gyro is None and not drive.is_gyro_reference:
-        out |= {"gyro_bias", "gyro_scale", "gyro_time_offset"}
-    if drive.range_slopes is None:
-        out |= {"range_scale", "range_bias"}
-    if drive.kind != "log":
-        out.add("wheel_radius_drift")
-    if not predictor.has_dropouts:
-        out.add("encoder_dropout")
-    if drive.is_gyro_reference:
-        out |= {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "lateral_slip_speed", "longitudinal_slip_turning"}
-    if not drive.has_headings:
-        out.add("lidar_yaw")
-    if drive.kind in ("rotations", "runs"):
-        out |= {"lidar_time_offset", "wheel_time_offset", "slope", "lateral_slip_speed", "rotation_slip_speed", "longitudinal_slip_turning"}
-    catalogue = {**CAUSES, "payload": payload(drive.robot.geometry.mass_kg), "track_width": track_width(drive.robot)}
-    found = [e if drive.is_lidar_reference else of_reference(e) for e in catalogue.values() if e.id not in out]
-    if drive.kind == "log" and not drive.is_gyro_reference:
-        found.append(slope_across())
-        length = float(drive.starts_s[-1])
-        if len(drive.maneuvers) >= 24:
-            found += [friction_change(length * q) for q in np.linspace(0.2, 0.8, moments)]
-    if drive.kind == "runs":
-        out = {"wheel_radius_difference", "tread_asymmetry", "lidar_yaw", "gyro_bias", "encoder_dropout"}
-        return tuple(e for e in found if e.id not in out)
-    has_casters = not is_skid_steer(drive.robot)
-    if not drive.has_positions:
-        shown = [e for e in (*found, *WINDOW_CAUSES.values()) if e.id in _SHOWN_BY_HEADINGS or (has_casters and e.id == _TRACK)]
-        return tuple(e for e in shown if not (has_casters and e.id == _SCALE))
-    if drive.kind == "windows":
-        found += list(WINDOW_CAUSES.values())
-    elif predictor.model.name != "friction":  # its own number for how far it turns is not the floor's
-        found.append(WINDOW_CAUSES[_SCALE])
-    return tuple(e for e in found if not has_casters or (e.id not in {*SKIDDING, _SCALE} - {_TRACK}))
+    setting = setting_of(predictor, moments)
+    found: list[Cause] = []
+    for cause in CAUSES.values():
+        if not setting.has_positions and not cause.is_shown_by_headings:
+            continue
+        if cause.applies(setting) and (setting.skids or not cause.by_skidding):
+            found += cause.variants(cause, setting)
+    if predictor.drive.is_lidar_reference:
+        return tuple(found)
+    return tuple(dataclasses.replace(cause, words=cause.reference_words or cause.words) for cause in found)
 
 
 def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[Cause, float], tolerance: float) -> Linearization:
@@ -302,7 +274,7 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
 def _signature(predictor: DrivePredictor, cause: Cause, sizes: dict[Cause, float], rows: FloatArray) -> FloatArray:
     """(M, 6) of ``cause`` where causes have these ``sizes``, which leave ``rows`` (M, 6); without another one of its group, whose place it
     would take: a floor that changes at another moment does not change at both."""
-    others = {e: size for e, size in sizes.items() if e.key == cause.key or group_of(e) != group_of(cause)}
+    others = {e: size for e, size in sizes.items() if e.key == cause.key or e.group != cause.group}
     return predictor.signature(with_sizes(others), cause, rows if len(others) == len(sizes) else None)
 
 
@@ -321,8 +293,3 @@ def _nuisances(rows: FloatArray) -> FloatArray:
     level = np.zeros((*rows.shape, 2))
     level[:, 4, 0] = level[:, 5, 1] = 1.0
     return np.where(np.isfinite(rows)[..., None], level, np.nan)
-
-
-def group_of(cause: Cause) -> str:
-    """Name of the group of causes of which only one is tried at a time."""
-    return cause.id if cause.id != "slope" else cause.key

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from localization.diagnosis.causes import STIFFNESS_EXPONENT, Cause
+from localization.diagnosis.causes import STIFFNESS_EXPONENT
+from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from motion_models.calibration.maneuvers import Batch
 from motion_models.se2 import FloatArray

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from localization.diagnosis.causes import Cause, Hypothesis
+from localization.diagnosis.causes.cause import Cause, Hypothesis, Motion, changed
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
@@ -219,7 +217,7 @@ class DrivePredictor:
 
     def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
-        hypothesis = _added(self.baseline.hypothesis, hypothesis)
+        hypothesis = self.baseline.hypothesis + hypothesis
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
         reference_params = np.array([self.wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
@@ -321,6 +319,8 @@ class _HypothesisModel:
             rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
+        if b.changed_rates:
+            rates = changed(b.changed_rates, Motion(rates, np.zeros((len(rates), 3)), p.batch.dt, p._times), "rates")
         value = self._of_model(rates, cg, params) + self._floor(rates, cg)
         if p.drive.robot.drive == DIFF_DRIVE:
             track = p.drive.robot.geometry.track_width_m
@@ -341,6 +341,8 @@ class _HypothesisModel:
             vx, vy, wz = value.T
             lateral, rotation, forward = b.slip_coefficients
             value = np.stack([vx * (1.0 - forward * np.abs(wz)), vy + lateral * vx * wz, wz * (1.0 - rotation * np.abs(vx))], axis=-1)
+        if b.changed_twists:
+            value = changed(b.changed_twists, Motion(rates, value, p.batch.dt, p._times), "twist")
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
 
@@ -389,8 +391,9 @@ class _HypothesisModel:
         if moved is not cg:
             moved = np.clip(moved, -half, half)
         grip = moved
-        if b.split_friction:
-            shifted, params[8] = _shifted_by_grip(moved, (0.5 * params[2], 0.5 * params[1]), params[8], b.split_friction)
+        split, params[12] = params[12] + b.split_friction, 0.0
+        if split:
+            shifted, params[8] = _shifted_by_grip(moved, (0.5 * params[2], 0.5 * params[1]), params[8], split)
             grip = np.clip(shifted, -half, half)
         centers = moved, grip
         if not b.friction_change:
@@ -420,12 +423,10 @@ class _HypothesisModel:
         return p._twists[key]
 
     def _load_key(self) -> tuple[object, ...]:
-        b = self._b
-        return b.cg, b.payload_kg, b.split_friction
+        return self._b.key("load")
 
     def _rates_key(self) -> tuple[object, ...]:
-        p, b = self._p, self._b
-        return b.left_radius_scale, b.right_radius_scale, b.encoder_loss, b.wheel_radius_drift, p.wheel_shift(b), b.wheel_lag_s
+        return *self._b.key("rates"), self._p.wheel_shift(self._b)
 
     def _with_inertia(
         self, law: FrictionModel, rates: FloatArray, centers: tuple[FloatArray, FloatArray], params: FloatArray
@@ -470,27 +471,3 @@ def _shifted_by_grip(cg: FloatArray, half: tuple[float, float], warp: float, spl
     n = 1.0 + g * eta
     shifted = np.column_stack([(xi + g * warp) / n, (eta + g) / n]) * np.array(half)
     return shifted, (warp + g * float(xi.mean())) / float(n.mean())
-
-
-def _added(a: Hypothesis, b: Hypothesis) -> Hypothesis:
-    """Both deviations at once."""
-    if a == Hypothesis():
-        return b
-    found: dict[str, Any] = {}
-    for name in (f.name for f in dataclasses.fields(Hypothesis)):
-        one, other = getattr(a, name), getattr(b, name)
-        if isinstance(one, tuple):
-            found[name] = tuple(x + y for x, y in zip(one, other, strict=True))
-        elif isinstance(one, Mapping):
-            found[name] = {key: one.get(key, 0.0) + other.get(key, 0.0) for key in {**one, **other}}
-        else:
-            found[name] = one + other
-    return Hypothesis(**found)
-
-
-def with_sizes(sizes: dict[Cause, float]) -> Hypothesis:
-    """The hypothesis that causes have these ``sizes``."""
-    hypothesis = Hypothesis()
-    for cause, size in sizes.items():
-        hypothesis = cause.inject(hypothesis, size)
-    return hypothesis

@@ -9,17 +9,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.diagnosis.causes import CAUSES, REFERENCE_WORDS, WINDOW_CAUSES, Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
     Linearization,
     Regression,
-    group_of,
     make_regression,
     regression,
 )
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.prediction import DrivePredictor
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
 
@@ -221,7 +221,7 @@ def search_causes(predictor: DrivePredictor, linearization: Linearization, bent:
     """Sizes of the best set of causes: the best few sets by signatures are compared by full predictions at their own sizes, and so is each
     of the ``bent`` causes alone, from half its typical size to both sides."""
     causes, problem = linearization.causes, linearization.problem
-    groups = [group_of(e) for e in causes]
+    groups = [e.group for e in causes]
     ranked = rank_subsets(problem, groups, _bounds(causes))
     least, best = ranked[0]
     sizes = _linear_sizes(linearization, best)
@@ -270,8 +270,8 @@ def simplest_set(tried: Sequence[tuple[float, dict[Cause, float]]], nothing: flo
     margin = max(_ALIAS_LOG_ODDS, _BASELINE_SHARE * (nothing - least)) if predictor.has_baseline else 0.0
     number, best = min((len(sizes), cost) for cost, sizes in tried if cost <= least + margin)
     equal = [sizes for cost, sizes in tried if len(sizes) == number and cost <= best + _TIE_LOG_ODDS]
-    first = () if predictor.drive.is_lidar_reference else REFERENCE_WORDS
-    order = {name: i for i, name in enumerate(dict.fromkeys((*first, *CAUSES, *WINDOW_CAUSES)))}
+    of_reference = [] if predictor.drive.is_lidar_reference else [c.id for c in CAUSES.values() if c.reference_words is not None]
+    order = {name: i for i, name in enumerate(dict.fromkeys((*of_reference, *CAUSES)))}
     return min(equal, key=lambda sizes: sorted(order.get(cause.id, len(order)) for cause in sizes))
 
 
@@ -316,7 +316,7 @@ def has_tolerated_substitute(linearization: Linearization, chosen: tuple[int, ..
     """Whether one cause no larger than what is tolerated of it, ``largest`` (p,), explains the drive about as well as ``i``, or as ``i``
     and another one of those ``chosen`` together, as where these two nearly cancel."""
     problem, causes = linearization.problem, linearization.causes
-    groups = [group_of(e) for e in causes]
+    groups = [e.group for e in causes]
     most = cost(problem, groups, chosen) + _ALIAS_LOG_ODDS
     for k in chosen:
         rest = tuple(j for j in chosen if j not in (i, k))
@@ -330,14 +330,14 @@ def has_tolerated_substitute(linearization: Linearization, chosen: tuple[int, ..
 
 def _substitutes(causes: tuple[Cause, ...], chosen: tuple[int, ...]) -> list[int]:
     """Causes that could take the place of one of those ``chosen``."""
-    groups = {group_of(causes[k]) for k in chosen}
-    return [j for j, cause in enumerate(causes) if group_of(cause) not in groups]
+    groups = {causes[k].group for k in chosen}
+    return [j for j, cause in enumerate(causes) if cause.group not in groups]
 
 
 def _cost(linearization: Linearization, sizes: dict[Cause, float], rows: FloatArray) -> float:
     """What ``rows`` (M, 6), which ``sizes`` leave, are off beyond all tolerances, and the price of so many causes."""
     whole = _regression_of(linearization, rows, linearization.signatures)
-    return whole.misfit() + price(whole.count, len({group_of(e) for e in linearization.causes}), len(sizes))
+    return whole.misfit() + price(whole.count, len({e.group for e in linearization.causes}), len(sizes))
 
 
 def _regression_of(linearization: Linearization, rows: FloatArray, signatures: FloatArray) -> Regression:

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive import drive_of_table, path_of
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import Linearization, group_of, regression
+from localization.diagnosis.linearization import Linearization, regression
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor
 from localization.diagnosis.selection import max_statistic, p_value, price, statistics
 from motion_models import se2
 from motion_models.calibration.chords import chord_jacobians
@@ -184,7 +185,7 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     n, spreads = len(names), linearization.problem.scale
     is_rival = np.array([name not in _SHAPES_OF_CAUSES for _, name in names])
     problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
-    groups = len({group_of(cause) for cause in linearization.causes})
+    groups = len({cause.group for cause in linearization.causes})
     found = []
     for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
         others = tuple(n + j for j in chosen if j not in replaced)
@@ -401,7 +402,7 @@ def separating_drive(predictor: DrivePredictor, findings: Sequence[Finding]) -> 
     finding = rivals[0]
     *names, last = finding.cause, *(name for name, _ in finding.aliases[:4])
     listed = f"{', '.join(names)} and {last}"
-    named = [(CAUSES.get(name) or WINDOW_CAUSES.get(name), size) for name, size in finding.aliases[:4]]
+    named = [(CAUSES.get(name), size) for name, size in finding.aliases[:4]]
     pairs = [(finding.definition, finding.size), *((cause, size) for cause, size in named if cause is not None)]
     base = with_sizes({f.definition: f.size for f in findings if f is not finding})
     if predictor.drive.gyro is None and {finding.cause, *(name for name, _ in finding.aliases)} == {

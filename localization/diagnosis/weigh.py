@@ -21,7 +21,8 @@ import numpy as np
 from scipy import stats
 
 from localization.calibration.windows import driven
-from localization.diagnosis.causes import CAUSES, STIFFNESS_EXPONENT, Cause, Hypothesis
+from localization.diagnosis.causes import CAUSES, STIFFNESS_EXPONENT
+from localization.diagnosis.causes.cause import Cause, Hypothesis
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.model_error import model_error_log_odds
@@ -115,6 +116,11 @@ class DrivenWeighing:
     def position(self) -> FloatArray:
         """(2,) CG in the body frame [m]."""
         return np.asarray(self.given + self.offset)
+
+    @property
+    def sizes(self) -> dict[Cause, float]:
+        """The offset as sizes of causes, to correct a robot by."""
+        return {CAUSES[name]: float(size) for name, size in zip(_CG, self.offset, strict=True)}
 
     @property
     def sigmas(self) -> FloatArray:
@@ -225,11 +231,6 @@ def estimate_map(predictor: DrivePredictor, causes: tuple[Cause, ...]) -> MapEst
 def _nominal(robot: Robot, name: str) -> float:
     """Parameter ``name`` of the friction model by the robot file."""
     return float(FrictionModel.from_robot(robot).nominal[FrictionModel.param_names.index(name)])
-
-
-def corrected_hypothesis(found: DrivenWeighing) -> Hypothesis:
-    """The robot file with the CG that was found, and nothing else changed."""
-    return Hypothesis(cg=(float(found.offset[0]), float(found.offset[1])))
 
 
 def _check(drive: Drive) -> float:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from localization.events import CgSample, Event, WheelSample
+from localization.events import CgSample, Event, Scan, WheelSample
 from localization.logs.clock_sync import Item
 from localization.logs.clouds import cloud_decoder
 from localization.logs.decode import (
@@ -37,7 +37,7 @@ from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
 from motion_models.center_of_gravity.model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import support_margin
-from motion_models.robot import Clock, Driver, Geometry, Robot
+from motion_models.robot import Clock, Driver, Geometry, Lidar, Robot
 from motion_models.se2 import FloatArray
 
 _RANKS = {"joint_states": 0, "odometry": 0, "center_of_gravity": 1, "imu": 2, "scan": 3, "points": 3}
@@ -92,7 +92,7 @@ class EventDecoder:
         wheels = "" if sources.wheels is None else sources.wheels.topic
         odometry_type = "" if sources.wheels is None else sources.wheels.type
         self._of_wheels = wheel_decoder((*joints[0], *joints[1]), robot.joints)
-        self._period_s, self._imu_unit = period_s, robot.imu.rate_unit_rad_s
+        self._period_s, self._imu_unit, self._lidar = period_s, robot.imu.rate_unit_rad_s, robot.lidar
         left, right = joints
         self._multipliers = robot.geometry.radius_multipliers
         self._has_multipliers = bool((self._multipliers != 1.0).any())
@@ -122,6 +122,8 @@ class EventDecoder:
             yield from map(self._roll, self.from_odometry(payload))
         elif isinstance(payload, CgSample):
             yield from self._check_cg(payload)
+        elif isinstance(payload, Scan) and not self._lidar.is_exact:
+            yield dataclasses.replace(payload, points=_with_true_ranges(payload.points, self._lidar))
         else:
             yield payload
 
@@ -150,6 +152,13 @@ class EventDecoder:
             "points": cloud_decoder(self._period_s.get(source.topic)),
         }
         return decoders[source.kind]
+
+
+def _with_true_ranges(points: FloatArray, lidar: Lidar) -> FloatArray:
+    """``points`` (n, 3) in the sensor's frame, each moved along its beam to the true range, (r - offset) / scale [m]."""
+    ranges = np.linalg.norm(points, axis=1)
+    true = np.maximum(ranges - lidar.range_offset_m, 0.0) / lidar.range_scale
+    return np.asarray(points * (true / np.maximum(ranges, 1e-9))[:, None])
 
 
 def _late_ns(kind: str, clock: Clock) -> int:

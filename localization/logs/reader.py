@@ -176,7 +176,7 @@ class Log:
         self._mount_notes = transforms.warnings()
         for frame in transforms.contradictions().keys() & self.robot.mounts.keys():
             del found[frame]  # the robot file decides
-        return {"base_link": Mount(), **self.robot.mounts, **found}
+        return self.robot.with_mounts(found)
 
     def damage(self) -> list[str]:
         """Warnings about which of its files could not be read, and how much could, so far."""

@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from localization.diagnosis.diagnose import DiagnosisResult
-from localization.diagnosis.linearization import group_of
 from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor
 from localization.report.charts import Axis, Chart, Series
 from motion_models import se2
@@ -137,10 +136,10 @@ def _odds(found: DiagnosisResult) -> list[Chart]:
     charts = []
     for f, i in zip(findings, chosen, strict=True):
         others = tuple(j for j in chosen if j != i)
-        groups = {group_of(causes[j]) for j in chosen}
+        groups = {causes[j].group for j in chosen}
         leads: dict[str, float] = {}
         for j, cause in enumerate(causes):
-            if group_of(cause) not in groups:
+            if cause.group not in groups:
                 leads[cause.label] = min(own - problem.gain((*others, j)), leads.get(cause.label, math.inf))
         ranked = sorted(leads.items(), key=lambda entry: entry[1])[:_RIVALS]
         names = [f.definition.label, *(name for name, _ in ranked)]

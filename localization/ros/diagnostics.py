@@ -63,32 +63,6 @@ _MAX_POINTS = 1500
 _MAX_CPU_S = 300
 _LOWEST_PRIORITY = 19
 _NAME = "diagnosis"
-_REMEDIES: Mapping[str, str] = {
-    "wheel_radius_scale": "check the tyres' pressure, or set wheel_radius_m = {g.wheel_radius_m:.4f}",
-    "wheel_radius_difference": "inflate the smaller tyres, or set left_wheel_radius_multiplier = {g.left_wheel_radius_multiplier:.4f} and "
-    "right_wheel_radius_multiplier = {g.right_wheel_radius_multiplier:.4f}",
-    "wheel_radius_drift": "check the tyres' pressure: one of them may lose air",
-    "track_width": "measure the distance of the wheels, or set track_width_m = {g.track_width_m:.4f}",
-    "payload": "weigh the robot (`skidloc weigh`), and add the load to its file",
-    "cg_offset_x": "weigh the robot (`skidloc weigh`), or set cg_x_m = {g.cg_x_m:.4f}",
-    "cg_offset_y": "weigh the robot (`skidloc weigh`), or set cg_y_m = {g.cg_y_m:.4f}",
-    "lidar_offset_x": "measure the LiDAR's mount, and correct its transform",
-    "lidar_offset_y": "measure the LiDAR's mount, and correct its transform",
-    "lidar_yaw": "measure the LiDAR's mount, and correct its transform",
-    "lidar_time_offset": "synchronize the clocks, or set lidar_time_offset_s = {c.lidar_time_offset_s:.3f} in [clock]",
-    "wheel_time_offset": "synchronize the clocks, or set wheel_time_offset_s = {c.wheel_time_offset_s:.3f} in [clock]",
-    "gyro_time_offset": "synchronize the clocks, or set gyro_time_offset_s = {c.gyro_time_offset_s:.3f} in [clock]",
-    "gyro_bias": "let the driver zero the gyro while the robot stands",
-    "gyro_scale": "correct the scale of the gyro in its driver",
-    "range_scale": "correct the scale of the ranges in the LiDAR's driver",
-    "range_bias": "correct the offset of the ranges in the LiDAR's driver",
-    "encoder_dropout": "check the cables of the wheels' encoders",
-    "missing_joint_messages": "check the driver of the wheels and the network",
-    "split_friction": "compare the tyres of both sides, and the floor under them",
-    "diagonal_load": "check the chassis and the tyres' pressure",
-}
-"""What to do, by cause; ``g`` is the corrected robot's geometry and ``c`` its clock."""
-_OTHER_REMEDY = "record this drive, and run `skidloc diagnose --out DIR`: robot.toml has the correction"
 
 
 @dataclass(frozen=True)
@@ -447,7 +421,7 @@ def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
     d = found.diagnosis
     values = {"verdict": d.verdict, "windows": str(d.windows), "model": d.model}
     if found.predictor is not None:
-        robot = correct_robot(found.predictor, d.hypothesis).robot
+        robot = correct_robot(found.predictor, {f.definition: f.size for f in correctable_findings(d)}).robot
     is_worse = d.handover is not None and not d.handover.is_better
     corrected = [] if is_worse else correctable_findings(d)
     remedies = []
@@ -456,7 +430,7 @@ def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
         if finding.aliases:
             values[f"or_{i}"] = describe_sizes(finding.aliases)
         if finding in corrected or finding.cause == MISSING_MESSAGES.id:
-            values[f"remedy_{i}"] = _REMEDIES.get(finding.cause, _OTHER_REMEDY).format(g=robot.geometry, c=robot.clock)
+            values[f"remedy_{i}"] = finding.definition.remedy.format(g=robot.geometry, c=robot.clock, r=robot)
             remedies.append(f"{finding.definition.label}: {values[f'remedy_{i}']}.")
     is_good = d.verdict in ("consistent", "undecidable") and not d.findings
     return Status(_NAME, OK if is_good else WARN, " ".join([f"{d.verdict}, {name}: {d.sentence}", *remedies]), values)

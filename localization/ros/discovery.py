@@ -172,7 +172,7 @@ class TopicDiscovery:
         first = {topic: stamps for topic, stamps in self._first.items() if topic in used}
         plan = plan_clocks(first)
         start_ns = min(plan.first_stamps(first), default=self._transport.epoch_ns + self._transport.now_ns())
-        mounts = {"base_link": Mount(), **self._robot.mounts, **self._transforms.mounts()}
+        mounts = self._robot.with_mounts(self._transforms.mounts())
         return DiscoveredTopics(parts, mounts, self._transforms, plan, start_ns, self._backlog)
 
     def _joint_names(self, topic: str) -> list[list[str]]:

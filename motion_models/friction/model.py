@@ -99,14 +99,15 @@ class FrictionModel(ModelBase):
     slip_stiffness [-]: K of the contact law; rolling_resistance [-]: f_r of 3.17; scrub [m]: yaw moment that the contact patches oppose to
     any turn, over mu m g; warp [-]: load that a twisted chassis moves onto the front left and rear right wheels, over m g / 4; tread [-]:
     how much more the wheels grip when they slide to the left than to the right (half the difference over the mean); tracked_x, tracked_y
-    [m]: the point whose motion is reported, 0 for the wheelbase's centre. Only rolling_resistance and the centripetal force depend on mu.
+    [m]: the point whose motion is reported, 0 for the wheelbase's centre; split_friction [-]: grip of the left wheels less that of the
+    right ones, over their mean. Only rolling_resistance and the centripetal force depend on mu.
 
     The twist at exactly still wheels is exactly zero. Its derivative there is that of the rounded law (see `contact`), as no other
     exists. Where soft tyres (slip_stiffness below about 3) allow several motions for one pair of wheel rates, it is one of them.
     """
 
     nominal: FloatArray
-    """(12,) the parameters."""
+    """(13,) the parameters."""
     saturation: float = 0.0
     """Contact law: 0 isotropic, 1 the thesis's, between them a mixture (see `contact`)."""
     centripetal: bool = False
@@ -130,6 +131,7 @@ class FrictionModel(ModelBase):
         Param("tread", "1", "how much more the wheels grip when they slide to the left than to the right"),
         Param("tracked_x", "m", "tracked point ahead of the wheelbase's middle", CENTRE_X_SIGMA_M, free=Free(logs=2, rotations=1)),
         Param("tracked_y", "m", "tracked point left of the wheelbase's middle", CENTRE_Y_SIGMA_M),
+        Param("split_friction", "1", "grip of the left wheels less that of the right ones, over their mean"),
     )
     traits: ClassVar[Traits] = Traits(
         options=("contact", "centripetal"), is_level=True, min_track_over_radius=_NOT_STRAIGHT, correction_params=_CG_OFFSETS
@@ -143,7 +145,7 @@ class FrictionModel(ModelBase):
         """
         g = robot.geometry
         law = robot.choice(cls.name, "contact", tuple(SATURATION), "isotropic")
-        defaults = [g.wheel_radius_m, g.track_width_m, g.wheelbase_m, 0.9, 1.0, STIFFNESS[law], 0.0263, 0.0, 0.0, 0.0, 0.0, 0.0]
+        defaults = [g.wheel_radius_m, g.track_width_m, g.wheelbase_m, 0.9, 1.0, STIFFNESS[law], 0.0263, *(0.0,) * 6]
         nominal = robot.coefficients(cls.name, cls.param_names, np.array(defaults))
         return cls(nominal, SATURATION[law], robot.switch(cls.name, "centripetal", CENTRIPETAL))
 
@@ -240,16 +242,19 @@ class FrictionModel(ModelBase):
         return rates.reshape(*lead, 2)
 
     def floor(self, params: FloatArray) -> Floor:
-        """What the balance depends on, with ``params`` (12,)."""
+        """What the balance depends on, with ``params`` (13,)."""
         return floor_of(np.asarray(params, dtype=np.float64), self.saturation)
 
 
 def check_parameters(cg: FloatArray, params: FloatArray) -> None:
-    """Raises `ModelError` for parameters (12,) that no robot can have and `CgError` for a CG in ``cg`` (..., 2) outside its wheels."""
+    """Raises `ModelError` for parameters (13,) that no robot can have and `CgError` for a CG in ``cg`` (..., 2) outside its wheels."""
     names = FrictionModel.param_names
-    if not np.isfinite(params).all() or np.any(params[_POSITIVE] <= 0) or abs(params[9]) >= 1:
+    if not np.isfinite(params).all() or np.any(params[_POSITIVE] <= 0) or abs(params[9]) >= 1 or abs(params[12]) >= 2:
         found = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names, params, strict=True))
-        raise ModelError(f"friction: {', '.join(names[_POSITIVE])} must be positive and tread within -1 and 1; found {found}.")
+        raise ModelError(
+            f"friction: {', '.join(names[_POSITIVE])} must be positive and tread within -1 and 1, "
+            f"split_friction within -2 and 2; found {found}."
+        )
     half = params[[2, 1]] / 2.0
     outside = ~(np.abs(cg) < half).all(axis=-1)  # also if it is not a number
     if np.any(outside):
@@ -272,7 +277,7 @@ class CorrectedFriction(ModelWrapper):
 
     @property
     def nominal(self) -> FloatArray:
-        """(14,)"""
+        """(15,)"""
         return np.append(self.inner.nominal, [0.0, 0.0])
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
@@ -292,7 +297,7 @@ class CorrectedFriction(ModelWrapper):
 
 
 def _clip_to_valid(cg: FloatArray, params: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Parameters (12,) and CG (..., 2) within their valid ranges, and 1 where the CG (..., 2) is not clipped, else 0."""
+    """Parameters (13,) and CG (..., 2) within their valid ranges, and 1 where the CG (..., 2) is not clipped, else 0."""
     clipped = params[:-2].copy()
     clipped[4] = max(clipped[4], _MIN_MU_RATIO)
     check_parameters(cg, clipped)
@@ -346,12 +351,13 @@ def _solve_samples(
     slope, d_slope = constants.slope, constants.d_slope
     has_slope = slope.shape[0] > 0
     radius, mu, warp, tracked_x, tracked_y = params[0], params[3], params[8], params[10], params[11]
-    floor = floor_of(params, constants.saturation)
+    floor, split = floor_of(params, constants.saturation), params[12]
     by = np.empty((3, COLUMNS))
     for i in range(wheels.shape[0]):
         speed, roll_l, roll_r = unit_rolls(radius, wheels[i, 0], wheels[i, 1])
         a_x, a_y, height = (slope[i, 0], slope[i, 1], slope[i, 2]) if has_slope else (0.0, 0.0, 0.0)
-        load, tilt = loads_at(cg[i, 0], cg[i, 1], warp, floor, pull_of(speed, mu, constants.centripetal), (a_x, a_y, height), mu)
+        x, y, t = gripped(cg[i, 0], cg[i, 1], warp, split, floor)
+        load, tilt = loads_at(x, y, t, floor, pull_of(speed, mu, constants.centripetal), (a_x, a_y, height), mu)
         vx, vy, wz, found = motion(roll_l, roll_r, load, floor)
         if not found:
             value[i] = d_wheels[i] = d_cg[i] = d_params[i] = math.nan
@@ -366,7 +372,7 @@ def _solve_samples(
         d_params[i, 1, 10], d_params[i, 0, 11] = wz * speed, -wz * speed
 
         # Back from unit speed, which is radius sqrt((q_l^2 + q_r^2) / 2) and so depends on the wheels too.
-        xi, eta = (cg[i, 0] + height * a_x) / floor.half_wheelbase, (cg[i, 1] + height * a_y) / floor.half_track
+        xi, eta = (x + height * a_x) / floor.half_wheelbase, (y + height * a_y) / floor.half_track
         for k in range(3):
             pulled, leaning = by[k, 12] * load.pull, by[k, 15] * load.slope_x + by[k, 16] * load.slope_y
             along = 0.5 * (point[k] - by[k, 0] * roll_l - by[k, 1] * roll_r) + pulled
@@ -391,6 +397,7 @@ def _solve_samples(
                 d_slope[i, k, 0] = by_xi * height + by[k, 15] * speed / mu + steeper * a_x
                 d_slope[i, k, 1] = by_eta * height + by[k, 16] * speed / mu + steeper * a_y
                 d_slope[i, k, 2] = by_xi * a_x + by_eta * a_y
+        _by_given_load(cg[i], (x, y, t), split, floor, d_cg[i], d_params[i])
 
 
 _twist = kernel(_solve_samples)
@@ -398,9 +405,45 @@ _twist = kernel(_solve_samples)
 
 @subroutine
 def floor_of(params: FloatArray, saturation: float) -> Floor:
-    """The parameters (12,) that the balance depends on, with the contact law of ``saturation``."""
+    """The parameters (13,) that the balance depends on, with the contact law of ``saturation``."""
     mu, mu_ratio, stiffness, rolling_resistance, scrub = params[3], params[4], params[5], params[6], params[7]
     return Floor(params[1] / 2.0, params[2] / 2.0, tyre(stiffness, mu_ratio, params[9], saturation), rolling_resistance / mu, scrub)
+
+
+@subroutine
+def gripped(x: float, y: float, warp: float, split: float, floor: Floor) -> tuple[float, float, float]:
+    """Centre of the contact forces [m] and their warp where left wheels grip ``split`` more than right ones, over the mean of both.
+
+    A contact's force goes with its load times its friction. With g = split / 2, loads (1 + sx xi + sy eta + sx sy t) / 4 as in
+    `motion_models.friction.contact.loads` times (1 + sy g) have the same form: xi' = (xi + g t) / n, eta' = (eta + g) / n and
+    t' = (t + g xi) / n with n = 1 + g eta.
+    """
+    if split == 0.0:
+        return x, y, warp
+    g = 0.5 * split
+    n = 1.0 + g * y / floor.half_track
+    return (x + g * warp * floor.half_wheelbase) / n, (y + g * floor.half_track) / n, (warp + g * x / floor.half_wheelbase) / n
+
+
+@subroutine
+def _by_given_load(
+    cg: FloatArray, grip: tuple[float, float, float], split: float, floor: Floor, d_cg: FloatArray, d_params: FloatArray
+) -> None:
+    """Turn the derivatives ``d_cg`` (3, 2) and ``d_params`` (3, 13) by the centre of the forces and their warp, ``grip``, into those by
+    the ``cg`` (2,) and the warp that are given; and fill that by split_friction. See `gripped`."""
+    (x, y, t), g, hw, ht = grip, 0.5 * split, floor.half_wheelbase, floor.half_track
+    xi, eta = cg[0] / hw, cg[1] / ht
+    warp = t * (1.0 + g * eta) - g * xi
+    n = 1.0 + g * eta
+    for k in range(3):
+        by_x, by_y, by_t = d_cg[k, 0], d_cg[k, 1], d_params[k, 8]
+        by_n = -(by_x * x + by_y * y + by_t * t) / n
+        d_cg[k, 0] = (by_x + by_t * g / hw) / n
+        d_cg[k, 1] = by_y / n + by_n * g / ht
+        d_params[k, 8] = (by_t + by_x * g * hw) / n
+        d_params[k, 2] += 0.5 * (by_x * g * warp - by_t * g * xi / hw) / n
+        d_params[k, 1] += 0.5 * (by_y * g / n - by_n * g * eta / ht)
+        d_params[k, 12] = 0.5 * ((by_x * warp * hw + by_y * ht + by_t * xi) / n + by_n * eta)
 
 
 @subroutine
@@ -439,10 +482,11 @@ def _wheels(command: FloatArray, cg: FloatArray, params: FloatArray, constants: 
     slope = constants.slope
     radius, mu, warp, tracked_y = params[0], params[3], params[8], params[11]
     floor = floor_of(params, constants.saturation)
-    unit = pull_of(1.0, mu, constants.centripetal)
+    unit, split = pull_of(1.0, mu, constants.centripetal), params[12]
     for i in range(command.shape[0]):
         on = (slope[i, 0], slope[i, 1], slope[i, 2]) if slope.shape[0] > 0 else (0.0, 0.0, 0.0)
-        load, _ = loads_at(cg[i, 0], cg[i, 1], warp, floor, unit, on, mu)
+        x, y, t = gripped(cg[i, 0], cg[i, 1], warp, split, floor)
+        load, _ = loads_at(x, y, t, floor, unit, on, mu)
         wz = command[i, 1]
         roll_l, roll_r = rolls_for(command[i, 0] + wz * tracked_y, wz, load, floor)
         rates[i, 0], rates[i, 1] = roll_l / radius, roll_r / radius

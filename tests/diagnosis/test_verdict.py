@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.diagnosis.causes import CAUSES, WINDOW_CAUSES, Hypothesis, slope_across, track_width
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Hypothesis, Setting, with_sizes
 from localization.diagnosis.diagnose import TOLERANCE, diagnose
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.findings import (
@@ -25,7 +26,7 @@ from localization.diagnosis.findings import (
 )
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, make_regression
 from localization.diagnosis.noise import given_noise
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor, with_sizes
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from localization.diagnosis.verdict import (
     _information_apart,
     attribute_rows,
@@ -104,7 +105,7 @@ def test_describe_row_tolerated_names_cause_and_share() -> None:
     ],
 )
 def test_describe_size_has_its_direction_in_words(cause: str, size: float, words: str) -> None:
-    assert {**CAUSES, **WINDOW_CAUSES}[cause].describe(size) == words
+    assert CAUSES[cause].describe(size) == words
 
 
 def diagnosis(findings: tuple[Finding, ...], trends: tuple[Trend, ...], table: dict[str, Component]) -> Diagnosis:
@@ -158,7 +159,7 @@ def test_attribute_rows_lists_no_tolerated_cause_that_is_not_significant(rotatio
 
 
 def test_sentence_slopes_along_and_across_are_told_apart() -> None:
-    along, across = finding("slope", 0.03), dataclasses.replace(finding("slope", -0.02), definition=slope_across())
+    along, across = finding("slope", 0.03), dataclasses.replace(finding("slope", -0.02), definition=CAUSES["slope (across)"])
     text = sentence(diagnosis((along, across), (), {"yaw": row("attributed")}))
     assert "Correct slope (along), off by +0.03 rad" in text
     assert "slope (across), off by -0.02 rad" in text
@@ -231,7 +232,9 @@ def test_correctable_findings_keep_what_the_contested_one_hardly_moves() -> None
 @pytest.mark.parametrize(("robot", "twin_m"), [("jackal", -0.13), ("husky_a200", -0.1)], ids=["jackal", "husky_a200"])
 def test_track_width_twin_beyond_the_wheelbase_is_not_considered(robot: str, twin_m: float) -> None:
     """k goes with t / (t^2 + W^2), which t and W^2 / t share."""
-    g, cause = load_robot(robot).geometry, track_width(load_robot(robot))
+    g, general = load_robot(robot).geometry, CAUSES["track_width"]
+    seen = Setting(load_robot(robot), "log", *(True,) * 6, is_friction_model=True)
+    (cause,) = general.variants(general, seen)
     least, most = cause.bounds
     assert least == pytest.approx(min(g.wheelbase_m - g.track_width_m, -2.0 * cause.typical))
     assert twin_m < least

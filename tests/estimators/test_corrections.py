@@ -63,7 +63,7 @@ def test_friction_correction_derivatives_equal_differences(seed):
     params = some_params(model, rng)
     wheels, cg = some_drive(rng, 5)
     twist = model.twist(wheels, cg, params)
-    assert twist.d_params.shape == (5, 3, 14)
+    assert twist.d_params.shape == (5, 3, 15)
     for j in range(2):
         assert_one_agrees(twist.d_cg[..., j], differences(lambda c: model.twist(wheels, c, params).value, cg, j))
     for j in range(params.size):
@@ -230,7 +230,7 @@ def test_corrections_with_unexplained_lidar_finish_the_run():
     estimator = make_physical(sensor, ALL, Noise().scaled(0.1))
     world, rng, stamp, pose = make_world(estimator, 0), np.random.default_rng(1), 0, np.zeros(3)
     model = estimator.model
-    none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 14)))
+    none = Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(model.param_names))))
     estimator.step(Step(0, 0, none, np.zeros(3), np.zeros(3), False, True, None, None))
     for _ in range(80):
         wheels, dt = np.array([[-3.0, 3.0]]), np.array([0.1])

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.diagnosis.causes import CAUSES, Cause, friction_change
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Cause, with_sizes
+from localization.diagnosis.causes.floor import friction_change
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import Linearization
-from localization.diagnosis.prediction import DrivePredictor, with_sizes
+from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.selection import folds, heldout_gain, heldout_squares
 from motion_models.se2 import FloatArray
 

@@ -97,7 +97,7 @@ def energy(body, state, cg):
 def test_dynamics_of_locked_wheels_only_take_energy(seed):
     rng = np.random.default_rng(seed)
     cg = rng.uniform(-0.1, 0.1, 2)
-    params = BODY.params + np.eye(12)[8] * 0.2 + np.eye(12)[9] * 0.3
+    params = BODY.params + np.eye(13)[8] * 0.2 + np.eye(13)[9] * 0.3
     body = dataclasses.replace(BODY, cg_height=0.1, params=params, creep=0.01, rest_speed=0.1)
     steps = math.ceil(2e-3 / body.longest_step(0.0))
     state = np.array([0, 0, 0, *rng.uniform(-1, 1, 2), rng.uniform(-2, 2)])

@@ -10,7 +10,7 @@ import pytest
 
 from localization.cli import main
 from motion_models.errors import RobotError
-from motion_models.robot import DIFF_DRIVE, Clock
+from motion_models.robot import DIFF_DRIVE, Clock, Lidar, Mount, Tf
 from motion_models.robot_file import load_robot, parse_robot, reference, robot_names, robot_toml
 
 # Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], from the sources in each file.
@@ -95,6 +95,29 @@ def test_robot_toml_clock_and_multipliers_round_trip() -> None:
 def test_parse_robot_bad_clock_is_refused(line: str, message: str) -> None:
     with pytest.raises(RobotError, match=message):
         parse_robot(robot_toml(load_robot("husky_a200")).split("\n[clock]")[0] + "\n" + line + "\n", "test")
+
+
+def test_robot_toml_lidar_and_overridden_frames_round_trip() -> None:
+    robot = load_robot("husky_a200")
+    changed = dataclasses.replace(robot, lidar=Lidar(1.02, 0.03), tf=Tf(("laser",)), mounts={**robot.mounts, "laser": Mount(0.4)})
+    assert parse_robot(robot_toml(changed), "test") == changed
+    transforms = {"laser": Mount(0.1), "other": Mount(0.2)}
+    assert changed.with_mounts(transforms)["laser"] == Mount(0.4)
+    assert robot.with_mounts(transforms)["laser"] == Mount(0.1)
+    assert changed.with_mounts(transforms)["other"] == Mount(0.2)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("[lidar]\nrange_scale = 1000.0", "lidar.range_scale is 1000; it must be near 1"),
+        ("[lidar]\nrange_offset_m = 30.0", "lidar.range_offset_m is 30 m"),
+        ('[tf]\noverridden = ["camera"]', "tf.overridden names camera, of which there is no"),
+    ],
+)
+def test_parse_robot_bad_lidar_or_frames_are_refused(line: str, message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        parse_robot(f"{robot_toml(load_robot('husky_a200'))}\n{line}\n", "test")
 
 
 def test_parse_robot_multiplier_far_from_one_is_refused() -> None:

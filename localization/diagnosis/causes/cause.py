@@ -1,0 +1,327 @@
+"""What a cause is: a direction in which robot, floor or sensors may differ from the robot file, with all that follows from it.
+
+A `Hypothesis` holds everything that may differ from the robot file; a cause adds its size to one place of it. The predictor that
+predicts motions from a hypothesis is in `localization.diagnosis.prediction`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from localization.diagnosis.drive import Drive
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+Stage = Literal["rates", "load", "floor", "twist", "reference", "sensor"]
+"""What a part of a hypothesis changes: the wheels' rates, the load on the wheels, the friction model, the body's twist, or what was
+measured, by that which measured the motion or by another sensor."""
+
+
+def _part(stage: Stage, default: Any = 0.0, lasts: bool = True) -> Any:
+    """A field of `Hypothesis` that changes ``stage``; one that does not ``lasts`` is of one drive, or of its clocks."""
+    return field(default=default, metadata={"stage": stage, "lasts": lasts})
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Motion in all intervals of a drive, as a change of rates or twists gets it."""
+
+    rates: FloatArray
+    """(N, 2) left and right wheel rates [rad/s]."""
+    twist: FloatArray
+    """(N, 3) vx, vy, wz that is predicted from them so far; of zeros where the rates are changed [m/s, m/s, rad/s]."""
+    dt: FloatArray
+    """(N,) length of the intervals [s]."""
+    times_s: FloatArray
+    """(N,) start of the intervals, from the drive's start [s]."""
+
+
+Change = Callable[[Motion, float], FloatArray]
+"""New rates (N, 2) or twists (N, 3) from the motion and the cause's size; they are the old ones at size 0."""
+Changes = tuple[tuple[Change, float], ...]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Deviations from the robot file, of every kind that a cause can have; all 0 for the robot file as it is."""
+
+    left_radius_scale: float = _part("rates")
+    """Relative."""
+    right_radius_scale: float = _part("rates")
+    encoder_loss: float = _part("rates", lasts=False)
+    wheel_radius_drift: float = _part("rates", lasts=False)
+    """Relative growth of all wheels from the drive's start to its end."""
+    changed_rates: tuple[tuple[Change, float], ...] = _part("rates", ())
+    """By causes that change the wheels' rates in another way."""
+    friction: Mapping[str, float] = field(default_factory=dict, metadata={"stage": "floor", "lasts": True})
+    """Additions to parameters of `FrictionModel`."""
+    stiffness_exponent: float = _part("floor")
+    """Power of the wheels' speed with which the slip stiffness grows (`friction_response`)."""
+    cg: tuple[float, float] = _part("load", (0.0, 0.0))
+    payload_kg: float = _part("load")
+    split_friction: float = _part("load")
+    """Grip of the left wheels less that of the right ones, over their mean."""
+    lidar_offset: tuple[float, float, float] = _part("reference", (0.0, 0.0, 0.0))
+    lidar_time_offset_s: float = _part("reference", lasts=False)
+    wheel_time_offset_s: float = _part("sensor", lasts=False)
+    gyro_bias: float = _part("sensor")
+    gyro_scale: float = _part("sensor")
+    gyro_time_offset_s: float = _part("sensor", lasts=False)
+    range_scale: float = _part("reference")
+    range_bias_m: float = _part("reference")
+    slip_coefficients: tuple[float, float, float] = _part("twist", (0.0, 0.0, 0.0))
+    """vy += a vx wz; wz *= 1 - b |vx|; vx -= c vx |wz|."""
+    rotation_coefficients: tuple[float, float, float] = _part("twist", (0.0, 0.0, 0.0))
+    """wz *= 1 + a - b |wz| - c (1 - T), T the share of turning, see `FullLinear`."""
+    longitudinal_curvature_slip: float = _part("twist")
+    """Longitudinal slip by the share of turning, see `FullLinear.longitudinal_slip_curvature`."""
+    changed_twists: tuple[tuple[Change, float], ...] = _part("twist", ())
+    """By causes that change the body's twist in another way."""
+    slope: tuple[float, float] = _part("floor", (0.0, 0.0), lasts=False)
+    """Rise of the floor along the axes of the drive's first heading [rad]."""
+    other_contact_law: float = _part("floor")
+    """Share of the contact law that the robot file does not choose (`motion_models.friction.contact`)."""
+    friction_change: float = _part("floor", lasts=False)
+    """Sideways grip is more by this share from `friction_change_at_s` on."""
+    friction_change_at_s: float = _part("floor", lasts=False)
+    wheel_lag_s: float = _part("rates", lasts=False)
+
+    def __add__(self, other: Hypothesis) -> Hypothesis:
+        """Both deviations at once."""
+        return Hypothesis(**{f.name: _sum(f.name, getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self)})
+
+    def key(self, *stages: Stage) -> tuple[object, ...]:
+        """What its changes of these ``stages`` depend on, hashable."""
+        values = (getattr(self, f.name) for f in dataclasses.fields(self) if f.metadata["stage"] in stages)
+        return tuple(tuple(sorted(v.items())) if isinstance(v, Mapping) else v for v in values)
+
+    def of_robot(self) -> Hypothesis:
+        """The part that changes the robot's motion, on this drive and on others."""
+        return self._where(lambda f: f.metadata["lasts"] and f.metadata["stage"] not in ("reference", "sensor"))
+
+    def without_passing(self) -> Hypothesis:
+        """Without what belongs to one drive or to clocks."""
+        return self._where(lambda f: bool(f.metadata["lasts"]))
+
+    def _where(self, is_kept: Callable[[dataclasses.Field[Any]], bool]) -> Hypothesis:
+        return Hypothesis(**{f.name: getattr(self, f.name) for f in dataclasses.fields(self) if is_kept(f)})
+
+
+def _sum(name: str, one: Any, other: Any) -> Any:
+    if name in ("changed_rates", "changed_twists"):
+        return (*one, *other)
+    if isinstance(one, tuple):
+        return tuple(x + y for x, y in zip(one, other, strict=True))
+    if isinstance(one, Mapping):
+        return {key: one.get(key, 0.0) + other.get(key, 0.0) for key in {**one, **other}}
+    return one + other
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a drive can show: by its kind, its sensors and its robot."""
+
+    robot: Robot
+    kind: str
+    """As `Drive.kind`: log, windows, rotations or runs."""
+    has_positions: bool
+    """Positions were measured, and not headings alone."""
+    has_headings: bool
+    """Headings were measured, and not positions alone."""
+    has_gyro: bool
+    has_ranges: bool
+    """A LiDAR measured the motion."""
+    has_dropouts: bool
+    """An encoder lost counts somewhere."""
+    skids: bool
+    """The robot's wheels skid in turns; else it turns by its geometry."""
+    is_friction_model: bool
+    """The diagnosed model has the floor's friction as its parameters."""
+    change_times_s: tuple[float, ...] = ()
+    """When a change of the floor is tried [s]."""
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the motion was measured along time, and not once for each row of a table."""
+        return self.kind not in ("rotations", "runs")
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A robot file while causes are written into it, one after the other."""
+
+    robot: Robot
+    drive: Drive
+    """Drive on which the causes were found."""
+    cg_shift: FloatArray
+    """(N, 2) by which the file moves the centre of gravity in each interval of the drive [m]."""
+    steps: tuple[str, ...] = ()
+    """What is to be done elsewhere, one sentence each."""
+
+    def with_step(self, text: str) -> Draft:
+        """The draft with one more thing to do elsewhere."""
+        return dataclasses.replace(self, steps=(*self.steps, text))
+
+    def with_robot(self, **sections: Any) -> Draft:
+        """The draft with other ``sections`` of the robot."""
+        return dataclasses.replace(self, robot=dataclasses.replace(self.robot, **sections))
+
+
+_PRIOR_FACTOR = 4.0  # sigma of a size's prior, over the typical size, where no physical limit is given
+_PLAUSIBLE_SIGMAS = 4.0  # of the typical size, or of a physical prior: one robot of 16,000 has more
+_SHOWN_UNITS: Mapping[str, tuple[float, str]] = {"1": (100.0, "%"), "m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
+"""Factor and unit in sentences, by the SI unit of a size."""
+OTHER_REMEDY = "record this drive, and run `skidloc diagnose --out DIR`: robot.toml has the correction"
+
+
+def _itself(cause: Cause, _: Setting) -> tuple[Cause, ...]:
+    return (cause,)
+
+
+def _always(_: Setting) -> bool:
+    return True
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One cause, as a direction in which hypotheses may differ."""
+
+    id: str
+    unit: str
+    meaning: str
+    typical: float
+    """A size that is common on robots: what a drive should be able to show, and the unit of steps in numeric differences."""
+    negligible: float
+    """Smaller sizes are within the accuracy of robot files, mounts and clocks: they are tolerated."""
+    inject: Callable[[Hypothesis, float], Hypothesis] = field(repr=False)
+    """What it changes: the hypothesis with a size of this cause added."""
+    words: tuple[str, str]
+    """What the robot does at a positive and at a negative size; {} stands for the magnitude with its unit."""
+    correct: Callable[[Draft, float], Draft] | None = field(default=None, repr=False)
+    """Writes a size into a robot file; None where only the models' coefficients hold it, which are matched to the motion."""
+    remedy: str = OTHER_REMEDY
+    """What to do; ``{g}`` is the corrected robot's geometry and ``{c}`` its clock."""
+    applies: Callable[[Setting], bool] = field(default=_always, repr=False)
+    """Whether a drive can show it."""
+    by_skidding: bool = False
+    """It acts by the friction of wheels that skid: no cause of a robot with casters."""
+    is_shown_by_headings: bool = False
+    """Headings alone show it; how far a robot turns has many physical reasons that only positions separate."""
+    variants: Callable[[Cause, Setting], tuple[Cause, ...]] = field(default=_itself, repr=False)
+    """The cause as it is on a drive's robot, or at several moments."""
+    reference_words: tuple[str, str] | None = None
+    """Words where a reference measured the motion and not the LiDAR, for a cause that is then the reference's."""
+    one_sided: bool = False
+    is_clock: bool = False
+    """It shifts samples in time, between which rates have kinks: signatures are differenced to both sides, over a larger step."""
+    at_s: float | None = None
+    """For a change: when."""
+    prior_sigma: float = 0.0
+    """How large the size may plausibly be, as a standard deviation; 0 for four times the typical size."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Sizes beyond these are not considered, where that is not the same to both sides (see `bounds`)."""
+    largest_share: float = 0.0
+    """Magnitude beyond which another cause is more likely, where that is not by ``prior_sigma``; 0: by that."""
+    axis: str = ""
+    """Where two causes have one id: its axis, in words."""
+
+    @property
+    def label(self) -> str:
+        """The id as tables show it, with the axis where there are two."""
+        return f"{self.id} ({self.axis})" if self.axis else self.id
+
+    @property
+    def key(self) -> str:
+        """Unique also among several moments of one change."""
+        return self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
+
+    @property
+    def group(self) -> str:
+        """Name of the group of causes of which only one is tried at a time."""
+        return self.key if self.axis else self.id
+
+    @property
+    def plausible(self) -> float:
+        """Sigma of the prior of the size."""
+        return self.prior_sigma or _PRIOR_FACTOR * self.typical
+
+    @property
+    def largest(self) -> float:
+        """Magnitude beyond which a size is not considered: ten times the typical size, or five sigma of a physical prior."""
+        return min(10.0 * self.typical, 5.0 * self.prior_sigma or math.inf)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Sizes that are considered: up to `largest` to both sides, or to one, within `limits`."""
+        return max(0.0 if self.one_sided else -self.largest, self.limits[0]), min(self.largest, self.limits[1])
+
+    @property
+    def largest_plausible(self) -> float:
+        """Magnitude beyond which another cause is more likely that is not in the catalogue: four times the typical size, or four sigma of
+        a physical prior."""
+        return self.largest_share or _PLAUSIBLE_SIGMAS * (self.prior_sigma or self.typical)
+
+    def describe(self, size: float, sigma: float = 0.0) -> str:
+        """The effect of ``size`` in words, with its direction, and with its ``sigma`` where that is given.
+
+        >>> from localization.diagnosis.causes import CAUSES
+        >>> CAUSES["track_width"].describe(-0.012)
+        'the left and right contacts are 12 mm closer together than the robot file has it'
+        """
+        factor, unit = (1.0, self.unit) if self.is_coefficient else _SHOWN_UNITS.get(self.unit, (1.0, self.unit))
+        amount = abs(size) * factor
+        decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
+        spread = f" +- {sigma * factor:.{decimals}f}" if sigma else ""
+        return self.words[size < 0.0].format(f"{amount:.{decimals}f}{spread}" + ("" if unit == "1" else f" {unit}"))
+
+    @property
+    def is_coefficient(self) -> bool:
+        """Whether the size is a coefficient of a slip law, which has no unit that is read by itself."""
+        return "= " in self.meaning
+
+
+def with_sizes(sizes: Mapping[Cause, float]) -> Hypothesis:
+    """The hypothesis that causes have these ``sizes``."""
+    hypothesis = Hypothesis()
+    for cause, size in sizes.items():
+        hypothesis = cause.inject(hypothesis, size)
+    return hypothesis
+
+
+def add(name: str) -> Callable[[Hypothesis, float], Hypothesis]:
+    """Adds a size to the number ``name`` of hypotheses."""
+    return lambda b, s: dataclasses.replace(b, **{name: getattr(b, name) + s})
+
+
+def add_item(name: str, index: int) -> Callable[[Hypothesis, float], Hypothesis]:
+    """Adds a size to one number of the tuple ``name`` of hypotheses."""
+
+    def inject(b: Hypothesis, s: float) -> Hypothesis:
+        old = getattr(b, name)
+        changed: dict[str, Any] = {name: tuple(v + s if i == index else v for i, v in enumerate(old))}
+        return dataclasses.replace(b, **changed)
+
+    return inject
+
+
+def change_rates(change: Change) -> Callable[[Hypothesis, float], Hypothesis]:
+    """Changes the wheels' rates by a function of the motion and the size, as a cause of another kind than those of the catalogue."""
+    return lambda b, s: dataclasses.replace(b, changed_rates=(*b.changed_rates, (change, s)))
+
+
+def change_twist(change: Change) -> Callable[[Hypothesis, float], Hypothesis]:
+    """Changes the body's twist by a function of the motion and the size, as a cause of another kind than those of the catalogue."""
+    return lambda b, s: dataclasses.replace(b, changed_twists=(*b.changed_twists, (change, s)))
+
+
+def changed(changes: Changes, motion: Motion, name: str) -> FloatArray:
+    """``name`` of ``motion``, its rates or its twist, after ``changes`` one after the other."""
+    for change, size in changes:
+        motion = dataclasses.replace(motion, **{name: np.ascontiguousarray(change(motion, size))})
+    return np.asarray(getattr(motion, name))

@@ -1,0 +1,95 @@
+"""Causes in the load on the wheels: a payload, and the centre of gravity."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from localization.diagnosis.causes.cause import Cause, Draft, Setting, add, add_item
+from motion_models.center_of_gravity.files import arms_model
+from motion_models.center_of_gravity.parts import Arms
+from motion_models.se2 import FloatArray
+
+_TOLERATED_LOAD = 0.01
+"""Share of the robot's mass that is tolerated as payload: over the front edge it moves the centre of gravity of the robots that come with
+skidloc by 1 to 5 mm, and 3 mm are tolerated of `cg_offset_x` [-]."""
+_WEIGH = "weigh the robot (`skidloc weigh`), or set "
+
+
+def _payload_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
+    return (dataclasses.replace(cause, negligible=_TOLERATED_LOAD * setting.robot.geometry.mass_kg),)
+
+
+def _correct_payload(draft: Draft, size: float) -> Draft:
+    """The robot's mass; a payload in the gripper moves with the arms, ``[arms] payload_kg``, and another is at rest on the robot."""
+    drive, arms, g = draft.drive, draft.robot.arms, draft.robot.geometry
+    mass = g.mass_kg + size
+    draft = draft.with_robot(geometry=dataclasses.replace(g, mass_kg=mass))
+    carried = drive.payload_arms * (size / mass)
+    if arms is not None and drive.payload_link and arms.payload_kg + size > 0.0:
+        arms = dataclasses.replace(arms, payload_kg=arms.payload_kg + size, payload_link=drive.payload_link)
+        return dataclasses.replace(draft.with_robot(arms=arms), cg_shift=draft.cg_shift + carried)
+    return _move_cg(draft, carried.mean(axis=0))
+
+
+def _move_cg(draft: Draft, shift: FloatArray) -> Draft:
+    """The CG of everything but the arms, so that the whole robot's moves by ``shift`` (2,) [m]; of a table, which has its own, no file
+    moves it, and only the models' coefficients hold it."""
+    arms, g = draft.robot.arms, draft.robot.geometry
+    x, y = (float(v) for v in shift)
+    if arms is not None and draft.drive.kind != "log":
+        return draft.with_step(
+            f"the centre of gravity is off by ({x:+.4f}, {y:+.4f}) m from that of the table; the models' coefficients hold it, and the "
+            "file's arms stay."
+        )
+    if arms is None:
+        draft = draft.with_robot(geometry=dataclasses.replace(g, cg_x_m=g.cg_x_m + x, cg_y_m=g.cg_y_m + y))
+    else:
+        draft = draft.with_robot(arms=_with_static_part(arms, draft.robot.folder, shift))
+    return dataclasses.replace(draft, cg_shift=draft.cg_shift + shift)
+
+
+def _with_static_part(arms: Arms, folder: Path | None, shift: FloatArray) -> Arms:
+    """``arms`` with everything but the arms moved so that the whole robot's CG moves by ``shift`` (2,) [m]: by the shift times all mass
+    over its own."""
+    model = arms_model(arms, folder)
+    x, y = (float(v) for v in model.static.position + shift * (model.mass / model.static.mass))
+    sigmas = np.sqrt(np.diag(model.static.covariance))
+    return dataclasses.replace(
+        arms,
+        static_mass_kg=model.static.mass,
+        static_x_m=x,
+        static_y_m=y,
+        static_mass_sigma_kg=float(sigmas[0]),
+        static_sigma_m=float(sigmas[1]),
+    )
+
+
+PAYLOAD = Cause(
+    "payload",
+    *("kg", "the robot carries a mass that its file does not have", 8.0, 1.0, add("payload_kg")),
+    ("the robot carries {} that its file does not have", "the robot carries {} less than its file has"),
+    correct=_correct_payload,
+    remedy="weigh the robot (`skidloc weigh`), and add the load to its file",
+    by_skidding=True,
+    variants=_payload_of_robot,
+    one_sided=True,
+)
+CG_OFFSET_X = Cause(
+    "cg_offset_x",
+    *("m", "the centre of gravity lies farther ahead than given", 0.03, 0.003, add_item("cg", 0)),
+    ("the centre of gravity lies {} farther ahead than given", "the centre of gravity lies {} farther back than given"),
+    correct=lambda d, s: _move_cg(d, np.array([s, 0.0])),
+    remedy=_WEIGH + "cg_x_m = {g.cg_x_m:.4f}",
+    by_skidding=True,
+)
+CG_OFFSET_Y = Cause(
+    "cg_offset_y",
+    *("m", "the centre of gravity lies farther left than given", 0.02, 0.003, add_item("cg", 1)),
+    ("the centre of gravity lies {} farther left than given", "the centre of gravity lies {} farther right than given"),
+    correct=lambda d, s: _move_cg(d, np.array([0.0, s])),
+    remedy=_WEIGH + "cg_y_m = {g.cg_y_m:.4f}",
+    by_skidding=True,
+)

@@ -1,0 +1,105 @@
+"""The gain of a corrected robot: its file is written, read again, and the log replayed with it, on windows that did not correct it."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from localization.diagnosis.causes.cause import with_sizes
+from localization.diagnosis.corrected_robot import compared_halves, correct_robot, first_half_sizes, of_reference
+from localization.diagnosis.drive import Drive
+from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.linearization import Linearization
+from localization.diagnosis.prediction import DrivePredictor
+from localization.logs.reader import Log
+from localization.pipeline import Run, Trial, replay
+from motion_models import se2
+from motion_models.calibration.maneuvers import IntArray
+from motion_models.registry import make_model
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot, relocated, robot_toml
+
+_ESTIMATORS = ("odometry", "ekf")
+_LEAD_NS = 4_000_000_000
+"""Before the first held-out window, for an estimator to begin [ns]."""
+_SAME_WINDOW_S = 0.3
+"""Windows of two readings of a log that begin so close are one: clocks that are corrected move them by less."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reader:
+    """How the diagnosed log is read with a robot: its drive, and its events."""
+
+    drive: Callable[[Robot], Drive]
+    log: Callable[[Robot], Log]
+
+
+def check_written_robot(
+    reader: Reader, predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]
+) -> HandoverCheck | None:
+    """Correct the robot by the first half of the drive, write its file, read it again, and predict and replay the second half with it.
+
+    ``named`` are the keys of the findings. Everything that the file holds acts as it does in other commands: units, clocks, ranges and
+    mounts when messages are decoded. None where the file would hold none of the findings, or the drive is too short.
+    """
+    sizes = first_half_sizes(predictor, linearization, named)
+    if sizes is None:
+        return None
+    old = predictor.drive.robot
+    corrected = correct_robot(predictor, sizes).robot
+    if corrected == old:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.toml"
+        path.write_text(robot_toml(relocated(corrected, path.parent)), encoding="utf-8")
+        new = load_robot(path)
+        drive = reader.drive(new)
+        if not drive.maneuvers:
+            return None
+        model = make_model(predictor.model.name, new)
+        after = DrivePredictor(drive, model, has_inertia=predictor.has_inertia, baseline=predictor.baseline)
+        of_marker = of_reference(with_sizes(sizes), drive.is_lidar_reference)
+        first, second = _paired(predictor.drive, drive)
+        rows = predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second]
+        found = compared_halves(*rows)
+        if found is None:
+            return None
+        runs = (old, predictor.drive, first), (new, drive, second)
+        errors = [_replay_errors(reader.log(robot), robot, predictor.model.name, cut, windows) for robot, cut, windows in runs]
+    return dataclasses.replace(found, replays={name: (errors[0][name], errors[1][name]) for name in errors[0]})
+
+
+def _paired(before: Drive, after: Drive) -> tuple[IntArray, IntArray]:
+    """Indices of the windows of the second half of ``before``, and of the same windows ``after``."""
+    half = len(before.maneuvers) // 2
+    starts = after.spans_ns[:, 0]
+    pairs = []
+    for i in range(half, len(before.maneuvers)):
+        j = int(np.argmin(np.abs(starts - before.spans_ns[i, 0])))
+        if abs(int(starts[j] - before.spans_ns[i, 0])) <= _SAME_WINDOW_S * 1e9:
+            pairs.append((i, j))
+    first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    return first, second
+
+
+def _replay_errors(log: Log, robot: Robot, model: str, drive: Drive, windows: IntArray) -> Mapping[str, float]:
+    """Root mean square error of the motion in ``windows`` of ``drive`` by each estimator, headings times half the track [m]."""
+    trials = [Trial(make_model(model, robot), name) for name in _ESTIMATORS]
+    start_ns = int(drive.spans_ns[windows, 0].min()) - _LEAD_NS
+    events = (event for event in log.events() if event.stamp_ns >= start_ns)
+    runs = replay(events, trials, log.robot, log.mounts, log.sources.lidar is not None)
+    return {run.estimator: _window_error(run, drive, windows, 0.5 * robot.geometry.track_width_m) for run in runs}
+
+
+def _window_error(run: Run, drive: Drive, windows: IntArray, turn_m: float) -> float:
+    spans = drive.spans_ns[windows]
+    inside = run.trajectory.covers(spans[:, 0]) & run.trajectory.covers(spans[:, 1])
+    used = [drive.maneuvers[int(i)] for i in windows[inside]]
+    moved = se2.between(run.trajectory.at(spans[inside, 0]), run.trajectory.at(spans[inside, 1]))
+    known = np.array([np.isfinite(np.diagonal(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1])) for m in used])
+    off = se2.between(np.array([m.measured[-1] for m in used]), moved) * np.array([1.0, 1.0, turn_m])
+    return float(np.sqrt(np.mean(np.sum(np.where(known, off, 0.0) ** 2, axis=1))))
