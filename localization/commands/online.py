@@ -54,7 +54,7 @@ class Online(OnlineSettings):
     """New .rrd file to record rerun's picture to, instead of opening its viewer."""
     transport: Annotated[TransportName, tyro.conf.arg(aliases=["--door"])] = "auto"
     """Transport of live topics: ROS 2 by DDS itself (extra `ros2`), by rclpy, or by zenoh (extra `zenoh`, experimental); ROS 1 by rospy.
-    `auto`: rclpy where it is sourced, else DDS."""
+    `auto`: rclpy where it is sourced, else DDS, else zenoh, by what is installed."""
     domain: int | None = None
     """ROS 2 domain (transports dds and zenoh); by default that of ROS_DOMAIN_ID, or 0."""
     interface: str | None = None

@@ -8,6 +8,7 @@ import pytest
 from localization.logs.serialization import encode, make
 from localization.ros.publisher import ODOMETRY
 from localization.ros.settings import NodeConfig
+from localization.ros.transports import choose_transport
 from localization.ros.transports.base import CLOCK, CLOCK_TYPE, Received, SimTimeTransport
 from tests.helpers.online import LogTransport, drive_log, run_node, track
 
@@ -59,3 +60,13 @@ def test_messages_before_the_first_clock_are_dropped():
     assert [received.received_ns for received in sim.take(0.1) if received.data == b"scan"] == [7 * S]
     assert sim.now_ns() == 7 * S
     assert CLOCK not in sim.publishers()
+
+
+@pytest.mark.parametrize(
+    ("installed", "chosen"),
+    [({"rclpy", "cyclonedds"}, "rclpy"), ({"cyclonedds", "zenoh"}, "dds"), ({"zenoh"}, "zenoh"), (set(), "dds")],
+)
+def test_automatic_transport_is_what_is_installed(installed, chosen, monkeypatch):
+    """On aarch64 there is no wheel of cyclonedds."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name if name in installed else None)
+    assert choose_transport() == chosen

@@ -41,7 +41,8 @@ try:
     from cyclonedds.util import duration
 except ImportError as error:
     raise TransportError(
-        f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error})."
+        f"ROS 2 topics without a ROS installation need the extra 'ros2': pip install 'skidloc[ros2]' ({error}). On aarch64, where"
+        " cyclonedds has no wheel, that extra is zenoh (--transport zenoh, beside rmw_zenohd); or source ROS 2 and use rclpy."
     ) from error
 
 _LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
