@@ -215,6 +215,9 @@ class Run:
     parameter_history: Mapping[str, FloatArray] = field(default_factory=dict)
     """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
 
+    def __repr__(self) -> str:
+        return f"<Run {self.model} {self.estimator}: {self.trajectory!r}, {len(self.warnings)} warnings>"
+
 
 _PARAMETERS_EVERY_NS = 2_000_000_000
 """Time between two samples of the estimated parameters, in `Run.parameter_history`."""

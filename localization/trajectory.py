@@ -56,6 +56,13 @@ class Trajectory:
                 "Sort the poses and drop those with repeated stamps."
             )
 
+    def __repr__(self) -> str:
+        if not len(self):
+            return "<Trajectory: no poses>"
+        seconds = (self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9
+        sigmas = "" if self.covariances is None else ", with covariances"
+        return f"<Trajectory: {len(self)} poses in {seconds:.1f} s, {self.distance(0.05):.1f} m{sigmas}>"
+
     def __len__(self) -> int:
         return len(self.stamps_ns)
 

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from localization import *  # noqa: F403
     from motion_models import *  # noqa: F403
+    from skidloc.online import Online as Online
     from skidloc.robot_log import RobotLog as RobotLog
     from skidloc.robot_log import Runs as Runs
     from skidloc.robot_log import ScoredRun as ScoredRun
     from skidloc.robot_log import open as open
 
-_OWN = ("RobotLog", "Runs", "ScoredRun", "open")
+_OWN = {"Online": "skidloc.online", **dict.fromkeys(("RobotLog", "Runs", "ScoredRun", "open"), "skidloc.robot_log")}
 
 
 def __getattr__(name: str) -> Any:
@@ -29,7 +30,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return metadata.version("skidloc")
     if name in _OWN:
-        return getattr(import_module("skidloc.robot_log"), name)
+        return getattr(import_module(_OWN[name]), name)
     for package in map(import_module, ("localization", "motion_models")):
         if name in package.__all__:
             return getattr(package, name)

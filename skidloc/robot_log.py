@@ -16,18 +16,17 @@ import numpy as np
 
 from localization.calibration.wheel_wiring import open_checked
 from localization.errors import EvaluationError
-from localization.estimators import check_estimator
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result, score
+from localization.events import Event
 from localization.logs import Log, TopicOverrides
-from localization.pipeline import ReplayConfig, Trial, replay
+from localization.pipeline import ReplayConfig, replay
 from localization.trajectory import Trajectory
-from motion_models.errors import ModelError
-from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from skidloc.online import make_trial
 
 if TYPE_CHECKING:
     from localization.report.notebook import Picture
@@ -60,6 +59,10 @@ class RobotLog:
         """Whether the log has scans of a planar or 3D LiDAR."""
         return self.log.sources.lidar is not None
 
+    def events(self) -> Iterator[Event]:
+        """Wheels, IMU, scans and the rest in SI units, in order of stamps: what `skidloc.Online.process` takes."""
+        return self.log.events()
+
     def replay(
         self,
         pairs: Sequence[str] = DEFAULT_PAIRS,
@@ -72,17 +75,10 @@ class RobotLog:
         file's topic, if the log has it.
         Raises `ModelError` or `EstimatorError` for unknown names, `EvaluationError` for a reference that shares no time with the log.
         """
-        trials = [self._trial(pair) for pair in pairs]
+        trials = [make_trial(pair, self.robot, self.has_lidar, self.log.no_wheels) for pair in pairs]
         track = self._reference(reference)
         runs = replay(self.log.events(), trials, self.robot, self.log.mounts, self.has_lidar, config)
         return Runs(tuple(ScoredRun(result) for result in score(runs, track)), track)
-
-    def _trial(self, pair: str) -> Trial:
-        model, separator, estimator = pair.partition("/")
-        if not separator:
-            raise ModelError(f"'{pair}' is no pair of motion model and estimator. Write MODEL/ESTIMATOR, as skid_steer/ekf.")
-        check_estimator(estimator, self.has_lidar, no_wheels=self.log.no_wheels)
-        return Trial(make_model(model, self.robot), estimator)
 
     def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:
         if isinstance(given, ReferenceTrack | Relations):
@@ -144,6 +140,9 @@ class ScoredRun:
     def plot(self, reference: ReferenceTrack | Relations | None = None) -> Picture:
         """Picture of the trajectory, aligned to the reference if there is one."""
         return Runs((self,), reference).plot()
+
+    def _repr_html_(self) -> str:
+        return Runs((self,), None)._repr_html_()
 
     def __repr__(self) -> str:
         error = "no reference" if self.ate_m is None else f"ATE {self.ate_m:.3f} m"

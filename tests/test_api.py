@@ -102,3 +102,30 @@ def test_unknown_reference_and_run_are_refused(log: skidloc.RobotLog, runs: skid
         log.replay(["diff_drive/odometry"], reference="nothing.tum")
     with pytest.raises(KeyError, match="diff_drive_odometry, diff_drive_ekf"):
         runs["graph"]
+
+
+def test_online_gives_the_estimates_of_a_replay(log: skidloc.RobotLog, runs: skidloc.Runs) -> None:
+    online, seen = skidloc.Online("husky_a200", "diff_drive/ekf", has_lidar=False, mounts=log.log.mounts), []
+    online.add_callback(seen.append)
+    replayed = runs["diff_drive/ekf"].trajectory
+    for event in log.events():
+        online.process(event)
+        if len(seen) >= 200:
+            break
+    assert [estimate.stamp_ns for estimate in seen] == replayed.stamps_ns[: len(seen)].tolist()
+    np.testing.assert_array_equal([estimate.pose for estimate in seen], replayed.poses[: len(seen)])
+
+
+def test_online_unknown_pair_is_named() -> None:
+    with pytest.raises(SkidlocError, match="'skid_steer' is no pair"):
+        skidloc.Online("husky_a200", "skid_steer")
+    with pytest.raises(SkidlocError, match="needs"):
+        skidloc.Online("husky_a200", "skid_steer/lidar", has_lidar=False)
+
+
+def test_reprs_are_short(log: skidloc.RobotLog, runs: skidloc.Runs) -> None:
+    run = runs["diff_drive/ekf"]
+    for shown in (log, run, run.trajectory, run.result, run.result.run):
+        assert len(repr(shown)) < 200
+    assert "poses in" in repr(run.trajectory)
+    assert run._repr_html_().startswith("<table>")

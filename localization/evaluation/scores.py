@@ -30,6 +30,10 @@ class Result:
     contradictions: tuple[str, ...] = ()
     """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
 
+    def __repr__(self) -> str:
+        error = None if self.accuracy is None else self.accuracy.ate_rmse_m
+        return f"<Result {self.name}: {'no ATE' if error is None else f'ATE {error:.3f} m'}, {self.run.trajectory!r}>"
+
     @property
     def name(self) -> str:
         """Model and estimator, as in names of files."""
