@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
+PACKAGES = ("motion_models", "localization")
 CODE = re.compile(r"\{code: (?P<path>\S+) :: (?P<text>[^\n]+?)\}(?=\s|$)")
 MESSAGES = re.compile(r"<!-- messages: (?P<path>\S+) -->")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
@@ -30,9 +31,15 @@ class Line(NamedTuple):
 
 
 def find_line(path: str, text: str) -> Line:
-    """The only line of the file ``path`` that contains ``text``. Raises `ValueError` where there is none, or are several."""
-    lines = (ROOT / path).read_text(encoding="utf-8").splitlines()
-    found = [Line(path, i, line.strip()) for i, line in enumerate(lines, start=1) if text in line]
+    """The only line of the file ``path``, or of the packages where it was moved, that contains ``text``. Raises `ValueError` where there
+    is none, or are several."""
+    files = [ROOT / path] if (ROOT / path).exists() else sorted(p for name in PACKAGES for p in (ROOT / name).rglob("*.py"))
+    found = [
+        Line(str(file.relative_to(ROOT)), i, line.strip())
+        for file in files
+        for i, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1)
+        if text in line
+    ]
     if len(found) != 1:
         raise ValueError(f"{path} has {len(found)} lines with '{text}': name a part of one.")
     return found[0]

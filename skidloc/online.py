@@ -21,8 +21,8 @@ class Online:
     """Estimates from events in SI units as they come: the same as those of a replay of these events, to the last bit.
 
     ``robot`` is a shipped robot's name, the path of a robot file, or a `Robot`; ``pair`` is MODEL/ESTIMATOR. ``mounts`` are poses of
-    sensors by frame (by default the robot file's). Without ``has_lidar`` an estimate comes with the wheels, else with each scan. Stamps are integer
-    nanoseconds of one clock. Raises `RobotError`, `ModelError` or `EstimatorError` for names that do not exist.
+    sensors by frame (by default the robot file's). Without ``has_lidar`` an estimate comes with the wheels, else with each scan. Stamps
+    are integer nanoseconds of one clock. Raises `RobotError`, `ModelError` or `EstimatorError` for names that do not exist.
 
     >>> import numpy as np
     >>> from localization.events import WheelSample
