@@ -242,8 +242,8 @@ def _check(drive: Drive) -> float:
         )
     if drive.is_gyro_reference or drive.motion_reference == "none":
         raise CalibrationError(
-            f"{name} has no positions, only headings, and these do not show about which point the robot turns: "
-            "record a LiDAR, or name a --reference."
+            f"{name} has no positions{', only headings' if drive.is_gyro_reference else ''}, so that it does not show about which point the"
+            " robot turns: record a LiDAR, or name a --reference."
         )
     g = robot.geometry
     turned = driven(drive.maneuvers, g.wheel_radius_m, g.track_width_m)[2]

@@ -207,7 +207,8 @@ def _find_problems(log: Log, topics: list[TopicInfo]) -> list[str]:
     if log.sources.lidar is None:
         found.append(f"no LiDAR: neither a planar scan ({wanted.scan}) nor a point cloud ({wanted.points}) is in the log.")
     if log.sources.imu is None:
-        found.append(f"no IMU ({wanted.imu}) is in the log: the yaw rate comes from the wheels and the LiDAR alone.")
+        others = "the wheels alone" if log.sources.lidar is None else "the wheels and the LiDAR alone"
+        found.append(f"no IMU ({wanted.imu}) is in the log: the yaw rate comes from {others}.")
     for source in (log.sources.lidar, log.sources.imu):
         frame = log.frames.get(source.topic) if source is not None else None
         if source is not None and frame is not None and frame not in log.mounts:
