@@ -123,6 +123,11 @@ class MapFusion(FilteredOdometry):
         self.localizer.set_pose(se2.compose(pose, se2.inverse(delta)), cov)
         self._take_pose()
 
+    def relocalize(self) -> None:
+        """Forget the place in the map, and search all of it. Odometry goes on."""
+        self.localizer.search_everywhere()
+        self._take_pose()
+
     def _take_pose(self) -> None:
         """The map's frame is where the localizer has the last keyframe."""
         self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(self.odometry.state["key"]))

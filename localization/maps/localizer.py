@@ -103,6 +103,11 @@ class Localizer:
         self._recent.clear()
         self._running = None
 
+    def search_everywhere(self) -> None:
+        """Forget the place, and search the whole map by the scans from now on."""
+        self.set_pose(self.places.centre, np.zeros((3, 3)))
+        self._initial_left, self._search_odds = 0, -_MAX_SEARCH_ODDS
+
     @property
     def probability(self) -> float:
         """That the robot is where `pose` has it; while it is searched, that it is at the first of `hypotheses`."""

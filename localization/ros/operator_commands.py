@@ -1,4 +1,4 @@
-"""Commands of an operator to a running node: a pose on /initialpose or /set_pose, payloads, reset, pause and tare, by topics and services.
+"""Commands of an operator to a running node, by topics and services: poses, payloads, reset, pause and tare, maps to save and to search.
 
 Topics work with every transport, services with rclpy alone.
 """
@@ -6,19 +6,26 @@ Topics work with every transport, services with rclpy alone.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from localization.errors import MapError, OutputError
 from localization.estimators import MapFusion
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
+from localization.maps import SavedMap, save_map
+from localization.output import versions
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
 from localization.ros.settings import Names
 from localization.ros.transports.base import Received, ServiceReply, Transport
+from motion_models import se2
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
 
@@ -26,6 +33,9 @@ SET_POSE, INITIAL_POSE = "set_pose", "initialpose"
 """Topics of a given pose: that of robot_localization, and that of RViz and nav2."""
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 RESET, PAUSE, TARE_PAYLOAD, PAYLOAD = "~/reset", "~/pause", "~/tare_payload", "~/payload"
+RELOCALIZE, SAVE_MAP = "~/relocalize", "~/save_map"
+_GLOBAL_LOCALIZATION, _SERIALIZE_MAP = "reinitialize_global_localization", "~/serialize_map"
+"""Services by the names of AMCL and slam_toolbox."""
 _TOPIC_TYPES = {
     SET_POSE: POSE_TYPE,
     INITIAL_POSE: POSE_TYPE,
@@ -33,6 +43,8 @@ _TOPIC_TYPES = {
     PAUSE: "std_msgs/msg/Bool",
     TARE_PAYLOAD: "std_msgs/msg/Empty",
     PAYLOAD: "geometry_msgs/msg/InertiaStamped",
+    RELOCALIZE: "std_msgs/msg/Empty",
+    SAVE_MAP: "std_msgs/msg/String",
 }
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 _MIN_SIGMA = 1e-3
@@ -76,6 +88,10 @@ class OperatorCommands:
         transport.offer_service(names.resolve(RESET), "std_srvs/srv/Empty", self.reset)
         transport.offer_service(names.resolve(PAUSE), "std_srvs/srv/SetBool", self.pause)
         transport.offer_service(names.resolve(TARE_PAYLOAD), "std_srvs/srv/Trigger", self.tare_payload)
+        for name in (RELOCALIZE, _GLOBAL_LOCALIZATION):
+            transport.offer_service(names.resolve(name), "std_srvs/srv/Empty", self.relocalize)
+        transport.offer_service(names.resolve(SAVE_MAP), "nav2_msgs/srv/SaveMap", self.save_map)
+        transport.offer_service(names.resolve(_SERIALIZE_MAP), "slam_toolbox/srv/SerializePoseGraph", self.save_map)
 
     def execute(self, received: Received) -> bool:
         """Execute the command that ``received`` holds; False where it is of another topic."""
@@ -100,6 +116,10 @@ class OperatorCommands:
             return self.pause(bool(message.data))
         if topic == TARE_PAYLOAD:
             return self.tare_payload()
+        if topic == RELOCALIZE:
+            return self.relocalize()
+        if topic == SAVE_MAP:
+            return self.save_map(message.data)
         frame = frame_name(message.header.frame_id)
         if topic == PAYLOAD:
             com = message.inertia.com
@@ -137,6 +157,42 @@ class OperatorCommands:
         self._node.restart(StartPose())
         self._report("reset: begins anew at the origin.")
         return ServiceReply(True, "begins anew at the origin")
+
+    def relocalize(self, _: Any = True) -> ServiceReply:
+        """Forget the place in the saved map, and search all of it; odometry goes on."""
+        estimator = self._node.session.pipeline.estimator
+        if not isinstance(estimator, MapFusion):
+            self._report(f"relocalize: {(refused := 'there is no saved map to search. Name one by --map.')}")
+            return ServiceReply(False, refused)
+        estimator.relocalize()
+        self._report("relocalize: the whole map is searched.")
+        return ServiceReply(True, "the whole map is searched")
+
+    def save_map(self, name: str) -> ServiceReply:
+        """Write the map as it is into the new file ``name``, beside the estimates; what comes of it is reported."""
+        session = self._node.session
+        mapped = session.pipeline.estimator.keyframe_map()
+        if mapped is None or not str(name).strip():
+            text = "give the name of a new file." if mapped is not None else "this estimator has no map of its own. Use graph."
+            self._report(f"save_map: nothing is saved: {text}")
+            return ServiceReply(False, text)
+        mounts = {frame: asdict(mount) for frame, mount in sorted(session.pipeline.mounts.items())}
+        moved = replace(mapped, poses=se2.compose(session.state.start.map_T_start, mapped.poses))
+        saved = SavedMap(moved, {"log": "live topics", "run": session.name, "mounts": mounts, "versions": dict(versions())})
+        path = Path(name).with_suffix(".skidmap")
+        if path.exists():
+            self._report(f"save_map: '{path}' exists already. Give another name.")
+            return ServiceReply(False, f"'{path}' exists already")
+        threading.Thread(target=self._write, args=(path, saved), name="save map").start()
+        return ServiceReply(True, f"'{path}' is being written")
+
+    def _write(self, path: Path, saved: SavedMap) -> None:
+        try:
+            save_map(path, saved)
+        except (MapError, OutputError) as error:
+            self._report(f"save_map: {error}")
+        else:
+            self._report(f"save_map: {len(saved.map.poses)} keyframes are in '{path}'.")
 
     def pause(self, is_paused: bool) -> ServiceReply:
         """Use no messages and publish no estimates, or continue. Motion meanwhile is a gap in the wheels' data."""

@@ -139,7 +139,11 @@ def test_node_subscribes_as_sensor_data_but_to_tf_static(calm):
     subscribed = calm[0].subscribed
     assert [topic for topic, is_latched in subscribed.items() if is_latched] == ["/tf_static"]
     assert {"/joint_states", "/scan", "/points", "/imu/data", "/center_of_gravity"} <= set(subscribed)
-    commands = {"/set_pose", "/initialpose", *(f"/skidloc/{name}" for name in ("reset", "pause", "tare_payload", "payload"))}
+    commands = {
+        "/set_pose",
+        "/initialpose",
+        *(f"/skidloc/{name}" for name in ("reset", "pause", "tare_payload", "payload", "relocalize", "save_map")),
+    }
     assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf", *commands}  # unused topics cost nothing
 
 
@@ -755,9 +759,29 @@ def test_rclpy_transport_calls_the_documented_interface(monkeypatch):
     assert fake.sent == [("/skidloc/odometry", b"three")]
     assert transport.publishers() == {"/scan": {"sensor_msgs/msg/LaserScan"}}  # /points has no publisher
     assert transport.offer_service("/skidloc/pause", "std_srvs/srv/SetBool", lambda data: ServiceReply(data, "paused"))
+    _offer_map_services(transport, fake, monkeypatch)
     response = fake.services["/skidloc/pause"](types.SimpleNamespace(data=True), types.SimpleNamespace(success=False, message=""))
     assert (response.success, response.message) == (True, "paused")
     transport.restrict(["/scan"])
     assert set(fake.subscriptions) == {"/scan"}
     assert fake.handlers == "none"  # Ctrl-C is the command's
     transport.close()
+
+
+def _offer_map_services(transport, fake, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Services of nav2 and slam_toolbox are offered where their packages are; handlers are given the name of the file."""
+
+    def save(name: str) -> ServiceReply:
+        return ServiceReply(name == "good", "")
+
+    assert not transport.offer_service("/skidloc/save_map", "nav2_msgs/srv/SaveMap", save)
+    for package, kind in (("nav2_msgs", "SaveMap"), ("slam_toolbox", "SerializePoseGraph")):
+        module = types.ModuleType(f"{package}.srv")
+        setattr(module, kind, type(kind, (), {}))
+        monkeypatch.setitem(sys.modules, f"{package}.srv", module)
+    assert transport.offer_service("/skidloc/save_map", "nav2_msgs/srv/SaveMap", save)
+    assert transport.offer_service("/skidloc/serialize_map", "slam_toolbox/srv/SerializePoseGraph", save)
+    by_nav2, by_toolbox = fake.services["/skidloc/save_map"], fake.services["/skidloc/serialize_map"]
+    for name, is_saved, code in (("good", True, 0), ("bad", False, 255)):
+        assert by_nav2(types.SimpleNamespace(map_url=name), types.SimpleNamespace(result=False)).result is is_saved
+        assert by_toolbox(types.SimpleNamespace(filename=name), types.SimpleNamespace(result=0)).result == code

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 
 from localization.estimators import PriorMap
 from localization.logs import open_log
+from localization.logs.serialization import encode, make
+from localization.maps import load_map
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Trial, replay
 from localization.ros.diagnostics import OK, WARN
@@ -53,6 +57,44 @@ def test_node_in_a_saved_map_is_localized_after_initialpose(places: PlaceMap) ->
     assert {-1, 0, 100} == set(cells.tolist())
     assert (cells == 0).mean() > 0.5
     assert cells.size == grid.info.width * grid.info.height
+
+
+def send(topic: str, data: bytes, at_s: float):
+    """A log's messages with one more."""
+
+    def spoil(messages):
+        at = messages[0].received_ns + int(at_s * S)
+        return sorted([*messages, Received(topic, at, data)], key=lambda m: m.received_ns)
+
+    return LogTransport(drive_log(), spoil)
+
+
+def test_node_relocalize_searches_again_and_offers_amcls_service(places: PlaceMap) -> None:
+    transport = send("/skidloc/relocalize", encode(make("std_msgs/msg/Empty")), 2.0)
+    node, reports = run_node(transport, "map", config=NodeConfig(wait_s=0.0), prior=PriorMap(places, np.array([1.0, 0.1, 0.2])))
+    assert "relocalize: the whole map is searched." in reports
+    poses = np.array([pose for pose, _ in track(transport).values()])
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.05  # odom has no jump
+    assert {"/skidloc/relocalize", "/reinitialize_global_localization", "/skidloc/save_map"} <= set(transport.services)
+    assert transport.services["/reinitialize_global_localization"](True).is_success
+    assert node.session.pipeline.estimator.localization()["state"] == "searching"
+    assert not transport.services["/skidloc/save_map"]("of_a_map").is_success
+
+
+def test_node_save_map_writes_the_graphs_map_and_nothing_over_a_file(tmp_path) -> None:
+    name = str(tmp_path / "live")
+    transport = send("/skidloc/save_map", encode(make("std_msgs/msg/String", data=name)), 12.0)
+    node, reports = run_node(transport, "graph", config=NodeConfig(wait_s=0.0))
+    for thread in [t for t in threading.enumerate() if t.name == "save map"]:
+        thread.join()
+    assert any("keyframes are in" in text for text in reports)
+    saved = load_map(tmp_path / "live.skidmap")
+    assert 1 < len(saved.map.poses) <= len(node.session.pipeline.estimator.keyframe_map().poses)
+    assert saved.provenance["log"] == "live topics"
+    before = (tmp_path / "live.skidmap").read_bytes()
+    assert not transport.services["/skidloc/save_map"](name).is_success
+    assert (tmp_path / "live.skidmap").read_bytes() == before
+    assert not transport.services["/skidloc/relocalize"](True).is_success
 
 
 def test_online_settings_with_a_missing_map_are_refused(tmp_path) -> None:

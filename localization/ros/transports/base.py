@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from localization.errors import TransportError
 from localization.logs.decode import UnusableError
@@ -26,14 +26,14 @@ class Received(NamedTuple):
 
 
 class ServiceReply(NamedTuple):
-    """Answer to a request of std_srvs; `Empty` has none of it."""
+    """Answer to a request; `Empty` has none of it, services of nav2 and slam_toolbox whether it succeeded."""
 
     is_success: bool
     message: str
 
 
-ServiceHandler = Callable[[bool], ServiceReply]
-"""Given the `data` of a SetBool request; True for Empty and Trigger."""
+ServiceHandler = Callable[[Any], ServiceReply]
+"""Given the `data` of a SetBool request, or the name of a file in others; True for Empty and Trigger."""
 
 
 class Transport(Protocol):

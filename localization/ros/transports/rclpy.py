@@ -14,6 +14,10 @@ from localization.ros.transports.base import MonotonicTime, Received, ServiceHan
 _LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
 _MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
 _SERVICE_PACKAGES = ("std_srvs",)
+_REQUEST_FIELDS = ("data", "filename", "map_url")
+"""What a handler is given: of std_srvs/SetBool, slam_toolbox's SerializePoseGraph and nav2_msgs/SaveMap."""
+_FAILURE = 255
+"""`result` of slam_toolbox's services that failed; 0 is success."""
 
 
 def import_rclpy(*parts: str) -> list[Any]:
@@ -88,12 +92,17 @@ class RclpyTransport(MonotonicTime):
         self._writers[topic] = self._node.create_publisher(_interface_class(kind), topic, latched if is_latched else _DEPTH)
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
-        """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; always True."""
+        """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; False where its package is not installed."""
+        if not _is_importable(kind.rpartition("/")[0].replace("/", ".")):
+            return False
 
         def answer(request: Any, response: Any) -> Any:
-            reply = handler(getattr(request, "data", True))
+            reply = handler(next((getattr(request, name) for name in _REQUEST_FIELDS if hasattr(request, name)), True))
             if hasattr(response, "success"):
                 response.success, response.message = reply
+            elif hasattr(response, "result"):
+                is_flag = isinstance(response.result, bool)
+                response.result = reply.is_success if is_flag else (0 if reply.is_success else _FAILURE)
             return response
 
         self._services.append(self._node.create_service(_interface_class(kind), name, answer))
