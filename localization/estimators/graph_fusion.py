@@ -77,6 +77,7 @@ class GraphFusion(FilteredOdometry):
         self._wheels = MotionPreintegration(len(corrections.names))
         self._steps, self._stamps_ns = array("d"), array("q")  # the filter's poses, if they are to be smoothed
         self._nodes, self._covs_since = array("q"), array("d")  # which of them are keyframes; covariances of the motion since the last one
+        self._odometry_covs = array("d")  # of the filter's poses at keyframes
         self._is_smoothing = is_smoothing
         self._is_keyframe_due = self._is_matched = False
         self._key, self._moved = 0, (np.zeros(3), np.zeros((3, 3)))  # last keyframe with a matched scan; motion since the last keyframe
@@ -107,9 +108,19 @@ class GraphFusion(FilteredOdometry):
         self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan) or self._is_found_again()
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
-        pose = se2.compose(self._map_T_odom, estimate.pose)
-        odometry = estimate.pose, estimate.covariance
-        return replace(estimate, pose=pose, covariance=A @ self._key_cov @ A.T + cov, odometry=odometry, map_T_odom=self._map_T_odom)
+        pose, odometry = se2.compose(self._map_T_odom, estimate.pose), (estimate.pose, estimate.covariance)
+        covariance = self._bound(A @ self._key_cov @ A.T + cov, self.odometry.state.cov("pose"))
+        return replace(estimate, pose=pose, covariance=covariance, odometry=odometry, map_T_odom=self._map_T_odom)
+
+    def _bound(self, cov: Cov3, odometry_cov: Cov3) -> Cov3:
+        """Covariance (3, 3) of a pose in the map, of which the graph has ``cov`` and the filter ``odometry_cov``.
+
+        The graph adds the motions from keyframe to keyframe as if their errors were independent. Those of scans in one submap are not:
+        they are of the poses, and do not add up, as the filter has it. Loops take away from the filter's errors, so that its covariance
+        remains a bound; positions have another frame.
+        """
+        is_odometry_better = not self._is_aligned and 0.0 < np.trace(odometry_cov[:2, :2]) < np.trace(cov[:2, :2])
+        return odometry_cov.copy() if is_odometry_better else cov
 
     def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
@@ -146,6 +157,7 @@ class GraphFusion(FilteredOdometry):
             between = self._between(k, wheels)
             update = GraphUpdate(se2.compose(self.graph.pose(between.a), between.delta), wheels, self._epoch_cov(), (between,))
         self.graph.apply(update)
+        self._odometry_covs.extend(odometry.state.cov("pose").ravel())
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
         self._lost_variance = self._position_variance()
@@ -239,7 +251,8 @@ class GraphFusion(FilteredOdometry):
         except EstimatorError as error:
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
-        self._smoothed_covs = covs
+        by_filter = np.array(self._odometry_covs).reshape(-1, 3, 3)
+        covs = self._smoothed_covs = np.array([self._bound(*pair) for pair in zip(covs, by_filter, strict=True)])
         nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
         return Trajectory(filtered.stamps_ns, *through_nodes(odom, np.array(self._covs_since).reshape(-1, 3, 3), nodes, poses, covs))
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.estimators import Estimate, Estimator
-from localization.events import ImuSample, Step
+from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.check import Check
 from localization.sensor_checks.consistency import Consistency
@@ -15,6 +15,7 @@ from localization.sensor_checks.disagreement import Disagreement
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GyroRate
 from localization.sensor_checks.inflation import CovarianceInflation
+from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
@@ -35,6 +36,7 @@ class SensorChecks:
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
+        self._disagreement = Disagreement(faults)
         self._checks: tuple[Check, ...] = (
             LidarTilt(mounts),
             OwnBody(faults),
@@ -42,9 +44,9 @@ class SensorChecks:
             TurnRates(faults, step_config),
             TravelDirection(faults),
             Standstill(faults, window, step_config),
-            Disagreement(faults),
+            self._disagreement,
         )
-        self._consistency = Consistency(faults)
+        self._consistency, self._places = Consistency(faults), KnownPlaces(self._inflation)
         self._step: Step | None = None
         self._pose: Pose2 | None = None
 
@@ -86,7 +88,16 @@ class SensorChecks:
             for check in self._checks:
                 check.compare_estimate(self._step, delta, estimate.nis)
             self._consistency.compare_estimate(delta, estimate.nis)
-        return self._inflation.inflate(estimate, delta)
+        inflated = self._inflation.inflate(estimate, delta)
+        if self._step is not None and self._step.scan is not None:
+            self._compare_places(self._step.scan, self._pose)
+        return inflated
+
+    def _compare_places(self, scan: Scan, pose: Pose2) -> None:
+        """A place from before the faults may show ``pose`` (3,): then differences of sensors count from here on."""
+        if self._places.update(lambda: self._window.project(scan), pose, self._faults.now_s, self._faults.latest_s):
+            self._disagreement.restart()
+            self._consistency.restart()
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on."""

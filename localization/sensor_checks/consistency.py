@@ -134,7 +134,13 @@ class Consistency:
         if nis is not None:
             self._matched_s = self._faults.now_s
         differences = [self._difference(e) for e in self._episodes.values() if self._is_inflating(e)]
+        is_lidar_right = self._has_scans and bool(self._windows[LIDAR_GYRO].bins) and DIFFERENCES[LIDAR_GYRO] not in self._episodes
+        self._faults.inflation.are_wheels_outvoted = is_lidar_right and DIFFERENCES[GYRO_WHEELS] in self._episodes
         self._faults.inflation.ongoing_pair = max(differences, key=lambda d: float(d @ d), default=None)
+
+    def restart(self) -> None:
+        """The pose is known: differences that last count from here on."""
+        self._episodes = {fault: episode._replace(poses=self._poses) for fault, episode in self._episodes.items()}
 
     @property
     def _has_scans(self) -> bool:

@@ -53,11 +53,16 @@ class Disagreement(Check):
             self._now = _Episode(self._distance.began_s - self._faults.start_s, self._faults.now_s, off, self._distance.mean_square)
             self._faults.revise(self._describe(self._now))
         elif self._now is not None:
-            if self._has_lost_scan:
+            if self._has_lost_scan and not self._faults.inflation.are_wheels_outvoted:
                 self._faults.inflation.add(self._now.difference)
             self._has_lost_scan = False
             self._largest = self._larger(self._now)
             self._ended, self._ended_s, self._now = self._ended + 1, self._ended_s + self._now.seconds, None
+
+    def restart(self) -> None:
+        """The pose is known: a disagreement that lasts counts from here on."""
+        self._distance.restart()
+        self._has_lost_scan = False
 
     def _larger(self, now: _Episode) -> _Episode:
         return now if self._largest is None or now.distance > self._largest.distance else self._largest
@@ -109,6 +114,11 @@ class MotionDistance:
     def difference(self) -> FloatArray | None:
         """Difference of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
         return None if self._motions is None else se2.log(se2.between(self._motions[1], self._motions[0]))
+
+    def restart(self) -> None:
+        """A difference that lasts is measured from here on."""
+        if self._motions is not None:
+            self._motions = np.zeros(3), np.zeros(3)
 
     def add(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """``delta`` (3,) of ``step`` by the estimate, and its NIS. Steps without scans or moving wheels are not compared."""

@@ -84,6 +84,11 @@ class FaultLog:
         """All so far, those last whose numbers change."""
         return {**self._declared, **self._revised}
 
+    @property
+    def latest_s(self) -> float:
+        """Time at which the latest fault began; the present one without a fault [s]."""
+        return max((found.at_s for found in self.found.values()), default=self.now_s)
+
     def warnings(self) -> list[str]:
         """All so far, in sentences."""
         return [f"at t = {found.at_s:.1f} s: {found.message}" for found in self.found.values()]

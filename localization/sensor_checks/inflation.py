@@ -25,6 +25,10 @@ class CovarianceInflation:
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
         self._pending, self._spread = np.zeros((3, 3)), np.zeros((3, 3))
         self._since_ns: int | None = None
+        self.are_wheels_outvoted = False
+        """The wheels contradict the gyro, which the LiDAR confirms: their distance from the estimate is no error of it."""
+        self.count = 0
+        """Differences that were added."""
         self.ongoing: FloatArray | None = None
         """(3,) difference of a disagreement that lasts, of wheels and scans."""
         self.ongoing_pair: FloatArray | None = None
@@ -44,11 +48,37 @@ class CovarianceInflation:
 
     def add_distance_from(self, reference: DeadReckoning) -> None:
         """Inflate by how far the estimate is from ``reference``."""
+        if self.are_wheels_outvoted:
+            return
         self.add(se2.log(se2.between(self._estimated, self._by_wheels if reference == "wheels" else self._by_gyro)))
 
     def add(self, difference: FloatArray) -> None:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""
-        self._pending = self._pending + np.outer(difference, difference)
+        self._pending, self.count = self._pending + np.outer(difference, difference), self.count + 1
+
+    @property
+    def is_inflating(self) -> bool:
+        """Whether the covariance has anything of a fault."""
+        return bool(self.total.any())
+
+    @property
+    def is_lasting(self) -> bool:
+        """Whether sensors disagree at present."""
+        return any(difference is not None for difference in self._lasting)
+
+    @property
+    def _lasting(self) -> tuple[FloatArray | None, FloatArray | None]:
+        return None if self.are_wheels_outvoted else self.ongoing, self.ongoing_pair
+
+    @property
+    def spread(self) -> Cov3:
+        """Covariance (3, 3) of what past faults have done to the pose."""
+        return np.asarray(self._spread + self._pending)
+
+    def set_known(self, spread: Cov3) -> None:
+        """A place from before the faults has shown the pose: its covariance ``spread`` (3, 3) is what is left of them."""
+        self._spread, self._pending = spread, np.zeros((3, 3))
+        self.restart()
 
     def inflate(self, estimate: Estimate, delta: Pose2) -> Estimate:
         """``estimate``, which moved by ``delta`` (3,) in the last step, with the covariance of all differences so far."""
@@ -56,7 +86,7 @@ class CovarianceInflation:
         A = se2.adjoint(se2.inverse(delta))
         self._spread = A @ self._spread @ A.T + self._pending
         self._pending = np.zeros((3, 3))
-        spread = self._total()
+        spread = self.total
         if not spread.any() or estimate.covariance is None:
             return estimate
         if self._since_ns is None:
@@ -71,14 +101,15 @@ class CovarianceInflation:
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
-        world = _turn(self._total(), float(smoothed.poses[-1, 2]))
+        world = _turn(self.total, float(smoothed.poses[-1, 2]))
         for i in np.flatnonzero(smoothed.stamps_ns >= self._since_ns):
             covariances[i] += _turn(world, -float(smoothed.poses[i, 2]))
         return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
 
-    def _total(self) -> Cov3:
+    @property
+    def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        return self._spread + sum((np.outer(d, d) for d in (self.ongoing, self.ongoing_pair) if d is not None), np.zeros((3, 3)))
+        return self._spread + self._pending + sum((np.outer(d, d) for d in self._lasting if d is not None), np.zeros((3, 3)))
 
 
 def _turn(cov: Cov3, angle: float) -> Cov3:

@@ -47,7 +47,7 @@ class ScanMotion(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Profile:
+class Profile:
     """A planar scan by bearing about the sensor."""
 
     center: FloatArray
@@ -64,26 +64,36 @@ class ScanOdometry:
     """Scan-to-scan odometry: `register` returns the motion since the scan before, or None."""
 
     def __init__(self) -> None:
-        self._last: _Profile | None = None
+        self._last: Profile | None = None
 
     def register(self, points: FloatArray, center: FloatArray) -> ScanMotion | None:
         """Motion since the last call; ``points`` (M, 2) and sensor position ``center`` (2,) in the body frame [m]; of any of its LiDARs.
 
         None for the first scan, for scans with too few points and where the scans do not fit onto each other.
         """
-        last, now = self._last, _make_profile(points - center, center)
+        last, now = self._last, make_profile(points - center, center)
         self._last = now
         if last is None or now is None:
             return None
         turn = _correlate(np.log(last.ranges), np.log(now.ranges))
-        return None if math.isnan(turn) else _refine(last, now, turn)
+        if math.isnan(turn):
+            return None
+        sensor_turn = np.array([*(now.center - last.center), turn])
+        return _refine(last, now, sensor_turn, _MIN_INLIERS)
 
 
-def _make_profile(points: Points2, center: FloatArray) -> _Profile | None:
-    """None for too few points."""
+def align_from(a: Profile, b: Profile, a_T_b: Pose2, min_inliers: float) -> ScanMotion | None:
+    """Motion of the body from profile ``a`` to ``b``, refined from ``a_T_b`` (3,); None where fewer than the share ``min_inliers`` of the
+    bearings of ``b`` fit."""
+    body_T_a, body_T_b = (np.array([*profile.center, 0.0]) for profile in (a, b))
+    return _refine(a, b, se2.compose(se2.between(body_T_a, a_T_b), body_T_b), min_inliers)
+
+
+def make_profile(points: Points2, center: FloatArray) -> Profile | None:
+    """Profile of ``points`` (M, 2) about the sensor, which is at ``center`` (2,) in the body frame [m]; None for too few points."""
     surface, ranges, normals = np.full((_BEARINGS, 2), np.nan), np.full(_BEARINGS, np.nan), np.full((_BEARINGS, 2), np.nan)
     _fill_profile(points, surface, ranges, normals)
-    return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else _Profile(center, surface, ranges, normals)
+    return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else Profile(center, surface, ranges, normals)
 
 
 @kernel
@@ -143,10 +153,10 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
     return turn
 
 
-def _refine(a: _Profile, b: _Profile, turn: float) -> ScanMotion | None:
-    """a_T_b of the body by point-to-line Gauss-Newton from a pure ``turn`` [rad]; None where the scans do not fit."""
-    a_T_b, structure, inliers = _align_profiles(a.points, a.normals, b.points, np.array([*(b.center - a.center), turn]))
-    if inliers < max(_MIN_INLIERS * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(a_T_b).all():
+def _refine(a: Profile, b: Profile, guess: Pose2, min_inliers: float) -> ScanMotion | None:
+    """a_T_b of the body by point-to-line Gauss-Newton from the sensor's ``guess`` (3,); None where the scans do not fit."""
+    a_T_b, structure, inliers = _align_profiles(a.points, a.normals, b.points, guess)
+    if inliers < max(min_inliers * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(a_T_b).all():
         return None
     body_T_a, body_T_b = (np.array([*profile.center, 0.0]) for profile in (a, b))
     moved = se2.compose(se2.compose(body_T_a, a_T_b), se2.inverse(body_T_b))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
 from localization.events import Step
 from localization.sensor_checks.check import Check, without_scan
@@ -28,6 +30,10 @@ of 3 s would take a time for a turned LiDAR in which the wheels of fr079 count b
 _MIN_TRAVEL_M = 0.05
 """Least way by the wheels, and by the LiDAR, in a bin whose direction counts [m]."""
 _MIN_TRAVEL_BINS = 6
+_MAX_LENGTH_RATIO = 2.0
+"""Ways whose lengths differ by more show wheels that spin, or another unit, and no direction."""
+_CONFIDENCE = 0.999
+"""Of the bound of a direction, one-sided: windows overlap, so that one of a thousand is one of some minutes."""
 _MAX_CURVATURE_RAD_M = 0.6
 """Sharper turns slide sideways."""
 
@@ -41,17 +47,16 @@ class TravelDirection(Check):
 
     def compare(self, window: Window) -> bool:
         """Declare a fault that lasts; whether the directions agree, or no scans have come."""
-        direction = _travel_direction(window.bins)
-        size = None if direction is None else abs(direction)
+        direction = travel_direction(window.bins)
         for evidence, most in ((self._off, _MAX_DIRECTION_RAD), (self._far_off, _MAX_SLIDE_RAD)):
-            evidence.add(None if size is None else size > most, window.end_s, window.begin_s)
+            evidence.add(None if direction is None else direction.exceeds(most), window.end_s, window.begin_s)
         if direction is None:
             return not window.has_scans
         if self._off.is_lasting and self._is_contradicted:
-            degrees = math.degrees(direction)
+            degrees = math.degrees(direction.angle)
             numbers = {"degrees": abs(degrees), "side": "left" if degrees > 0.0 else "right", "correction": -degrees}
             self._faults.declare(LIDAR_DIRECTION, self._off.since_s, numbers)
-        return abs(direction) <= _MAX_DIRECTION_RAD
+        return abs(direction.angle) <= _MAX_DIRECTION_RAD
 
     def apply(self, step: Step) -> Step:
         """``step`` without its scan."""
@@ -62,14 +67,38 @@ class TravelDirection(Check):
         return self._off.is_majority or self._far_off.is_majority
 
 
-def _travel_direction(bins: Iterable[Bin]) -> float | None:
-    """Direction [rad] of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known."""
+class Direction(NamedTuple):
+    """Of the LiDAR's travel against the wheels'."""
+
+    angle: float
+    """[rad]"""
+    bound: float
+    """Its error at most [rad], by the scatter of the bins (`_CONFIDENCE`)."""
+
+    def exceeds(self, most: float) -> bool | None:
+        """Whether it is larger than ``most`` [rad]; None where its error does not show it."""
+        size = abs(self.angle)
+        return True if size - self.bound > most else False if size <= most else None
+
+
+def travel_direction(bins: Iterable[Bin]) -> Direction | None:
+    """Direction of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known.
+
+    With products z_k = lidar_k conj(wheels_k) it is the angle of their sum. Its error is sum Im(z_k exp(-i angle)) / sum |z_k|, with
+    Student's t for a variance that is measured by n - 1 of these.
+    """
     rows = np.array([(*b.wheels, *b.lidar) for b in bins])
     rows = rows[np.isfinite(rows).all(axis=1)]
     wheels, turned, lidar = rows[:, 0] + 1j * rows[:, 1], np.abs(rows[:, 2]), rows[:, 3] + 1j * rows[:, 4]
-    is_long = (np.abs(wheels) >= _MIN_TRAVEL_M) & (np.abs(lidar) >= _MIN_TRAVEL_M) & (turned <= _MAX_CURVATURE_RAD_M * np.abs(wheels))
+    shorter, longer = np.minimum(np.abs(wheels), np.abs(lidar)), np.maximum(np.abs(wheels), np.abs(lidar))
+    is_long = (shorter >= _MIN_TRAVEL_M) & (longer <= _MAX_LENGTH_RATIO * shorter) & (turned <= _MAX_CURVATURE_RAD_M * shorter)
     if is_long.sum() < _MIN_TRAVEL_BINS:
         return None
     offset = lidar[is_long] * np.conj(wheels[is_long])
     unit = offset / np.abs(offset)
-    return float(np.angle(offset.sum())) if abs(unit.mean()) >= _MIN_COHERENCE else None
+    if abs(unit.mean()) < _MIN_COHERENCE:
+        return None
+    angle, n = float(np.angle(offset.sum())), len(offset)
+    across = (offset * np.exp(-1j * angle)).imag
+    sigma = math.sqrt(n / (n - 1) * float(across @ across)) / float(np.abs(offset).sum())
+    return Direction(angle, float(stdtrit(n - 1, _CONFIDENCE)) * sigma)

@@ -14,7 +14,7 @@ from localization.lidar import LidarConfig, Sweep
 from localization.sensor_checks.scan_motion import ScanOdometry
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Points2
 
 _BIN_S = 0.25
 WINDOW_BINS, MIN_BINS = 24, 10
@@ -65,12 +65,16 @@ class Window:
 
     def _register(self, scan: Scan) -> FloatArray:
         """Motion (3,) in the open bin, which ``scan`` ends."""
-        mount = self._mounts.get(scan.frame_id, Mount())
-        sweep = Sweep.from_scan(scan, mount).within(self._config.min_range_m, self._config.max_range_m)
-        motion = self._scans.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
+        motion = self._scans.register(*self.project(scan))
         if motion is None or not self._open.has_scan_at_start:
             return np.full(3, np.nan)
         return motion.delta if motion.has_translation else np.array([np.nan, np.nan, motion.delta[2]])
+
+    def project(self, scan: Scan) -> tuple[Points2, FloatArray]:
+        """Points (M, 2) of ``scan`` in the plane of the body, and where its LiDAR is (2,) [m]."""
+        mount = self._mounts.get(scan.frame_id, Mount())
+        sweep = Sweep.from_scan(scan, mount).within(self._config.min_range_m, self._config.max_range_m)
+        return sweep.project(sweep.points), np.array([mount.x, mount.y])
 
     @property
     def begin_s(self) -> float:

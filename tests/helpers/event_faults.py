@@ -45,6 +45,22 @@ def lose_ticks(left: float, right: float, seed: int = 0) -> EventFault:
     return apply
 
 
+def multiply_wheels(factor: float, begin: float, end: float) -> EventFault:
+    """Angles of the wheels grow ``factor`` times as fast, from the part ``begin`` of the drive to ``end``."""
+
+    def apply(events: list[Event]) -> Iterator[Event]:
+        first_ns, last_ns, last, counted = events[0].stamp_ns, events[-1].stamp_ns, None, np.zeros(2)
+        for event in events:
+            if isinstance(event, WheelSample):
+                step = event.position - (event.position if last is None else last)
+                is_wrong = begin <= (event.stamp_ns - first_ns) / (last_ns - first_ns) < end
+                last, counted = event.position, counted + step * (factor if is_wrong else 1.0)
+                event = replace(event, position=counted.copy(), velocity=np.full(2, np.nan))
+            yield event
+
+    return apply
+
+
 def faults_of_turns(axis: int = 2) -> dict[str, EventFault]:
     """By name; the gyro's ``axis`` is upright."""
     return {

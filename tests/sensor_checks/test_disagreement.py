@@ -13,7 +13,9 @@ import pytest
 from localization.estimators import Estimate
 from localization.ros.state_serialization import serialize
 from localization.sensor_checks.disagreement import DISAGREEMENT
+from localization.sensor_checks.known_places import KnownPlaces
 from motion_models import se2
+from tests.helpers import rooms
 from tests.helpers.checked_drive import CheckedDrive
 
 
@@ -36,8 +38,14 @@ def test_wheels_far_from_the_estimate_are_reported_and_inflate_it() -> None:
 
 
 @pytest.mark.parametrize(("nis", "left_m"), [(None, math.hypot(4.0, 2.5)), (3.0, 0.0)], ids=["scans lost", "scans matched"])
-def test_disagreements_that_end_stay_in_the_covariance_without_scans(nis: float | None, left_m: float) -> None:
-    """Wheels that count three times too far from 4 to 8 s and from 20 to 22.5 s: 4 and 2.5 m, and no more after it."""
+def test_disagreements_that_end_stay_in_the_covariance_without_scans(
+    nis: float | None, left_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No place of before is in reach of a drive of 15 m.
+
+    Wheels that count three times too far from 4 to 8 s and from 20 to 22.5 s: 4 and 2.5 m, and no more after it."""
+    monkeypatch.setattr(KnownPlaces, "update", lambda *arguments: False)
+    monkeypatch.setattr(rooms, "X", (-4.0, 20.0))
     robot = CheckedDrive(nis=nis)
     factors = ((4.0, 8.0), (20.0, 22.5))
     robot.wheels = lambda v, w: ((3.0 if any(a <= 0.1 * len(robot.applied) < b for a, b in factors) else 1.0) * v, w)
