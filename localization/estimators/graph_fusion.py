@@ -117,10 +117,11 @@ class GraphFusion(FilteredOdometry):
 
         The graph adds the motions from keyframe to keyframe as if their errors were independent. Those of scans in one submap are not:
         they are of the poses, and do not add up, as the filter has it. Loops take away from the filter's errors, so that its covariance
-        remains a bound; positions have another frame.
+        remains a bound; positions have another frame. Without a LiDAR the filter does not have the wheels' radius, which the graph has.
         """
-        is_odometry_better = not self._is_aligned and 0.0 < np.trace(odometry_cov[:2, :2]) < np.trace(cov[:2, :2])
-        return odometry_cov.copy() if is_odometry_better else cov
+        is_bound = self.lost is not None and not self._is_aligned
+        is_smaller = 0.0 < np.trace(odometry_cov[:2, :2]) < np.trace(cov[:2, :2])
+        return odometry_cov.copy() if is_bound and is_smaller else cov
 
     def run_deferred(self) -> None:
         """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
