@@ -7,6 +7,7 @@ never changed after they are made. The constructors raise `EventError` for array
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -221,12 +222,12 @@ class Step:
     is_scan_excluded: bool = False
     """A scan came, and a sensor check left it out."""
 
-    @property
+    @cached_property
     def duration(self) -> float:
         """[s]"""
         return (self.end_ns - self.start_ns) * _NS
 
-    @property
+    @cached_property
     def cov(self) -> FloatArray:
         """(3, 3) of ``predicted`` by slip and CG error, for estimators that take steps as independent. A constant CG error is not; their
         prior of k and the centre of rotation covers it."""
@@ -238,7 +239,7 @@ class Step:
         """(3,) by the wheels from the mean of the step to its end; zero where they are not used."""
         return self.twist - self.mean_twist if self.has_wheels else np.zeros(3)
 
-    @property
+    @cached_property
     def mean_twist(self) -> FloatArray:
         """(3,) by the wheels over the step; of one of no duration, and without wheel data, that at its end."""
         return se2.log(self.predicted.delta) / self.duration if self.has_wheels and self.duration > 0.0 else self.twist

@@ -290,9 +290,14 @@ def inverse(a_T_b: ArrayLike) -> FloatArray:
     return np.asarray(_inverse(a_T_b))
 
 
+@gufunc("(n),(n)->(n)")
+def _between(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    out[0], out[1], out[2] = scalar_between(triple(a), triple(b))
+
+
 def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
     """``a_T_b`` (..., 3): pose of b relative to a."""
-    return compose(inverse(world_T_a), world_T_b)
+    return np.asarray(_between(world_T_a, world_T_b))
 
 
 @gufunc("(n),(m)->(m)")

@@ -136,11 +136,13 @@ def clone(state: State, source: str, name: str) -> State:
 
     An older variable ``name`` is marginalized, and the copy takes its place.
     """
-    order, layout = list(state.layout.groups), state.layout
     if name not in state:
-        order, layout = [*order, name], Layout({**layout.groups, name: layout.groups[source]})
-    copied = state.layout.indices([source if one == name else one for one in order])
-    return State(layout, {**state.means, name: state[source]}, state.P[np.ix_(copied, copied)])
+        group = state.layout.groups[source]
+        state = augment(state, name, group, state[source], np.zeros((group.dim, group.dim)))
+    P, copy, original = state.P.copy(), state.layout.rows[name], state.layout.rows[source]
+    P[copy, :] = P[original, :]
+    P[:, copy] = P[:, original]
+    return State(state.layout, {**state.means, name: state[source]}, P)
 
 
 def augment(state: State, name: str, group: Group, mean: FloatArray, cov: FloatArray) -> State:

@@ -139,7 +139,8 @@ class State:
     def cov(self, *names: str) -> FloatArray:
         """Joint covariance (k, k) of the errors of the variables ``names``."""
         if len(names) == 1:
-            return self.cross_cov(names[0], names[0]).copy()
+            rows = self.layout.rows[names[0]]
+            return self.P[rows, rows].copy()
         indices = self.layout.indices(names)
         return self.P[np.ix_(indices, indices)]
 
@@ -149,15 +150,17 @@ class State:
 
     def difference_cov(self, one: str, other: str) -> FloatArray:
         """Covariance (k, k) of e_one - e_other, for errors in one tangent space."""
-        return clip_eigenvalues(self.cov(one) + self.cov(other) - self.cross_cov(one, other) - self.cross_cov(other, one))
+        P, a, b = self.P, self.layout.rows[one], self.layout.rows[other]
+        return clip_eigenvalues(P[a, a] + P[b, b] - P[a, b] - P[b, a])
 
     def between(self, start: str, end: str) -> tuple[FloatArray, FloatArray]:
         """``start``^-1 ``end`` of two variables of one group, and the covariance (k, k) of its right perturbation, to first order."""
         group = self.layout.groups[end]
-        delta = group.compose(group.inverse(self[start]), self[end])
+        delta = group.compose(group.inverse(self.means[start]), self.means[end])
         A = group.adjoint(group.inverse(delta))
-        cross = self.cross_cov(end, start) @ A.T
-        return delta, clip_eigenvalues(self.cov(end) - cross - cross.T + A @ self.cov(start) @ A.T)
+        P, a, b = self.P, self.layout.rows[start], self.layout.rows[end]
+        cross = P[b, a] @ A.T
+        return delta, clip_eigenvalues(P[b, b] - cross - cross.T + A @ P[a, a] @ A.T)
 
 
 def clip_eigenvalues(cov: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import operator
 from collections import deque
 from typing import NamedTuple
 
@@ -132,7 +133,7 @@ class MotionDistance:
         self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), wheels, delta))
         while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:
             self._rows.popleft()
-        self.mean_square = sum(row[1] for row in self._rows) / len(self._rows)
+        self.mean_square = sum(map(operator.itemgetter(1), self._rows)) / len(self._rows)
         is_short = self._rows[-1][0] - self._rows[0][0] < 0.9 * _DISAGREEMENT_S or len(self._rows) < _MIN_DISAGREEING_SCANS
         if is_short or self.mean_square <= _MAX_MEAN_SQUARE:
             self._motions = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,6 +57,11 @@ class FaultLog:
         if self._start_ns is None:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
         self.now_s = (step.end_ns - self._start_ns) * _NS
+
+    @property
+    def declared(self) -> Collection[Fault]:
+        """Faults that were declared."""
+        return self._declared.keys()
 
     def __contains__(self, fault: Fault) -> bool:
         return fault in self._declared

@@ -100,7 +100,7 @@ class TurnRates(Check):
 
     def apply(self, step: Step) -> Step:
         """``step`` without gyro or scan, or with unknown wheels."""
-        faults = {fault for fault, evidence in self._evidence.items() if fault in self._faults and evidence.is_majority}
+        faults = {fault for fault in self._faults.declared if fault in self._evidence and self._evidence[fault].is_majority}
         if faults & {GYRO_OPPOSITE, GYRO_UNIT} or (self._is_gyro_stuck and GYRO_STUCK in faults):
             step = replace(step, turn=None)
         if LIDAR_OPPOSITE in faults:

@@ -90,3 +90,15 @@ def test_map_fusion_pose_given_between_keyframes_is_of_that_moment():
     assert np.abs(delta).max() > 0.01
     estimates = [estimate for event in drive()[1000:1100] for estimate in pipeline.process(event)]
     assert estimates[0].pose == pytest.approx(pose, abs=0.1)
+
+
+def test_map_fusion_has_the_filters_residuals_and_learned_parameters():
+    """Without them, the checks of innovations would not run for it."""
+    pipeline = start(np.array([0.2, -0.2, 0.1]))
+    for event in drive()[:200]:
+        pipeline.process(event)
+    estimator = pipeline.estimator
+    assert isinstance(estimator, MapFusion)
+    assert estimator.residuals is not None
+    np.testing.assert_array_equal(estimator.residuals.file_delta, estimator.odometry.residuals.file_delta)
+    assert [learned.name for learned in estimator.learned_parameters()] == ["wheel_radius_scale", "wheel_separation_multiplier"]

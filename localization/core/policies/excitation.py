@@ -33,8 +33,8 @@ class Excitation:
     def start_scan(self, state: State, R: Cov3) -> None:
         """A scan with covariance ``R`` (3, 3) follows. The way is open where the scan knows less of it than ``state``, until the next
         scan."""
-        prior = state.cov("pose")[0, 0] + state.cov("map")[0, 0] - 2.0 * state.cross_cov("pose", "map")[0, 0]
-        self._is_way_open = bool(R[0, 0] > prior)
+        P, pose, submap = state.P, state.layout.rows["pose"].start, state.layout.rows["map"].start
+        self._is_way_open = bool(R[0, 0] > P[pose, pose] + P[submap, submap] - 2.0 * P[pose, submap])
 
     def considered(self) -> set[str]:
         """Names of the variables that have no gain."""

@@ -1,0 +1,61 @@
+"""Policies of the filter: what a step does not excite, and the slip within a sweep."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.core.filter import inflate
+from localization.core.motion import FilterConfig, initial_state
+from localization.core.policies.excitation import Excitation
+from localization.core.policies.slip import SweepSlip
+from localization.core.policies.wheel_noise import WheelNoiseScale
+from localization.events import Step
+from motion_models import se2
+from motion_models.base import Motion
+from motion_models.online_calibration import make_corrections
+from motion_models.registry import make_model
+from motion_models.robot_file import load_robot
+
+ROBOT = load_robot("vaultbot")
+STATE = initial_state(ROBOT.gyro_noise, make_corrections(make_model("skid_steer", ROBOT), "constant"), FilterConfig())
+
+
+def step_of(delta, is_standing=False, has_wheels=True):
+    """A step of 0.1 s."""
+    delta = np.asarray(delta, float)
+    return Step(0, 100_000_000, Motion(delta, 1e-4 * np.eye(3)), np.zeros(3), se2.log(delta) / 0.1, is_standing, has_wheels)
+
+
+@pytest.mark.parametrize(("delta", "considers"), [([0.1, 0.0, 0.001], True), ([0.1, 0.0, 0.1], False), ([0.0, 0.0, 0.1], False)])
+def test_excitation_of_nearly_straight_motion_considers_corrections(delta, considers):
+    excitation = Excitation(0.4, 0.25)
+    excitation.start_step(step_of(delta).predicted)
+    assert ("corrections" in excitation.considered()) == considers
+    assert {"map", "key"} <= excitation.considered()
+
+
+def test_excitation_by_scan_that_leaves_the_way_open_considers_radius():
+    excitation = Excitation(0.4, 0.25)
+    state = inflate(STATE, "pose", np.diag([1e-4, 1e-4, 1e-4]))
+    excitation.start_scan(state, np.diag([100.0, 1e-6, 1e-6]))
+    assert "radius" in excitation.considered()
+    excitation.start_scan(state, np.diag([1e-6, 1e-6, 1e-6]))
+    assert "radius" not in excitation.considered()
+
+
+def test_sweep_slip_deskews_with_the_slip_of_the_last_step():
+    slip, driven = SweepSlip(), step_of([0.1, 0.0, 0.0])
+    np.testing.assert_allclose(slip.twist(driven), [1.0, 0.0, 0.0])
+    slip.end_step(driven, np.array([0.8, 0.0, 0.1]), is_measured=True)  # wheels slip by 0.2 m/s
+    np.testing.assert_allclose(slip.twist(driven), [0.8, 0.0, 0.1])
+    stalled = step_of([0.0, 0.0, 0.0])
+    np.testing.assert_allclose(slip.offset(stalled), [0.08, 0.0, 0.01], atol=1e-15)
+
+
+def test_wheel_noise_scale_is_of_driving_wheels_alone():
+    noise = WheelNoiseScale()
+    noise.value = 4.0
+    np.testing.assert_allclose(noise.cov(step_of([0.1, 0.0, 0.0])), 4e-4 * np.eye(3))
+    for step in (step_of([0.0, 0.0, 0.0], is_standing=True), step_of([0.1, 0.0, 0.0], has_wheels=False)):
+        np.testing.assert_allclose(noise.cov(step), 1e-4 * np.eye(3))
