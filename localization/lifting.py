@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +34,15 @@ class Pose3:
     """(3, 3) from the body's axes into the world's."""
     covariance: FloatArray
     """(6, 6) of x, y, z, roll, pitch, yaw in the world's axes [m, rad], as in nav_msgs/Odometry."""
+
+    def moved(self, delta: Pose2, cov: Cov3) -> Pose3:
+        """The pose after a planar motion (3,) in the body's plane, whose right perturbation has ``cov`` (3, 3)."""
+        way = self.rotation @ [delta[0], delta[1], 0.0]
+        rotation, full = self.rotation @ _yaw(float(delta[2])), np.zeros((6, 6))
+        full[:2, :2], full[:2, 5], full[5, :2], full[5, 5] = cov[:2, :2], cov[:2, 2], cov[2, :2], cov[2, 2]
+        lever, world = np.eye(6), np.kron(np.eye(2), rotation)
+        lever[:3, 3:] = -np.array([[0.0, -way[2], way[1]], [way[2], 0.0, -way[0]], [-way[1], way[0], 0.0]])
+        return Pose3(self.position + way, rotation, lever @ self.covariance @ lever.T + world @ full @ world.T)
 
 
 class Lifting:
@@ -121,11 +131,29 @@ class Trajectory3:
     """(N, 4) x, y, z, w."""
     covariances: FloatArray
     """(N, 6, 6) of x, y, z, roll, pitch, yaw in the world's axes [m, rad]."""
+    is_lifted: bool
+    """Lifted from planar poses; else of an estimator in space."""
 
     @property
     def sigmas(self) -> FloatArray:
         """(N, 6) of x, y, z, roll, pitch, yaw [m, rad]."""
         return np.sqrt(np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0))
+
+    def poses(self) -> Iterator[Pose3]:
+        """All poses, in order of time."""
+        for position, turn, covariance in zip(self.positions, self.quaternions.tolist(), self.covariances, strict=True):
+            yield Pose3(position, _rotation(*turn), covariance)
+
+
+def _rotation(x: float, y: float, z: float, w: float) -> FloatArray:
+    """(3, 3) of a unit quaternion."""
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
 
 
 class AttitudeTable:
@@ -150,7 +178,7 @@ class AttitudeTable:
         for pose, cov, row in zip(planar.poses[known], covariances[known], rows[at], strict=True):
             found = lifting.add(pose, cov, row[:3], (float(row[3]), float(row[4])))
             numbers.append(_row_of(found))
-        return _trajectory(planar.stamps_ns[known], np.array(numbers))
+        return _trajectory(planar.stamps_ns[known], np.array(numbers), is_lifted=True)
 
 
 class SpaceTable:
@@ -172,7 +200,7 @@ class SpaceTable:
 
     def trajectory(self) -> Trajectory3:
         """All poses so far."""
-        return _trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._numbers))
+        return _trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._numbers), is_lifted=False)
 
 
 def _row_of(pose: Pose3) -> FloatArray:
@@ -180,9 +208,9 @@ def _row_of(pose: Pose3) -> FloatArray:
     return np.concatenate([pose.position, quaternion(pose.rotation), pose.covariance.ravel()])
 
 
-def _trajectory(stamps_ns: IntArray, numbers: FloatArray) -> Trajectory3:
+def _trajectory(stamps_ns: IntArray, numbers: FloatArray, *, is_lifted: bool) -> Trajectory3:
     table = numbers.reshape(-1, 43)
-    return Trajectory3(stamps_ns, table[:, :3], table[:, 3:7], table[:, 7:].reshape(-1, 6, 6))
+    return Trajectory3(stamps_ns, table[:, :3], table[:, 3:7], table[:, 7:].reshape(-1, 6, 6), is_lifted)
 
 
 def write_tum3(path: Path, trajectory: Trajectory3 | None) -> None:

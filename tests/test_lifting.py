@@ -6,9 +6,12 @@ import math
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from localization.lifting import AttitudeTable, Lifting, quaternion, write_tum3
+from localization.lifting import AttitudeTable, Lifting, Pose3, quaternion, write_tum3
+from localization.logs.serialization import FusedWriter
+from localization.logs.writer import FusedEstimate, odometry_message, transform_message
 from localization.trajectory import Trajectory
 
 
@@ -81,3 +84,38 @@ def test_slope_drive_in_mujoco_slides_as_the_odometry_has_it(degrees, mu):
     assert flat[0] > 1.0
     assert tilted[0] < 0.25 * flat[0]
     assert abs(tilted[3]) < 0.05
+
+
+def test_pose_in_space_moved_in_its_plane_has_the_covariance_of_samples():
+    """First order against 40,000 samples of both perturbations."""
+    rng, rotation = np.random.default_rng(3), Rotation.from_euler("zyx", [0.7, -0.2, 0.1]).as_matrix()
+    root = 0.01 * rng.normal(size=(6, 6))
+    pose, delta, cov = Pose3(np.array([1.0, 2.0, 0.5]), rotation, root @ root.T), np.array([0.6, 0.1, 0.3]), np.diag([4e-4, 1e-4, 9e-4])
+    made = pose.moved(delta, cov)
+    error, slip = rng.normal(size=(40_000, 6)) @ root.T, rng.normal(size=(40_000, 3)) * np.sqrt(np.diagonal(cov))
+    before = Rotation.from_rotvec(error[:, 3:]) * Rotation.from_matrix(rotation)
+    after = before * Rotation.from_euler("z", delta[2]) * Rotation.from_rotvec(np.column_stack([0 * slip[:, :2], slip[:, 2]]))
+    along = np.tile([delta[0], delta[1], 0.0], (40_000, 1))
+    middle = (before * Rotation.from_euler("z", delta[2])).apply(np.column_stack([slip[:, :2], 0 * slip[:, 2]]))
+    positions = pose.position + error[:, :3] + before.apply(along) + middle
+    turns = (after * Rotation.from_matrix(made.rotation).inv()).as_rotvec()
+    found = np.cov(np.column_stack([positions - made.position, turns]).T)
+    np.testing.assert_allclose(found, made.covariance, atol=0.05 * np.abs(made.covariance).max())
+
+
+def test_fused_message_of_a_pose_in_space_has_height_tilt_and_covariance():
+    rotation = Rotation.from_euler("zyx", [0.7, -0.2, 0.1])
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    pose = Pose3(np.array([1.0, 2.0, 0.5]), rotation.as_matrix(), covariance)
+    estimate = FusedEstimate(5, np.array([1.0, 2.0, 0.7]), np.zeros(3), np.eye(3), np.eye(3), in_space=pose)
+    message = odometry_message(estimate)
+    q = message.pose.pose.orientation
+    assert message.pose.pose.position.z == 0.5
+    np.testing.assert_allclose([q.x, q.y, q.z, q.w], rotation.as_quat(canonical=True), atol=1e-12)
+    np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), covariance)
+    assert transform_message(estimate).transforms[0].transform.translation.z == 0.5
+    written = FusedWriter(is_ros1=False)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    read = store.deserialize_cdr(written.odometry(estimate), "nav_msgs/msg/Odometry")
+    assert read.pose.pose == message.pose.pose
+    np.testing.assert_array_equal(read.pose.covariance, message.pose.covariance)

@@ -351,6 +351,7 @@ def _distance(results: Sequence[Result]) -> float | None:
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
     t = run.trajectory if run.filtered is None else run.filtered  # what would have been published
+    in_space = None if run.in_space is None or run.in_space.is_lifted else run.in_space.poses()
     parent = MAP_FRAME if run.estimator in ESTIMATORS_WITH_MAP else PARENT_FRAME
     for i in range(len(t)):
         twist_cov = run.twist_covariances[i]
@@ -361,6 +362,7 @@ def _estimates(run: Run) -> Iterator[FusedEstimate]:
             None if t.covariances is None else t.covariances[i],
             twist_cov if np.isfinite(twist_cov).all() else None,
             parent,
+            None if in_space is None else next(in_space),
         )
 
 

@@ -6,7 +6,6 @@ estimate, by templates that rosbags has filled once.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -22,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from localization.logs.chunks import Channel, RawMessage
 from localization.logs.decode import Oddity, UnusableError
 from localization.logs.message_templates import STORE, STORE_ROS1, Message, MessageLayout, Template
-from localization.logs.writer import BODY_FRAME, PARENT_FRAME, FusedEstimate, odom_axes, odometry_message, six_by_six, transform_message
+from localization.logs.writer import BODY_FRAME, PARENT_FRAME, FusedEstimate, odometry_message, six_by_six, transform_message
 from motion_models.se2 import FloatArray
 
 _GRAPH_PACKAGE = "rmw_dds_common"
@@ -351,13 +350,13 @@ class FusedWriter:
 
     def odometry(self, estimate: FusedEstimate) -> bytes:
         """The bytes of `odometry_message`."""
-        covariance = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))
-        parts = (*_place(estimate), six_by_six(covariance), estimate.twist[:2], estimate.twist[2:], six_by_six(estimate.twist_covariance))
+        twist = estimate.twist
+        parts = (*estimate.place(), estimate.pose_covariance(), twist[:2], twist[2:], six_by_six(estimate.twist_covariance))
         return self._odometry.fill(Message(self._odometry_form, estimate.stamp_ns, estimate.stamp_ns, parts))
 
     def transform(self, estimate: FusedEstimate) -> bytes:
         """The bytes of `transform_message`."""
-        return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, _place(estimate)))
+        return self._transform.fill(Message(self._transform_form, estimate.stamp_ns, estimate.stamp_ns, estimate.place()))
 
 
 def _named(layout: MessageLayout, parent: str, body: str) -> MessageLayout:
@@ -372,33 +371,33 @@ def _named(layout: MessageLayout, parent: str, body: str) -> MessageLayout:
     return replace(layout, build=build)
 
 
-def _place(estimate: FusedEstimate) -> tuple[FloatArray, FloatArray]:
-    half = float(estimate.pose[2]) / 2
-    return estimate.pose[:2], np.array([math.sin(half), math.cos(half)])
-
-
 _NOWHERE = FusedEstimate(0, np.zeros(3), np.zeros(3))
 
 
 def _build_odometry(
-    stamp: Any, place: FloatArray, heading: FloatArray, cov: FloatArray, speed: FloatArray, turn: FloatArray, twist_cov: FloatArray
+    stamp: Any, place: FloatArray, turned: FloatArray, cov: FloatArray, speed: FloatArray, turn: FloatArray, twist_cov: FloatArray
 ) -> Any:
     made = odometry_message(_NOWHERE)
     pose, twist = made.pose.pose, made.twist.twist
     made.header.stamp, made.pose.covariance, made.twist.covariance = stamp, cov, twist_cov
-    (pose.position.x, pose.position.y), (pose.orientation.z, pose.orientation.w) = place.tolist(), heading.tolist()
+    _set_place(pose.position, pose.orientation, place, turned)
     (twist.linear.x, twist.linear.y), twist.angular.z = speed.tolist(), float(turn[0])
     return made
 
 
-def _build_transform(stamp: Any, place: FloatArray, heading: FloatArray) -> Any:
+def _set_place(position: Any, orientation: Any, place: FloatArray, turned: FloatArray) -> None:
+    position.x, position.y, position.z = place.tolist()
+    orientation.x, orientation.y, orientation.z, orientation.w = turned.tolist()
+
+
+def _build_transform(stamp: Any, place: FloatArray, turned: FloatArray) -> Any:
     made = transform_message(_NOWHERE)
     made.transforms[0].header.stamp, inner = stamp, made.transforms[0].transform
-    (inner.translation.x, inner.translation.y), (inner.rotation.z, inner.rotation.w) = place.tolist(), heading.tolist()
+    _set_place(inner.translation, inner.rotation, place, turned)
     return made
 
 
 _ODOMETRY = MessageLayout(
-    "", "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry
+    "", "nav_msgs/msg/Odometry", (("f8", 3), ("f8", 4), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry
 )
-_TRANSFORM = MessageLayout("", "tf2_msgs/msg/TFMessage", (("f8", 2), ("f8", 2)), _build_transform)
+_TRANSFORM = MessageLayout("", "tf2_msgs/msg/TFMessage", (("f8", 3), ("f8", 4)), _build_transform)

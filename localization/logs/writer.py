@@ -45,6 +45,7 @@ from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
 from rosbags.typesys.stores.ros2_humble import tf2_msgs__msg__TFMessage as TFMessage
 
 from localization.errors import OutputError
+from localization.lifting import Pose3, quaternion
 from localization.logs.message_templates import STORE, STORE_ROS1, Message, MessageLayout, Template
 from localization.output import output_errors, refuse_existing
 from motion_models.se2 import FloatArray
@@ -161,6 +162,21 @@ class FusedEstimate:
     """(3, 3) of the twist, or None where it is unknown."""
     parent: str = PARENT_FRAME
     """Frame that the pose is in."""
+    in_space: Pose3 | None = None
+    """The pose in space, of which ``pose`` is the one seen from above: it is written with its (6, 6) covariance."""
+
+    def place(self) -> tuple[FloatArray, FloatArray]:
+        """Position (3,) [m] and quaternion x, y, z, w (4,); on the plane where there is no pose in space."""
+        if self.in_space is not None:
+            return self.in_space.position, np.array(quaternion(self.in_space.rotation))
+        x, y, theta = self.pose.tolist()
+        return np.array([x, y, 0.0]), np.array([0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)])
+
+    def pose_covariance(self) -> FloatArray:
+        """(36,) row-major covariance of x, y, z, roll, pitch, yaw in the parent's axes."""
+        if self.in_space is not None:
+            return self.in_space.covariance.ravel()
+        return six_by_six(None if self.covariance is None else odom_axes(self.covariance, float(self.pose[2])))
 
 
 def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]], tf_of: str | None = None) -> None:
@@ -225,14 +241,14 @@ def _write(writer: Writer, path: Path, connection: Connection, stamp_ns: int, da
 
 def odometry_message(estimate: FusedEstimate) -> Odometry:
     """nav_msgs/Odometry."""
-    x, y, theta = (float(v) for v in estimate.pose)
+    (x, y, z), turn = estimate.place()
     vx, vy, wz = (float(v) for v in estimate.twist)
     return Odometry(
         header=_header(estimate),
         child_frame_id=BODY_FRAME,
         pose=PoseWithCovariance(
-            pose=Pose(position=Point(x=x, y=y, z=0.0), orientation=_heading(theta)),
-            covariance=six_by_six(odom_axes(estimate.covariance, theta) if estimate.covariance is not None else None),
+            pose=Pose(position=Point(x=float(x), y=float(y), z=float(z)), orientation=_quaternion(turn)),
+            covariance=estimate.pose_covariance(),
         ),
         twist=TwistWithCovariance(
             twist=Twist(linear=Vector3(x=vx, y=vy, z=0.0), angular=Vector3(x=0.0, y=0.0, z=wz)),
@@ -243,8 +259,8 @@ def odometry_message(estimate: FusedEstimate) -> Odometry:
 
 def transform_message(estimate: FusedEstimate) -> TFMessage:
     """tf2_msgs/TFMessage, from the frame of the pose to `base_link`."""
-    x, y, theta = (float(v) for v in estimate.pose)
-    transform = Transform(translation=Vector3(x=x, y=y, z=0.0), rotation=_heading(theta))
+    (x, y, z), turn = estimate.place()
+    transform = Transform(translation=Vector3(x=float(x), y=float(y), z=float(z)), rotation=_quaternion(turn))
     return TFMessage(transforms=[TransformStamped(header=_header(estimate), child_frame_id=BODY_FRAME, transform=transform)])
 
 
@@ -272,8 +288,9 @@ def _header(estimate: FusedEstimate) -> Header:
     return Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=estimate.parent)
 
 
-def _heading(theta: float) -> Quaternion:
-    return Quaternion(x=0.0, y=0.0, z=math.sin(theta / 2), w=math.cos(theta / 2))
+def _quaternion(turn: FloatArray) -> Quaternion:
+    x, y, z, w = map(float, turn)
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _check_estimates(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[tuple[str, FusedEstimate]]:
@@ -290,6 +307,9 @@ def _check_estimates(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[
         last_ns = estimate.stamp_ns
         _check_values("pose", estimate.pose, (3,), where)
         _check_values("twist", estimate.twist, (3,), where)
+        if estimate.in_space is not None:
+            _check_values("pose in space", estimate.in_space.position, (3,), where)
+            _check_values("covariance of the pose in space", estimate.in_space.covariance, (6, 6), where)
         for what, covariance in (("covariance", estimate.covariance), ("twist covariance", estimate.twist_covariance)):
             if covariance is None:
                 continue

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -280,7 +279,7 @@ def _change_of_rate(dt: FloatArray, rates: FloatArray, age_s: float) -> tuple[fl
 def _fused(estimate: Estimate, stamp_ns: int) -> FusedEstimate:
     """``estimate`` in `odom`."""
     pose, covariance = estimate.odometry or (estimate.pose, estimate.covariance)
-    return FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance)
+    return FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance, in_space=estimate.in_space)
 
 
 class Path:
@@ -339,4 +338,5 @@ def _propagated(last: Estimate, motion: Motion, twist: FloatArray, twist_cov: Fl
 
     pose, cov = moved(last.pose, last.covariance)
     odometry = None if last.odometry is None else moved(*last.odometry)
-    return replace(last, stamp_ns=stamp_ns, pose=pose, covariance=cov, twist=twist, twist_covariance=twist_cov, nis=None, odometry=odometry)
+    in_space = None if last.in_space is None else last.in_space.moved(motion.delta, motion.cov)
+    return Estimate(stamp_ns, pose, cov, twist, twist_cov, None, odometry, last.map_T_odom, in_space)

@@ -22,8 +22,10 @@ IN_SPACE = ReplayConfig(step=StepConfig(planar=False))
 
 @dataclass(frozen=True)
 class SpaceErrors:
-    """Of each estimate with a vertical."""
+    """Of each estimate."""
 
+    stamps_ns: FloatArray
+    """(N,)"""
     poses: FloatArray
     """(N, 4, 4) estimated."""
     true: FloatArray
@@ -78,10 +80,11 @@ def run_in_space(drive: HillDrive, scans: list[Scan], model: str = "skid_steer")
         pose[:3, :3], pose[:3, 3] = made.rotation, made.position
         world = np.kron(np.eye(2), made.rotation)
         spread.append(world.T @ made.covariance @ world + 1e-12 * np.eye(6))
-    true = true_poses(drive, np.array([e.stamp_ns for e in found]))
+    stamps = np.array([e.stamp_ns for e in found])
+    true = true_poses(drive, stamps)
     same = _upright(true[0]) @ se3.inverse(_upright(poses[0]))
     errors = np.array([se3.log(se3.inverse(same @ e) @ t) for e, t in zip(poses, true, strict=True)])
-    return SpaceErrors(poses, true, errors, np.array(spread)), pipeline
+    return SpaceErrors(stamps, poses, true, errors, np.array(spread)), pipeline
 
 
 def _upright(pose: FloatArray) -> FloatArray:
