@@ -59,7 +59,10 @@ def draw_grid(mapped: KeyframeMap, resolution: float, free: float = FREE) -> Gri
     shape = np.floor(both.max(axis=0) / resolution) - low + 1 + _MARGIN_CELLS
     if not (shape.max() <= _MAX_CELLS and shape[0] * shape[1] <= _MAX_CELLS):
         size = f"{shape[0] * resolution:.3g} m x {shape[1] * resolution:.3g} m"
-        raise MapError(f"{size} at {resolution} m are more than {_MAX_CELLS // 1_000_000} million cells. Use a larger --resolution.")
+        raise MapError(
+            f"{size} at {resolution} m are more than {_MAX_CELLS // 1_000_000} million cells. Is the map in metres? Else use a larger "
+            "--resolution."
+        )
     log_odds = np.zeros((int(shape[1]), int(shape[0])))
     starts, ends = np.floor(starts / resolution) - low, np.floor(ends / resolution) - low
     _cast(log_odds, starts.astype(np.int64), ends.astype(np.int64), np.repeat(np.arange(len(starts)), mapped.counts))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from localization.errors import MapError
 from localization.maps.localizer import LIKELY, Localizer
 from localization.maps.place_search import PlaceMap
 from motion_models import se2
@@ -111,3 +113,23 @@ def test_localizer_without_scans_keeps_searching(office: PlaceMap) -> None:
     for _ in range(3):
         localizer.add(np.zeros(3), np.empty((0, 2)), np.zeros(3), COV)
     assert localizer.state == "searching"
+
+
+@pytest.mark.parametrize("scale", [pytest.param(3.28, marks=pytest.mark.extended), 1 / 3.28])
+def test_localizer_in_a_map_of_other_units_is_never_localized(scale: float) -> None:
+    metres = floor_plan.make_map()
+    other = replace(metres, poses=metres.poses * [scale, scale, 1.0], points=metres.points * np.float32(scale))
+    assert {state for state, _ in drive(Localizer(PlaceMap(other, 0.02)), OFFICE, WAY[:4])} == {"searching"}
+
+
+def test_place_map_in_millimetres_asks_for_the_unit() -> None:
+    metres = floor_plan.make_map()
+    with pytest.raises(MapError, match="Is the map in metres"):
+        PlaceMap(replace(metres, poses=metres.poses * [1000.0, 1000.0, 1.0], points=metres.points * np.float32(1000.0)), 0.02)
+
+
+def test_localizer_with_a_sensor_of_another_height_is_never_wrong(office: PlaceMap) -> None:
+    """It misses the low furniture of the map, and has table tops instead."""
+    tops = np.vstack([floor_plan.box(10.5, 5.0, 11.5, 5.8), floor_plan.box(1.5, 6.0, 3.5, 7.0)])
+    found = drive(Localizer(office), np.vstack([OFFICE[:7], OFFICE[11:12], OFFICE[-5:-4], tops]), WAY)
+    assert all(error < 0.3 for state, error in found if state == "localized")

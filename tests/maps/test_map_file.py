@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import random
+import threading
 import zipfile
 from pathlib import Path
 
@@ -137,3 +138,24 @@ def test_load_of_truncated_and_damaged_files_raises_map_errors(file: Path) -> No
         file.write_bytes(data[: rng.randrange(len(data))])
         with pytest.raises(MapError):
             load_map(file)
+
+
+def test_save_by_two_at_once_leaves_one_whole_file_and_refuses_the_other(tmp_path: Path) -> None:
+    path, both, refused = tmp_path / "room.skidmap", threading.Barrier(2), []
+
+    def save(log: str) -> None:
+        both.wait(10.0)
+        try:
+            save_map(path, SavedMap(square_room.make_map(), {"log": log}))
+        except OutputError as error:
+            refused.append(str(error))
+
+    nodes = [threading.Thread(target=save, args=(log,)) for log in ("first", "second")]
+    for node in nodes:
+        node.start()
+    for node in nodes:
+        node.join()
+    assert len(refused) == 1
+    assert "exists already" in refused[0]
+    assert load_map(path).provenance["log"] in ("first", "second")
+    assert [file.name for file in tmp_path.iterdir()] == ["room.skidmap"]
