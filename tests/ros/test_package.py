@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
 import runpy
 import sys
 import tomllib
@@ -14,7 +16,9 @@ import pytest
 from ruamel.yaml import YAML
 
 from localization.errors import SettingError
+from localization.estimators import ESTIMATORS
 from localization.ros.settings import PARAMS_FILE, Names, defaults, make_settings, parameters, to_yaml
+from motion_models.registry import MODELS
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = sorted((ROOT / "localization" / "ros" / "launch").glob("*.launch.py"))
@@ -149,3 +153,18 @@ def test_settings_of_the_command_and_of_the_node_are_the_same():
 
     shared = {field.name for field in dataclasses.fields(make_settings({"robot": "vaultbot"}, Names()))} - {"autostart"}
     assert shared <= {field.name for field in dataclasses.fields(Online)}
+
+
+def test_layouts_show_topics_that_are_published_or_read():
+    share = ROOT / "localization" / "ros" / "share"
+    readme = (ROOT / "localization" / "ros" / "README.md").read_text(encoding="utf-8")
+    known = {f"/skidloc/{name}" for name in re.findall(r"`~/(\w+)`", readme)} | {"/scan", "/points", "/initialpose", "/diagnostics"}
+    rviz = YAML(typ="safe").load((share / "skidloc.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
+    shown = {entry["Topic"]["Value"] for entry in [*rviz["Displays"], *rviz["Tools"]] if "Topic" in entry}
+    layout = json.loads((share / "skidloc_foxglove.json").read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    plotted = {path["value"].split(".")[0] for panel in panels.values() for path in panel.get("paths", [])}
+    fused = {f"/{model}_{estimator}/odometry" for model in MODELS for estimator in ESTIMATORS}
+    assert {"/skidloc/map", "/skidloc/path", "/skidloc/odometry", "/skidloc/pose", "/scan"} <= shown <= known
+    assert set(panels["3D!robot"]["topics"]) | plotted <= known | fused
+    assert all(f'"{name}"' in json.dumps(layout["layout"]) for name in panels)
