@@ -7,7 +7,7 @@ DATA := tests/data
 .PHONY: demo demo-buildings test test-extended test-all test-ros2 check docs benchmark clean
 
 .venv/ready: pyproject.toml constraints.txt
-	@echo "Making .venv with what pyproject.toml names (some 800 MB; minutes at the first time)."
+	@echo "Making .venv with what pyproject.toml names (1.5 GB; minutes at the first time)."
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
