@@ -13,7 +13,9 @@ import numpy as np
 
 from localization.calibration.dead_reckoning import dead_reckon, forward_rate
 from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
-from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, draft_robot, finish_robot, survey_log
+from localization.calibration.log_survey import survey_log
+from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
+from localization.calibration.robot_setup import draft_robot, finish_robot
 from localization.calibration.wheel_signals import LidarMotion, WheelSignals, lidar_motion, read_signals
 from localization.calibration.wheel_units import CORRECTED, expected_scaling
 from localization.calibration.wheel_wiring import WiringReport, open_checked

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from localization.calibration.robot_check import RobotCheck, check_robot, model_of
-from localization.calibration.robot_setup import Given
+from localization.calibration.robot_draft import Given
 from localization.commands.common import new_folder, print_line, print_table, write_json
 from localization.errors import LogError
 from localization.logs import TopicOverrides

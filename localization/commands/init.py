@@ -13,7 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm, Prompt
 
-from localization.calibration.robot_setup import DRIVE_60_S, Draft, Given, Survey, draft_robot, finish_robot, survey_log
+from localization.calibration.log_survey import Survey, survey_log
+from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
+from localization.calibration.robot_setup import draft_robot, finish_robot
 from localization.commands.calibrate import Calibrate
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from localization.logs import TopicOverrides

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from localization.calibration.robot_setup import Draft, Given, Survey, draft_robot, finish_robot
+from localization.calibration.log_survey import Survey
+from localization.calibration.robot_draft import Draft, Given
+from localization.calibration.robot_setup import draft_robot, finish_robot
 from localization.logs.topic_roles import TYPES
 from motion_models.errors import RobotError
 
