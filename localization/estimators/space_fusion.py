@@ -49,7 +49,7 @@ class SpaceFusion(Estimator):
         self._cloud: FloatArray | None = None  # of the last step, deskewed, in the body frame
         self._last_key: Transform3 | None = None
         self._lost = LostScans()
-        self._counts = dict.fromkeys(("scans", "matched", "standing"), 0)
+        self._counts = dict.fromkeys(("scans", "matched", "standing", "planar"), 0)
 
     def step(self, step: Step) -> Estimate:
         """Predict, update by gyro and gravity, update by the cloud."""
@@ -88,7 +88,8 @@ class SpaceFusion(Estimator):
 
     def _update_cloud(self, step: Step) -> float | None:
         """Match the cloud of ``step`` and update by it; its NIS (6 degrees of freedom), or None where there is no cloud or no match."""
-        if step.scan is None or not self._has_vertical:
+        self._counts["planar"] += step.scan is not None and step.scan.is_planar
+        if step.scan is None or step.scan.is_planar or not self._has_vertical:
             self._lost.add(step.end_ns, "excluded") if step.is_scan_excluded else self._lost.add_no_scan(step.end_ns)
             return None
         self._counts["scans"] += 1
@@ -158,6 +159,20 @@ class SpaceFusion(Estimator):
     def counts(self) -> Mapping[str, int]:
         """Number of occurrences by name: scans, matched, and those of lost scans by cause."""
         return {**self._counts, **self._lost.causes}
+
+    def warnings(self) -> list[str]:
+        """What is missing for poses in space, and the remedy."""
+        if not self._has_vertical:
+            return [
+                "poses in space need the vertical, and no IMU with an accelerometer and a known mount has measured gravity: no cloud was "
+                "matched. Give the IMU's mount (/tf_static, or [mounts] of the robot file), or leave out --config.step.no-planar."
+            ]
+        if self._counts["planar"]:
+            return [
+                f"{self._counts['planar']} planar scans were not matched: poses in space take clouds of a 3D LiDAR (--topic.points). "
+                "Leave out --config.step.no-planar for a planar LiDAR."
+            ]
+        return []
 
     def map_points(self) -> Points2:
         """(M, 2) points of the map seen from above [m]."""

@@ -69,3 +69,17 @@ def test_replay_in_space_gives_its_poses_with_six_by_six_covariances(rolled, amo
     np.testing.assert_array_equal(run.in_space.positions[:, :2], run.trajectory.poses[:, :2])
     assert run.in_space.covariances.shape == (len(run.trajectory), 6, 6)
     assert (np.linalg.eigvalsh(run.in_space.covariances) > -1e-9).all()
+
+
+def test_space_fusion_without_an_imus_mount_is_named(rolled, among_trees):
+    """Gravity cannot be measured: wheels alone, and no cloud is matched."""
+    unknown = dataclasses.replace(rolled, mounts={"base_link": rolled.mounts["base_link"]})
+    _, pipeline = run_in_space(unknown, among_trees[:8], "diff_drive")
+    assert pipeline.estimator.counts()["matched"] == 0
+    assert any("no IMU with an accelerometer and a known mount" in warning for warning in pipeline.warnings())
+
+
+def test_space_fusion_of_planar_scans_is_named(rolled, among_trees):
+    flat = [dataclasses.replace(scan, is_planar=True) for scan in among_trees]
+    _, pipeline = run_in_space(rolled, flat, "diff_drive")
+    assert any("planar scans were not matched" in warning for warning in pipeline.warnings())
