@@ -64,11 +64,12 @@ class CovarianceInflation:
     @property
     def is_lasting(self) -> bool:
         """Whether sensors disagree at present."""
-        return any(difference is not None for difference in self._lasting)
+        return len(self._lasting) > 0
 
     @property
-    def _lasting(self) -> tuple[FloatArray | None, FloatArray | None]:
-        return None if self.are_wheels_outvoted else self.ongoing, self.ongoing_pair
+    def _lasting(self) -> list[FloatArray]:
+        ongoing = None if self.are_wheels_outvoted else self.ongoing
+        return [difference for difference in (ongoing, self.ongoing_pair) if difference is not None]
 
     @property
     def spread(self) -> Cov3:
@@ -109,7 +110,7 @@ class CovarianceInflation:
     @property
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        return self._spread + self._pending + sum((np.outer(d, d) for d in self._lasting if d is not None), np.zeros((3, 3)))
+        return self._spread + self._pending + sum((np.outer(d, d) for d in self._lasting), np.zeros((3, 3)))
 
 
 def _turn(cov: Cov3, angle: float) -> Cov3:

@@ -13,7 +13,7 @@ from tests.studies.buildings import BUILDINGS
 ROOT = Path(__file__).parents[2]
 PACKAGES = tuple(str(ROOT / name) for name in ("localization", "motion_models"))
 STEPS, WARM_UP_STEPS = 60, 10
-LIMITS = {"functions": 185, "calls a step": 345, "lines of their files": 6_900}
+LIMITS = {"functions": 190, "calls a step": 365, "lines of their files": 7_050}
 TARGETS = {"functions": 80, "calls a step": 250, "lines of their files": 3_500}
 
 
