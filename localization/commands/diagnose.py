@@ -37,9 +37,10 @@ from localization.diagnosis.linearization import default_model
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
+from motion_models.calibration.cross_validation import Interval
 from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
-from motion_models.errors import CalibrationError
+from motion_models.errors import CalibrationError, SkidlocError
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
@@ -166,7 +167,12 @@ class Diagnose:
             return found
         reader = Reader(lambda robot: self._drive_of_log(self.source, robot), self._log)
         named = [f.definition.key for f in correctable_findings(d)]
-        handover = check_written_robot(reader, found.predictor, found.linearization, named)
+        try:
+            handover = check_written_robot(reader, found.predictor, found.linearization, named)
+        except SkidlocError as error:  # a robot that no command runs with keeps its old values
+            note = f"the corrected robot cannot be replayed: {error}"
+            handover = dataclasses.replace(d.handover, gain=Interval(0.0, 0.0, 0.0))
+            d = dataclasses.replace(d, warnings=(*d.warnings, note))
         return dataclasses.replace(found, diagnosis=dataclasses.replace(d, handover=handover or d.handover))
 
     def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> tuple[list[Finding], tuple[str, ...]]:

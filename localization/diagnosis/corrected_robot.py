@@ -27,7 +27,7 @@ _ANCHOR_WEIGHT = 1e-3  # weight of the old coefficients beside one sample's twis
 _TURN_M = 0.3  # one radian counts as so many metres in the match of twists
 _TWIST = 1e-4
 _MIN_HALF_WINDOWS = 8
-_BLOCK = 2  # neighbouring windows share their errors: a scan between them, and the floor
+BLOCK = 2  # neighbouring windows share their errors: a scan between them, and the floor
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def compared_halves(before: FloatArray, after: FloatArray) -> HandoverCheck | No
     before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[:, c] ** 2))) for c in shown} for r in (before, after))
     scale = np.array([max(before_rms[CHANNELS[c]], 1e-12) * math.sqrt(len(shown)) for c in shown])
     squares = [np.sum(np.nan_to_num(r[:, shown] / scale) ** 2, axis=1) for r in (before, after)]
-    gain = root_mean_gain(squares[0], squares[1], np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
+    gain = root_mean_gain(squares[0], squares[1], np.arange(len(before)) // BLOCK, np.random.default_rng(0))
     return HandoverCheck(before_rms, after_rms, len(before), gain)
 
 

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from localization.diagnosis.causes.cause import with_sizes
-from localization.diagnosis.corrected_robot import compared_halves, correct_robot, first_half_sizes, of_reference
+from localization.diagnosis.corrected_robot import BLOCK, compared_halves, correct_robot, first_half_sizes, of_reference
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.findings import HandoverCheck, Replayed
 from localization.diagnosis.linearization import Linearization
 from localization.diagnosis.prediction import DrivePredictor
 from localization.logs.reader import Log
 from localization.pipeline import Run, Trial, replay
 from motion_models import se2
+from motion_models.calibration.cross_validation import root_mean_gain
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
+from motion_models.se2 import FloatArray
 
 _ESTIMATORS = ("odometry", "ekf")
 _LEAD_NS = 4_000_000_000
@@ -68,9 +71,21 @@ def check_written_robot(
         found = compared_halves(*rows)
         if found is None:
             return None
+        if not drive.has_headings:  # chords between positions are no poses to compare with
+            return found
         runs = (old, predictor.drive, first), (new, drive, second)
         errors = [_replay_errors(reader.log(robot), robot, predictor.model.name, cut, windows) for robot, cut, windows in runs]
-    return dataclasses.replace(found, replays={name: (errors[0][name], errors[1][name]) for name in errors[0]})
+    compared = {name: _compared(errors[0][name], errors[1][name]) for name in errors[0]}
+    return dataclasses.replace(found, replays={name: one for name, one in compared.items() if one is not None})
+
+
+def _compared(before: FloatArray, after: FloatArray) -> Replayed | None:
+    """Squared errors (W,) of one estimator in the same windows with both files, where both runs cover them; None where none do."""
+    known = np.isfinite(before) & np.isfinite(after)
+    if not known.any():
+        return None
+    gain = root_mean_gain(before[known], after[known], np.arange(int(known.sum())) // BLOCK, np.random.default_rng(0))
+    return Replayed(math.sqrt(float(before[known].mean())), math.sqrt(float(after[known].mean())), gain)
 
 
 def _paired(before: Drive, after: Drive) -> tuple[IntArray, IntArray]:
@@ -86,8 +101,8 @@ def _paired(before: Drive, after: Drive) -> tuple[IntArray, IntArray]:
     return first, second
 
 
-def _replay_errors(log: Log, robot: Robot, model: str, drive: Drive, windows: IntArray) -> Mapping[str, float]:
-    """Root mean square error of the motion in ``windows`` of ``drive`` by each estimator, headings times half the track [m]."""
+def _replay_errors(log: Log, robot: Robot, model: str, drive: Drive, windows: IntArray) -> dict[str, FloatArray]:
+    """Squared errors (W,) of the motion in ``windows`` of ``drive`` by each estimator, headings times half the track [m^2]."""
     trials = [Trial(make_model(model, robot), name) for name in _ESTIMATORS]
     start_ns = int(drive.spans_ns[windows, 0].min()) - _LEAD_NS
     events = (event for event in log.events() if event.stamp_ns >= start_ns)
@@ -95,11 +110,9 @@ def _replay_errors(log: Log, robot: Robot, model: str, drive: Drive, windows: In
     return {run.estimator: _window_error(run, drive, windows, 0.5 * robot.geometry.track_width_m) for run in runs}
 
 
-def _window_error(run: Run, drive: Drive, windows: IntArray, turn_m: float) -> float:
-    spans = drive.spans_ns[windows]
-    inside = run.trajectory.covers(spans[:, 0]) & run.trajectory.covers(spans[:, 1])
-    used = [drive.maneuvers[int(i)] for i in windows[inside]]
-    moved = se2.between(run.trajectory.at(spans[inside, 0]), run.trajectory.at(spans[inside, 1]))
+def _window_error(run: Run, drive: Drive, windows: IntArray, turn_m: float) -> FloatArray:
+    spans, used = drive.spans_ns[windows], [drive.maneuvers[int(i)] for i in windows]
+    moved = se2.between(run.trajectory.at(spans[:, 0]), run.trajectory.at(spans[:, 1]))  # NaN where the run does not cover the window
     known = np.array([np.isfinite(np.diagonal(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1])) for m in used])
     off = se2.between(np.array([m.measured[-1] for m in used]), moved) * np.array([1.0, 1.0, turn_m])
-    return float(np.sqrt(np.mean(np.sum(np.where(known, off, 0.0) ** 2, axis=1))))
+    return np.asarray(np.sum(np.where(known, off, 0.0) ** 2, axis=1))

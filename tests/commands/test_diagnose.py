@@ -255,3 +255,19 @@ def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: P
     assert "friction, which suits husky_a200, is consistent on this drive and names no cause." in capsys.readouterr().out
     assert main(["diagnose", str(log), "--robot", "husky_a200"]) == 0
     assert "which suits" not in capsys.readouterr().out
+
+
+@pytest.mark.extended
+def test_diagnose_lidar_beside_tf_static_is_corrected_in_the_robot_file(tmp_path: Path) -> None:
+    """The log's transform is wrong by 60 mm: the file's mount goes before it, in every command."""
+    log = bag(tmp_path / "drive.mcap", {"lidar_offset_x": 0.06}, 31, "husky_a200")
+    out = tmp_path / "out"
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(out)]) == 0
+    robot = load_robot(str(out / "robot.toml"))
+    (frame,) = robot.tf.overridden
+    given = open_log(log, load_robot("husky_a200")).mounts[frame]
+    assert open_log(log, robot).mounts[frame].x == pytest.approx(given.x + 0.06, abs=0.01)
+    found = json.loads((out / "diagnosis.json").read_text())["handover"]
+    assert max(found["rms_after"][name] / found["rms_before"][name] for name in ("x", "y")) < 0.3
+    before, after = (found["replays"]["odometry"][name] for name in ("before_m", "after_m"))
+    assert after < 0.4 * before
