@@ -20,6 +20,7 @@ from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
+from localization.diagnosis.extension import ExtendedResult, extend, suggests_extension
 from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
@@ -76,6 +77,9 @@ class Diagnose:
     healthy: Annotated[Path | None, tyro.conf.arg(metavar="LOG")] = None
     """Log of the same robot without a fault, about two minutes of arcs and turns: causes then count from how it moved there, and not from
     the robot file."""
+    extend: bool = False
+    """Search terms that the model lacks: products of speed, yaw rate, accelerations, CG and time. What improves windows to which it was not
+    fitted is written to robot.toml as [models.NAME.terms]."""
     window_s: float = 2.0
     """Length of the windows that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
@@ -101,19 +105,27 @@ class Diagnose:
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
             found = self._with_suited_model(found, drive)
-        if self.out is not None:
+        extended = None
+        if self.extend:
+            with console.status("searching for terms"):
+                extended = extend(found, drive, model, self.config)
+                found = extended.found
+        if self.out is not None and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):
                 found = self._with_written_robot(found)
         content = found.diagnosis.to_dict()
+        if extended is not None:
+            content["extension"] = None if extended.extension is None else extended.extension.to_dict()
         if self.out is not None:
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
-                corrected, manual_steps = self._write_robot(folder, found, robot)
+                corrected, manual_steps = self._write_robot(folder, found, robot, extended)
                 shares = held_shares(found.predictor, {f.definition: f.size for f in corrected}) if found.predictor and corrected else {}
                 write_diagnosis_report(folder / "diagnosis.html", found, is_interactive=not self.static)
         if self.json is not None:
             write_json(self.json, content)
         print_diagnosis(console, found.diagnosis)
+        print_extension(console, found, extended)
         if self.out is not None:
             print_handover(console, corrected, manual_steps, shares)
             console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
@@ -175,12 +187,18 @@ class Diagnose:
             d = dataclasses.replace(d, warnings=(*d.warnings, note))
         return dataclasses.replace(found, diagnosis=dataclasses.replace(d, handover=handover or d.handover))
 
-    def _write_robot(self, folder: Path, found: DiagnosisResult, robot: Robot) -> tuple[list[Finding], tuple[str, ...]]:
+    def _write_robot(
+        self, folder: Path, found: DiagnosisResult, robot: Robot, extended: ExtendedResult | None
+    ) -> tuple[list[Finding], tuple[str, ...]]:
         """Write robot.toml; returns the findings that it corrects, and what is to be done elsewhere."""
         d, predictor = found.diagnosis, found.predictor
+        if extended is not None and extended.extension is not None and extended.robot is not None:
+            remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}.", f"Extended: {extended.extension.describe()}."]
+            write_text_file(folder / "robot.toml", robot_toml(relocated(extended.robot, folder), remarks="\n".join(remarks)))
+            return [], ()
         new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
         is_worse = d.handover is not None and not d.handover.is_better
-        correctable = [] if predictor is None else correctable_findings(d)
+        correctable = [] if predictor is None or not d.is_confirmed else correctable_findings(d)
         held = [f for f in correctable if predictor is not None and is_held(predictor, f)]
         corrected = [] if is_worse else held
         if predictor is not None and (sizes := {f.definition: f.size for f in correctable if f in corrected or f not in held}):
@@ -203,6 +221,27 @@ class Diagnose:
         text = robot_toml(relocated(new, folder), remarks="\n".join(remarks))
         write_text_file(folder / "robot.toml", text)
         return corrected, tuple(manual_steps)
+
+
+def print_extension(console: Console, found: DiagnosisResult, extended: ExtendedResult | None) -> None:
+    """The terms of the model, or that a search for them is possible."""
+    if extended is None:
+        if suggests_extension(found):
+            console.print("next: diagnose with --extend, which searches a term of the model for it.", markup=False, soft_wrap=True)
+        return
+    if extended.extension is None:
+        console.print("no term of the library explains what is left.", markup=False)
+        return
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for head in ("component", "term", "value", "95 %", "unit", "stability", "log-likelihood"):
+        table.add_column(head, no_wrap=True)
+    for row in extended.extension.to_dict()["terms"]:
+        low, high = row["interval"]
+        sizes = (f"{row['value']:+.4g}", f"{low:+.3g} to {high:+.3g}", row["unit"])
+        table.add_row(row["component"], row["expression"], *sizes, f"{100 * row['stability']:.0f} %", f"{row['log_likelihood']:+.0f}")
+    console.print(table)
+    if extended.robot is None:
+        console.print(f"not written: {extended.extension.describe()}.", markup=False, soft_wrap=True)
 
 
 def print_handover(console: Console, corrected: Sequence[Finding], manual_steps: Sequence[str], shares: Mapping[str, float]) -> None:

@@ -18,7 +18,7 @@ from localization.diagnosis.prediction import CHANNELS
 from motion_models.calibration.cross_validation import Interval
 from motion_models.se2 import FloatArray
 
-Verdict = Literal["consistent", "explained", "ambiguous", "unexplained", "undecidable"]
+Verdict = Literal["consistent", "explained", "extended", "ambiguous", "unexplained", "undecidable"]
 MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.studies.unknown_effects --develop`)."""
@@ -288,6 +288,14 @@ class Diagnosis:
     handover: HandoverCheck | None = None
     """What the corrected robot gains on the second half of the drive."""
 
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the robot may be corrected by the findings: where a part of the drive stays unexplained, only what improves windows that
+        sizes were not fitted to."""
+        if self.verdict != "unexplained":
+            return True
+        return self.handover.is_better if self.handover is not None else self.gain is not None and self.gain.low > 0.0
+
     def to_dict(self) -> dict[str, Any]:
         """The format of `diagnose --json`, whose keys stay as they are."""
         left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
@@ -423,7 +431,7 @@ def sentence(d: Diagnosis) -> str:
         tolerated = describe_tolerated(d)
         text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
         return text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
-    estimated = correctable_findings(d)
+    estimated = correctable_findings(d) if d.is_confirmed else []
     parts = [f"{part[0].upper()}{part[1:]}" for part in ([_correction(d, estimated)] if estimated else []) + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
     if left:

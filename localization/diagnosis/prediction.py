@@ -15,8 +15,9 @@ from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, d
 from motion_models import se2
 from motion_models.base import MotionModel, Twist
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
-from motion_models.calibration.prediction import predict
+from motion_models.calibration.prediction import predict, series_of
 from motion_models.compiled import kernel, subroutine
+from motion_models.extended_model import in_series
 from motion_models.friction import FrictionModel
 from motion_models.robot import DIFF_DRIVE
 from motion_models.se2 import FloatArray
@@ -353,7 +354,7 @@ class _HypothesisModel:
             return self._quasi_static(model, rates, cg, params, 0.0)
         key = (*self._rates_key(), "model")
         if key not in twists:
-            twists[key] = model.twist(rates, cg, params).value
+            twists[key] = in_series(model, series_of(self._p.batch)).twist(rates, cg, params).value
         return twists[key]
 
     def _floor(self, rates: FloatArray, cg: FloatArray) -> FloatArray:

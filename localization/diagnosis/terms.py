@@ -1,0 +1,371 @@
+"""Terms that a motion model lacks: sparse regression of what a drive leaves unexplained, through the integration of its windows.
+
+With y discrepancies of the drive, S signatures of causes within their tolerance, N nuisances and T what candidate terms of unit
+coefficient move at each measured pose, all whitened by the drive's noise,
+
+    y = S x + N z + T c + e,     x ~ N(0, tolerance^2), c sparse.
+
+Terms and findings of the diagnosis compete: sets are searched by steps that add, drop or exchange one of them, each at the price of the
+extended BIC (Chen & Chen 2008), so that a term takes the place of a physical name that explains the drive less well. Stability selection
+(Meinshausen & Buehlmann 2010): the share of random halves of the drive in which the same term is found. As a candidate weak form of SINDy
+(Messenger & Bortz 2021), rates are never differentiated.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.diagnosis.causes.cause import Hypothesis, with_sizes
+from localization.diagnosis.diagnose import DiagnosisResult
+from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize
+from localization.diagnosis.noise import Noise, estimate_drive_noise
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor
+from localization.diagnosis.verdict import moved_by
+from motion_models.calibration.prediction import series_of
+from motion_models.extended_model import ExtendedModel
+from motion_models.se2 import FloatArray
+from motion_models.terms import COMPONENTS, Expression, Term, parse_expression
+
+_POWERS = ("", "{0}", "abs({0})", "{0}^2", "{0}*abs({0})", "sign({0})", "{0}^3")
+"""Shapes of one variable: even and odd, to the third power, as slip grows."""
+_OF_CAUSES = frozenset({("vx", "v"), ("vx", "wz"), ("vy", "v"), ("vy", "wz"), ("wz", "v"), ("wz", "wz")})
+"""Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference."""
+_MORE = {
+    "vx": ("dv", "abs(dv)", "sign(v)*abs(dv)", "v*abs(dv)", "v*t", "abs(v)*t", "dv*abs(v)"),
+    "vy": ("dwz", "v*dwz", "wz*dv", "wz*t", "v*wz*t", "v*dv"),
+    "wz": ("dwz", "abs(dwz)*sign(wz)", "wz*abs(dv)", "wz*dv", "v*dwz", "wz*t", "v*t", "dv", "abs(wz)*t"),
+}
+"""Accelerations and time."""
+_OF_CG = {
+    "vx": ("v*cg_x", "wz*cg_y", "v*cg_y", "abs(wz)*cg_x"),
+    "vy": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x"),
+    "wz": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x", "wz*cg_x^2"),
+}
+_CG_MOVES_M = 0.005
+_FLAT = 1e3  # sigma of nuisances, over their unit
+_COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
+_ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
+"""Of a term that a robot with equal sides does not have; two in three robots have such sides."""
+_COMPLEXITY_PRICE = 1.5
+"""Of each factor beyond the first, in twice the log-odds: of two shapes that fit alike the simpler is taken."""
+_ROUNDS, _STEPS = 4, 12
+_MOST = 4
+"""Most terms of one extension."""
+_HALVES = 40
+_ALIKE = 0.9
+"""Correlation of two candidates that one drive does not separate."""
+_MIN_STABILITY = 0.5
+SEARCHED = ("log", "windows")
+"""Kinds of drives whose windows have all kinds of motion."""
+_LEAST_SHARE = 0.02
+"""Least share of all that is explained for a term: accuracy of columns, which are those of small terms."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term without its coefficient, and its price in twice the log-odds."""
+
+    component: str
+    expression: Expression
+    price: float
+
+
+@dataclass(frozen=True)
+class FoundTerm:
+    """A term of the drive, with what supports it."""
+
+    term: Term
+    stability: float
+    """Share of random halves of the drive in which it, or one that this drive does not separate from it, is among the best."""
+    gain: float
+    """Twice the log-likelihood that it gains beside the others."""
+    alike: tuple[str, ...] = ()
+    """Candidates that the drive hardly separates from it, best first."""
+
+
+class Search(NamedTuple):
+    """Result of `find_terms`."""
+
+    terms: tuple[FoundTerm, ...]
+    kept: tuple[int, ...]
+    """Causes beside the terms, as indices of the linearization's."""
+    sizes: FloatArray
+    """(k,) of the kept causes, in their units."""
+    state: Linearization
+    """The drive as it was searched, in the noise that is left beside the terms."""
+
+
+def candidate_terms(predictor: DrivePredictor, count: int) -> tuple[Candidate, ...]:
+    """Candidates for a drive in which ``count`` numbers were measured; CG products only where the CG moves."""
+    powers = list(itertools.product(_POWERS, _POWERS))[1:]
+    texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
+    has_cg = bool(np.std(predictor.batch.cg, axis=0).max() > _CG_MOVES_M)
+    found: dict[tuple[str, Expression], None] = {}
+    for component in COMPONENTS:
+        for text in (*texts, *_MORE[component], *(_OF_CG[component] if has_cg else ())):
+            if (component, text) not in _OF_CAUSES:
+                found.setdefault((component, parse_expression(text)))
+    base = 2.0 * math.log(len(found)) + math.log(max(count, 2))
+    return tuple(Candidate(c, e, base + _complexity(Term(c, e, 0.0))) for c, e in found)
+
+
+def _complexity(term: Term) -> float:
+    factors = sum(f.power for f in term.expression.factors)
+    return _COMPLEXITY_PRICE * (factors - 1) + (0.0 if term.is_symmetric else _ASYMMETRIC_PRICE)
+
+
+def term_columns(predictor: DrivePredictor, hypothesis: Hypothesis, candidates: Sequence[Candidate]) -> FloatArray:
+    """(M, 6, K) change of the discrepancies per unit of each candidate's coefficient, with the sign of what the term removes."""
+    batch, twist = predictor.batch, predictor.corrected_twist(hypothesis)
+    series = series_of(batch)
+    rate = np.divide(1.0, series.dt, out=np.zeros(len(series.dt)), where=series.dt > 0.0)
+    v, wz = twist[:, 0], twist[:, 2]
+    values = {"v": v, "wz": wz, "cg_x": batch.cg[:, 0], "cg_y": batch.cg[:, 1], "t": series.t}
+    values |= {"dv": np.diff(v, prepend=v[:1]) * rate, "dwz": np.diff(wz, prepend=wz[:1]) * rate}
+    expressions = list(dict.fromkeys(c.expression for c in candidates))
+    shapes = np.column_stack([e.evaluate(values)[0] for e in expressions])
+    moved = np.zeros((len(batch.ends), 3, 3, len(expressions)))
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
+        inside = slice(batch.first[owner] + batch.lead[owner], end)
+        moved[i] = moved_by(twist[inside], batch.dt[inside], shapes[inside] * batch.dt[inside, None])
+    columns = np.full((len(batch.ends), len(CHANNELS), len(candidates)), 0.0)
+    for k, candidate in enumerate(candidates):
+        columns[:, :3, k] = moved[:, :, COMPONENTS.index(candidate.component), expressions.index(candidate.expression)]
+    return columns
+
+
+class _Regression:
+    """Least squares on candidates beside what is tolerated, in normal form; columns of candidates have unit length."""
+
+    def __init__(self, y: FloatArray, base: FloatArray, columns: FloatArray) -> None:
+        """Whitened ``y`` (n,); ``base`` (n, b) times its prior sigma; ``columns`` (n, K)."""
+        self.lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+        T = columns / self.lengths
+        factor = np.linalg.cholesky(base.T @ base + np.eye(base.shape[1]))
+        half_t, half_y = np.linalg.solve(factor, base.T @ T), np.linalg.solve(factor, base.T @ y)
+        self.gram, self.moment = T.T @ T - half_t.T @ half_t, T.T @ y - half_t.T @ half_y
+
+    def gain(self, chosen: Sequence[int]) -> float:
+        """Twice the log-likelihood that the ``chosen`` columns gain."""
+        if not chosen:
+            return 0.0
+        i = list(chosen)
+        return float(self.moment[i] @ np.linalg.solve(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)), self.moment[i]))
+
+    def fit(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Coefficients (k,) of the ``chosen`` columns in their own units, and their covariance."""
+        i = list(chosen)
+        cov = np.linalg.inv(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)))
+        scale = 1.0 / self.lengths[i]
+        return cov @ self.moment[i] * scale, cov * np.outer(scale, scale)
+
+    def gains_beside(self, chosen: Sequence[int]) -> FloatArray:
+        """(K,) twice the log-likelihood that each column would gain beside those ``chosen``; 0 where these leave nothing of it."""
+        i = list(chosen)
+        across = np.linalg.solve(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)), self.gram[i]) if i else np.zeros((0, len(self.moment)))
+        score = self.moment - across.T @ self.moment[i]
+        left = np.diagonal(self.gram) - np.sum(across * self.gram[i], axis=0)
+        is_usable = left > _COLLINEAR * np.maximum(np.diagonal(self.gram), 0.05)
+        return np.asarray(np.where(is_usable, score**2 / np.maximum(left, 1e-9), 0.0))
+
+
+def _best_set(problem: _Regression, prices: FloatArray, start: tuple[int, ...], most: int) -> tuple[float, tuple[int, ...]]:
+    """Set of columns of least cost (prices less gains), by adding, dropping and exchanging one at a time from ``start``."""
+
+    def cost(chosen: tuple[int, ...]) -> float:
+        return float(prices[list(chosen)].sum()) - problem.gain(chosen)
+
+    current, least = start, cost(start)
+    for _ in range(_STEPS):
+        tried: list[tuple[float, tuple[int, ...]]] = []
+        for left in ((), *((i,) for i in current)):  # what is dropped
+            rest = tuple(i for i in current if i not in left)
+            if left:
+                tried.append((cost(rest), rest))
+            if len(rest) < most:
+                gains = problem.gains_beside(rest) - prices
+                gains[[*rest, *left]] = -math.inf
+                best = int(np.argmax(gains))
+                tried.append((cost((*rest, best)), (*rest, best)))
+        better, chosen = min(tried)
+        if better >= least - 1e-6:
+            break
+        current, least = chosen, better
+    return least, current
+
+
+class _Design(NamedTuple):
+    """Rows and columns of the regression, before whitening."""
+
+    linear: FloatArray
+    base: FloatArray
+    """(M, 6, b) times prior sigma."""
+    columns: FloatArray
+    """(M, 6, K) causes, then candidates."""
+
+    def problem(self, noise: Noise, used: FloatArray | None = None) -> _Regression:
+        """Whitened, of the windows ``used`` (M,) or all."""
+        y, b, t = noise.whiten(self.linear), noise.whiten(self.base), noise.whiten(self.columns)
+        if used is not None:
+            y, b, t = y[used], b[used], t[used]
+        return _Regression(y.ravel(), b.reshape(y.size, -1), t.reshape(y.size, -1))
+
+
+def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | None:
+    """Terms that explain the drive of ``found`` better than its findings do, or what these leave; None where it was not searched."""
+    state, predictor = found.linearization, found.predictor
+    if state is None or predictor is None or predictor.drive.kind not in SEARCHED:
+        return None
+    sizes = {finding.definition: finding.size for finding in found.diagnosis.findings if finding.definition in state.causes}
+    if found.diagnosis.verdict == "unexplained":  # signatures about findings that are wrong would mislead
+        sizes = {}
+        state = dataclasses.replace(linearize(predictor, state.causes, sizes, TOLERANCE), noise=state.noise)
+    named, f = tuple(i for i, cause in enumerate(state.causes) if cause in sizes), len(state.causes)
+    candidates = candidate_terms(predictor, state.problem.count)
+    design = _make_design(predictor, state, with_sizes(sizes), range(f), candidates)
+    own = 2.0 * math.log(len({cause.group for cause in state.causes})) + math.log(max(state.problem.count, 2))
+    prices = np.array([*(own for _ in state.causes), *(c.price for c in candidates)])
+    noise, chosen, previous = state.noise, named, None
+    for _ in range(_ROUNDS):
+        problem = design.problem(noise)
+        starts = sorted({chosen, named, ()})
+        _, chosen = min(_best_set(problem, prices, start, len(named) + _MOST) for start in starts)
+        terms = tuple(sorted(i for i in chosen if i >= f))
+        if terms == previous:
+            break
+        previous = terms
+        noise = _noise_without(predictor, state, design.columns[..., list(terms)])
+    chosen, stability = _supported(design, noise, chosen, f, rng)
+    return _describe(design.problem(noise), state, noise, chosen, candidates, stability)
+
+
+def _supported(
+    design: _Design, noise: Noise, chosen: tuple[int, ...], f: int, rng: np.random.Generator
+) -> tuple[tuple[int, ...], dict[int, float]]:
+    """``chosen`` without terms (from column ``f`` on) that random halves of the drive do not show again, or that are within the accuracy of
+    columns: they repair what others miss; and the stability of each."""
+    problem = design.problem(noise)
+    while True:
+        stability = _stability(design, noise, chosen, rng)
+        whole = problem.gain(chosen)
+        gains = {i: whole - problem.gain(tuple(j for j in chosen if j != i)) for i in chosen if i >= f}
+        weak = [i for i, gain in gains.items() if stability[i] < _MIN_STABILITY or gain < _LEAST_SHARE * whole]
+        if not weak:
+            return chosen, stability
+        worst = min(weak, key=lambda i: gains[i])
+        chosen = tuple(i for i in chosen if i != worst)
+
+
+def _describe(
+    problem: _Regression,
+    state: Linearization,
+    noise: Noise,
+    chosen: tuple[int, ...],
+    candidates: Sequence[Candidate],
+    stability: Mapping[int, float],
+) -> Search:
+    """The ``chosen`` columns, causes before ``candidates``, with their sizes."""
+    f = len(problem.moment) - len(candidates)
+    names = [Term(c.component, c.expression, 0.0).name for c in candidates]
+    values, cov = problem.fit(chosen)
+    terms = []
+    for n, i in enumerate(chosen):
+        if i >= f:
+            others = tuple(j for j in chosen if j != i)
+            term = Term(candidates[i - f].component, candidates[i - f].expression, float(values[n]), float(math.sqrt(cov[n, n])))
+            gain = problem.gain(chosen) - problem.gain(others)
+            terms.append(FoundTerm(term, stability[i], gain, _alike(problem, i, others, names, f)))
+    kept = tuple(i for i in chosen if i < f)
+    sizes = np.array([values[n] for n, i in enumerate(chosen) if i < f])
+    return Search(tuple(sorted(terms, key=lambda t: -t.gain)), kept, sizes, dataclasses.replace(state, noise=noise))
+
+
+def _make_design(
+    predictor: DrivePredictor, state: Linearization, hypothesis: Hypothesis, causes: Sequence[int], candidates: Sequence[Candidate]
+) -> _Design:
+    """Rows, what is tolerated, and columns of the ``causes`` and of the ``candidates`` about ``hypothesis``."""
+    T = term_columns(predictor, hypothesis, candidates)
+    S = np.nan_to_num(state.signatures)
+    base = np.concatenate([S * (state.problem.scale * state.problem.tolerance), np.nan_to_num(state.nuisances) * _FLAT], axis=-1)
+    return _Design(state.linear, base, np.concatenate([S[..., list(causes)], T], axis=-1))
+
+
+def _noise_without(predictor: DrivePredictor, state: Linearization, columns: FloatArray) -> Noise:
+    """Noise of the drive once the terms of ``columns`` (M, 6, k) may have any size."""
+    unit = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=(0, 1))), 1e-12)
+    known = np.isfinite(state.linear)[..., None]
+    nuisances = np.concatenate([state.nuisances, np.where(known, unit, np.nan)], axis=-1)
+    return estimate_drive_noise(predictor, state.linear, state.signatures, nuisances, state.causes)
+
+
+def _alike(problem: _Regression, i: int, others: tuple[int, ...], names: list[str], f: int) -> tuple[str, ...]:
+    """Names of the candidates that would gain nearly as much as column ``i`` beside the ``others``, best first."""
+    gains = problem.gains_beside(others)
+    near = [j for j in np.argsort(-gains) if j >= f and j != i and gains[j] > gains[i] - 7.0]
+    return tuple(names[j - f] for j in near[:3])
+
+
+def _stability(design: _Design, noise: Noise, chosen: tuple[int, ...], rng: np.random.Generator) -> dict[int, float]:
+    """Share of random halves of the drive's blocks in which each of the ``chosen`` columns, or one like it, is the best in its place."""
+    blocks = np.arange(len(design.linear)) // 4
+    count = int(blocks[-1]) + 1
+    hits = dict.fromkeys(chosen, 0)
+    y, b, t = noise.whiten(design.linear), noise.whiten(design.base), noise.whiten(design.columns)
+    for _ in range(_HALVES):
+        used = np.isin(blocks, rng.permutation(count)[: max(count // 2, 1)])
+        n = int(used.sum()) * y.shape[1]
+        problem = _Regression(y[used].ravel(), b[used].reshape(n, -1), t[used].reshape(n, -1))
+        for i in chosen:
+            others = tuple(j for j in chosen if j != i)
+            gains = problem.gains_beside(others)
+            best = int(np.argmax(gains))
+            G = problem.gram
+            alike = abs(G[best, i]) / math.sqrt(max(G[best, best] * G[i, i], 1e-18))
+            hits[i] += best == i or alike > _ALIKE or gains[i] > gains[best] - 7.0
+    return {i: hit / _HALVES for i, hit in hits.items()}
+
+
+def extended_model(predictor: DrivePredictor, terms: Sequence[Term]) -> ExtendedModel:
+    """The predictor's model with ``terms`` beside those that it has."""
+    model = predictor.model
+    if isinstance(model, ExtendedModel):
+        return dataclasses.replace(model, terms=merge_terms(model.terms, terms))
+    return ExtendedModel(model, tuple(terms))
+
+
+def merge_terms(own: Sequence[Term], added: Sequence[Term]) -> tuple[Term, ...]:
+    """``own`` terms with those ``added``: coefficients of the same term are summed."""
+    found: dict[str, Term] = {t.name: t for t in own}
+    for term in added:
+        old = found.get(term.name)
+        found[term.name] = term if old is None else dataclasses.replace(term, value=old.value + term.value)
+    return tuple(found.values())
+
+
+def sizes_on(predictor: DrivePredictor, search: Search, used: FloatArray) -> tuple[dict[int, float], tuple[Term, ...]]:
+    """Sizes of the kept causes by index, and the terms, as the windows ``used`` (M,) alone have them."""
+    state = search.state
+    candidates = [Candidate(t.term.component, t.term.expression, 0.0) for t in search.terms]
+    hypothesis = with_sizes({state.causes[i]: float(s) for i, s in zip(search.kept, search.sizes, strict=True)})
+    design = _make_design(predictor, state, hypothesis, search.kept, candidates)
+    k = len(search.kept)
+    values, cov = design.problem(state.noise, used).fit(range(k + len(candidates)))
+    sigmas = np.sqrt(np.diagonal(cov))[k:]
+    terms = tuple(
+        dataclasses.replace(t.term, value=float(value), sigma=float(sigma))
+        for t, value, sigma in zip(search.terms, values[k:], sigmas, strict=True)
+    )
+    return {i: float(v) for i, v in zip(search.kept, values[:k], strict=True)}, terms
+
+
+def halves(windows: int) -> tuple[FloatArray, FloatArray]:
+    """Two halves of so many windows, (windows,) each: blocks of four in turn, so that both have all kinds of motion."""
+    first = (np.arange(windows) // 4) % 2 == 0
+    return first, ~first
