@@ -44,8 +44,8 @@ class HeldOutReplay:
     gain: Gain
     """Of discrepancies over their noise."""
     path_before: float
-    """Root mean square of the distance between the wheels' path and the measured one, end to end over the held-out windows [m], or of the
-    headings where these alone were measured [rad]."""
+    """Root mean square of the distance between the wheels' path and the measured one, end to end over the held-out windows whose positions
+    were measured [m]; of the headings where these alone were measured in all [rad]."""
     path_after: float
     unit: str
     windows: int
@@ -193,9 +193,11 @@ def _compare(predictor: DrivePredictor, before: FloatArray, after: FloatArray, s
     rms = [math.sqrt(float(s.sum() / max(number.sum(), 1.0))) for s in sums]
     low, high = np.quantile(1.0 - new / np.maximum(old, 1e-12), [0.025, 0.975])
     gain = Gain(rms[0], rms[1], 1.0 - rms[1] / max(rms[0], 1e-12), float(low), float(high))
-    has_positions = bool(np.isfinite(before[used][:, 0]).all())
-    old_path, new_path = (_path_error(predictor.batch.measured[used], rows[used], has_positions) for rows in (before, after))
-    return HeldOutReplay(gain, old_path, new_path, "m" if has_positions else "rad", int(used.sum()))
+    positioned = np.logical_and(used, np.isfinite(before[:, 0]))
+    has_positions = bool(positioned.any())
+    shown = positioned if has_positions else used
+    old_path, new_path = (_path_error(predictor.batch.measured[shown], rows[shown], has_positions) for rows in (before, after))
+    return HeldOutReplay(gain, old_path, new_path, "m" if has_positions else "rad", int(shown.sum()))
 
 
 def _path_error(measured: FloatArray, rows: FloatArray, has_positions: bool) -> float:

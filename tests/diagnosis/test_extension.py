@@ -13,6 +13,9 @@ import pytest
 from rich.console import Console
 
 from localization.commands.diagnose import Diagnose
+from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive import drive_of_table
+from localization.diagnosis.extension import extend
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver, make_batch, windows_text
 from motion_models.calibration.prediction import predict
@@ -98,3 +101,18 @@ def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name
     output, content = run(tmp_path, windows(load_robot(name), ROBOTS[name], 500 + seed), name)
     assert content["verdict"] == "consistent", output
     assert not load_robot(tmp_path / "out" / "robot.toml").terms
+
+
+def test_extend_where_some_windows_have_headings_alone_states_metres_of_the_others() -> None:
+    """Along walls scans fix no position: such windows take no part in the path, and do not turn all of it into headings."""
+    name, seed = "pioneer_3dx", 3
+    plain, model = load_robot(name), ROBOTS[name]
+    drive = windows(dataclasses.replace(plain, terms={model: (random_term(seed),)}), model, seed)
+    by_heading = np.diag([np.inf, np.inf, SIGMA[2] ** 2])
+    drive = [dataclasses.replace(m, cov=by_heading) if i in (5, 8) else m for i, m in enumerate(drive)]
+    table, made = drive_of_table("drive.csv", plain, drive, "windows"), make_model(model, plain)
+    extension = extend(examine(table, made), table, made).extension
+    assert extension is not None
+    assert extension.replay.unit == "m"
+    assert extension.replay.windows == 19  # of the second half, windows 4 to 7, 12 to 15, ..., without window 5
+    assert extension.replay.path_after < extension.replay.path_before
