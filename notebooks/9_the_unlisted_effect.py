@@ -69,19 +69,23 @@ def drive_along(model, rates, start):
 
 
 def true_motion(seed, arcs):
-    """Records of a drive of so many arcs, each drawn until it stays in the hall, after a second of rest."""
+    """Records of a drive of so many arcs that stay in the hall, after a second of rest; an arc that none of 50 continues is dropped."""
     rng, model = np.random.default_rng(seed), make_model(MODEL, real)
     n, ramp = round(ARC_S / STEP_S), np.clip(np.arange(round(ARC_S / STEP_S)) * STEP_S / RAMP_S, 0.0, 1.0)[:, None]
-    rates, poses, twists = [np.zeros((200, 2))], [np.zeros((200, 3))], [np.zeros((200, 3))]
-    while len(rates) <= arcs:
-        target = rng.uniform(-5.0, 5.0, 2)
-        wanted = rates[-1][-1] + ramp * (target - rates[-1][-1])
-        path, twist = drive_along(model, wanted, poses[-1][-1])
-        if np.all(np.abs(path[:, :2]) < ROOM_M):
-            for kept, new in zip((rates, poses, twists), (wanted, path, twist), strict=True):
-                kept.append(new)
+    driven = [(np.zeros((200, 2)), np.zeros((200, 3)), np.zeros((200, 3)))]
+    failed = 0
+    while len(driven) <= arcs:
+        last, path, _ = driven[-1]
+        rates = last[-1] + ramp * (rng.uniform(-5.0, 5.0, 2) - last[-1])
+        poses, twists = drive_along(model, rates, path[-1])
+        if np.all(np.abs(poses[:, :2]) < ROOM_M):
+            driven.append((rates, poses, twists))
+            failed = 0
+        elif (failed := failed + 1) == 50:
+            driven.pop()
+            failed = 0
     rows = np.zeros((200 + n * arcs, COLUMNS))
-    rows[:, POSE], rows[:, TWIST], rows[:, RATES] = (np.vstack(parts) for parts in (poses, twists, rates))
+    rows[:, POSE], rows[:, TWIST], rows[:, RATES] = (np.vstack(parts) for parts in zip(*((p, t, r) for r, p, t in driven), strict=True))
     rows[:, ANGLES] = STEP_S * np.cumsum(rows[:, RATES], axis=0)
     rows[:, MARGIN] = 1.0
     track = TrueMotion(rows[0], STEP_S)
