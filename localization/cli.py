@@ -33,7 +33,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "check": ("Check", "Check whether a robot is wired and described right, by a minute of driving."),
     "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
-    "map": ("Map", "Show a saved map, export it for planners and viewers, or join two."),
+    "map": ("Map", "Show a saved map, in words or in a browser, export it for planners and viewers, or join two."),
     "online": ("Online", "Run the estimator live on ROS topics, or on a log as it was recorded."),
     "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),
 }

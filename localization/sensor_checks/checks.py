@@ -47,6 +47,7 @@ class SensorChecks:
             self._disagreement,
         )
         self._consistency, self._places = Consistency(faults), KnownPlaces(self._inflation)
+        self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None
 
@@ -73,10 +74,16 @@ class SensorChecks:
         return step
 
     def compare_residuals(self, estimator: Estimator) -> None:
-        """Compare the innovations of the last step, and the learned parameters, with their covariances."""
-        residuals = estimator.residuals
-        if self._step is not None and residuals is not None:
-            self._consistency.add(self._step, residuals, estimator.learned_parameters)
+        """Compare the innovations of the last step, and the learned parameters, with their covariances.
+
+        Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
+        """
+        residuals, step = estimator.residuals, self._step
+        if step is None or residuals is None:
+            return
+        if step.scan is not None:
+            self._is_lidar_placed = step.scan.frame_id in self._mounts
+        self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)
 
     def inflate(self, estimate: Estimate) -> Estimate:
         """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""

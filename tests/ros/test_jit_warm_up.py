@@ -32,7 +32,8 @@ for estimator, model in (("ekf", "skid_steer"), ("graph", "friction")):
     node.finish()
     after = compiled()
     assert before["localization.lidar.scan_matcher._align"] == 1, before
-    print("not compiled:", [name for name, n in before.items() if n == 0 and name.startswith("localization.lidar")])
+    planar = [name for name in before if name.startswith("localization.lidar") and "cloud_map" not in name and "_in_space" not in name]
+    print("not compiled:", [name for name in planar if before[name] == 0])
     print("compiled late:", {name: n for name, n in after.items() if n > before.get(name, 0)})
 """
 

@@ -49,7 +49,7 @@ class Law:
     title: str
     stiffness: float
     make: Callable[[FloatArray, float], MotionModel]
-    """From parameters (12,) and the height of the CG [m] to the model."""
+    """From parameters (13,) and the height of the CG [m] to the model."""
 
     def model(self, robot: str) -> MotionModel:
         """The law on "VaultBot" or on the DRIVE data set's "Husky", unfitted."""
@@ -118,7 +118,7 @@ def husky_errors(model: MotionModel) -> FloatArray:
 
 
 def run_errors(model: MotionModel, params: FloatArray) -> FloatArray:
-    """(6, 7, 2) predicted minus measured vision errors of the 84 runs, for a robot of friction ``params`` (12,) [m]."""
+    """(6, 7, 2) predicted minus measured vision errors of the 84 runs, for a robot of friction ``params`` (13,) [m]."""
     plain = dataclasses.replace(model, differentiated=()) if isinstance(model, RivalFriction) else model
     rows = gentle_arcs.compare(params, gentle_arcs.configurations(params, plain), plain)
     return np.array([row.predicted - row.measured for row in rows])

@@ -60,7 +60,7 @@ class GridFit:
 
     names: tuple[str, ...]
     params: FloatArray
-    """(12,) all parameters."""
+    """(13,) all parameters."""
     values: FloatArray
     """(c,) of ``names``."""
     sigma: FloatArray
@@ -87,7 +87,7 @@ def measured(table: RotationTable) -> FloatArray:
 
 
 def predict(cg: FloatArray, params: FloatArray, model: MotionModel = VAULTBOT) -> tuple[FloatArray, FloatArray]:
-    """`measured` (n, 3) as the friction model predicts it for ``cg`` (n, 2), and its derivative (n, 3, 12) by ``params`` (12,)."""
+    """`measured` (n, 3) as the friction model predicts it for ``cg`` (n, 2), and its derivative (n, 3, 13) by ``params`` (13,)."""
     twist = model.twist(wheel_rates(), cg, params)
     (vx, vy, wz), (d_vx, d_vy, d_wz) = np.moveaxis(twist.value, -1, 0), np.moveaxis(twist.d_params, 1, 0)
     value = np.stack([wz / COMMAND[1], -vy / wz, vx / wz], axis=-1)

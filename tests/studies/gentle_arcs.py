@@ -113,7 +113,7 @@ def path(twist: FloatArray) -> FloatArray:
 
 
 def vision_error(trajectory: str, cg: FloatArray, controller: MotionModel, robot: FloatArray, model: MotionModel = VAULTBOT) -> FloatArray:
-    """(...) mean distance [m] of a robot with friction ``robot`` (12,) from where its controller's odometry has it, at ``cg`` (..., 2)."""
+    """(...) mean distance [m] of a robot with friction ``robot`` (13,) from where its controller's odometry has it, at ``cg`` (..., 2)."""
     cgs = np.broadcast_to(cg[..., None, :], (*cg.shape[:-1], len(commands(trajectory)), 2))
     wheels = controller.wheels(commands(trajectory), cgs, controller.nominal)
     driven = path(model.twist(wheels, cgs, robot).value)
@@ -166,7 +166,7 @@ def configurations(robot: FloatArray, model: MotionModel = VAULTBOT) -> dict[str
 
 
 def compare(robot: FloatArray, cgs: dict[str, FloatArray], model: MotionModel = VAULTBOT) -> list[Comparison]:
-    """All six trajectories with a robot of friction ``robot`` (12,) at the configurations' ``cgs``."""
+    """All six trajectories with a robot of friction ``robot`` (13,) at the configurations' ``cgs``."""
     controllers, seen = [make_model(name, load_robot("vaultbot")) for name in CONTROLLERS], table_5_2()
     cg = np.array(list(cgs.values()))
     return [

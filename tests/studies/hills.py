@@ -88,8 +88,8 @@ HEADINGS = (
 
 
 def parameters(wheelbase_m: float, track_m: float, mu: float, slip_stiffness: float, rolling_resistance: float) -> FloatArray:
-    """(12,) of a symmetric robot."""
-    return np.array([_RADIUS_M, track_m, wheelbase_m, mu, 1.0, slip_stiffness, rolling_resistance, 0.0, 0.0, 0.0, 0.0, 0.0])
+    """(13,) of a symmetric robot."""
+    return np.concatenate([[_RADIUS_M, track_m, wheelbase_m, mu, 1.0, slip_stiffness, rolling_resistance], np.zeros(6)])
 
 
 def turn(of: Turning) -> FloatArray:

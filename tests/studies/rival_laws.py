@@ -47,7 +47,7 @@ class RivalFriction:
     """`FrictionModel` by another law of the total slip."""
 
     nominal: FloatArray
-    """(12,) as `FrictionModel.param_names`."""
+    """(13,) as `FrictionModel.param_names`."""
     shape: str = "exponential"
     stiffness_ratio: float = 1.0
     """Lateral over longitudinal stiffness at small slip; sliding friction stays isotropic."""
