@@ -212,11 +212,14 @@ class Replayed(NamedTuple):
     after_m: float
     gain: Interval
     """Difference of both; 95 % interval over blocks of windows [m]."""
+    noise_m: float = 0.0
+    """Root mean square of the drive's noise in these windows [m]: an estimator with the same scans errs by less against them."""
 
     @property
     def is_worse(self) -> bool:
-        """Whether errors grow by more than 2 %, and by more than their scatter."""
-        return self.after_m > _MAX_GROWTH * self.before_m and self.gain.high < 0.0
+        """Whether errors grow by more than 2 %, by more than their scatter, and by more than the drive's noise."""
+        has_grown = self.after_m > _MAX_GROWTH * self.before_m and self.gain.high < 0.0
+        return has_grown and self.after_m**2 - self.before_m**2 > self.noise_m**2
 
 
 @dataclass(frozen=True)

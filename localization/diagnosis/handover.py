@@ -15,6 +15,7 @@ from localization.diagnosis.corrected_robot import BLOCK, compared_halves, corre
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import HandoverCheck, Replayed
 from localization.diagnosis.linearization import Linearization
+from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import DrivePredictor
 from localization.logs.reader import Log
 from localization.pipeline import Run, Trial, replay
@@ -75,17 +76,21 @@ def check_written_robot(
             return found
         runs = (old, predictor.drive, first), (new, drive, second)
         errors = [_replay_errors(reader.log(robot), robot, predictor.model.name, cut, windows) for robot, cut, windows in runs]
-    compared = {name: _compared(errors[0][name], errors[1][name]) for name in errors[0]}
+    noise = _window_noise(linearization.noise, first, 0.5 * old.geometry.track_width_m)
+    compared = {name: _compared(errors[0][name], errors[1][name], noise) for name in errors[0]}
     return dataclasses.replace(found, replays={name: one for name, one in compared.items() if one is not None})
 
 
-def _compared(before: FloatArray, after: FloatArray) -> Replayed | None:
-    """Squared errors (W,) of one estimator in the same windows with both files, where both runs cover them; None where none do."""
+def _compared(before: FloatArray, after: FloatArray, noise: FloatArray) -> Replayed | None:
+    """Squared errors (W,) of one estimator in the same windows with both files, and the variance of their noise (W,), where both runs
+    cover the windows; None where none do."""
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
     gain = root_mean_gain(before[known], after[known], np.arange(int(known.sum())) // BLOCK, np.random.default_rng(0))
-    return Replayed(math.sqrt(float(before[known].mean())), math.sqrt(float(after[known].mean())), gain)
+    return Replayed(
+        math.sqrt(float(before[known].mean())), math.sqrt(float(after[known].mean())), gain, math.sqrt(float(noise[known].mean()))
+    )
 
 
 def _paired(before: Drive, after: Drive) -> tuple[IntArray, IntArray]:
@@ -108,6 +113,12 @@ def _replay_errors(log: Log, robot: Robot, model: str, drive: Drive, windows: In
     events = (event for event in log.events() if event.stamp_ns >= start_ns)
     runs = replay(events, trials, log.robot, log.mounts, log.sources.lidar is not None)
     return {run.estimator: _window_error(run, drive, windows, 0.5 * robot.geometry.track_width_m) for run in runs}
+
+
+def _window_noise(noise: Noise, windows: IntArray, turn_m: float) -> FloatArray:
+    """(W,) variance of the motion in ``windows`` that is noise on this drive, headings times ``turn_m`` [m^2]."""
+    variances = np.where(noise.known, noise.sigmas, 0.0)[windows, :3] ** 2
+    return np.asarray(variances @ np.array([1.0, 1.0, turn_m**2]))
 
 
 def _window_error(run: Run, drive: Drive, windows: IntArray, turn_m: float) -> FloatArray:

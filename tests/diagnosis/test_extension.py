@@ -81,7 +81,7 @@ DRAWN = [(robot, seed) for robot in ROBOTS for seed in range(20)]
 NAMES = [f"{robot}_{seed}" for robot, seed in DRAWN]
 
 
-@pytest.mark.parametrize(("name", "seed"), cases(DRAWN, ["pioneer_3dx_3"], NAMES))
+@pytest.mark.parametrize(("name", "seed"), cases(DRAWN, ["pioneer_3dx_3"], NAMES, pytest.mark.slow))
 def test_extend_finds_a_random_effect_and_its_file_drives_better(tmp_path: Path, name: str, seed: int) -> None:
     """What the effect adds to the error of other windows falls by 70 % at least with the file that was written."""
     hidden, plain, model = random_term(seed), load_robot(name), ROBOTS[name]
@@ -96,7 +96,7 @@ def test_extend_finds_a_random_effect_and_its_file_drives_better(tmp_path: Path,
     assert after - floor < 0.09 * (before - floor), (hidden, output)  # of squares: 70 % of the root mean square
 
 
-@pytest.mark.parametrize(("name", "seed"), cases(DRAWN, ["pioneer_3dx_0"], NAMES))
+@pytest.mark.parametrize(("name", "seed"), cases(DRAWN, ["pioneer_3dx_0"], NAMES, pytest.mark.slow))
 def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name: str, seed: int) -> None:
     output, content = run(tmp_path, windows(load_robot(name), ROBOTS[name], 500 + seed), name)
     assert content["verdict"] == "consistent", output

@@ -33,7 +33,7 @@ def test_every_cause_states_which_models_hold_it() -> None:
 
 
 @pytest.mark.parametrize("robot", ["husky_a200", "vaultbot"], ids=["without arms", "with arms"])
-@pytest.mark.parametrize("cause", cases(HELD, usual=["cg_offset_x", "lateral_slip_speed"]))
+@pytest.mark.parametrize("cause", cases(HELD, usual=["cg_offset_x", "lateral_slip_speed"], others=pytest.mark.slow))
 def test_corrected_robot_holds_a_cause_where_a_model_has_its_place(cause: str, robot: str) -> None:
     definition = CAUSES[cause]
     size = definition.typical * (0.5 if definition.one_sided else 1.0)

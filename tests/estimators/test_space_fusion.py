@@ -14,6 +14,8 @@ from tests.helpers.hill_scans import MOUNT, make_scene, scans
 from tests.helpers.hills import rolling_drive
 from tests.helpers.in_space import IN_SPACE, in_order, run_in_space
 
+pytestmark = pytest.mark.xdist_group("among_trees")
+
 
 @pytest.fixture(scope="module")
 def rolled():
