@@ -1,6 +1,6 @@
 """Positions without headings (GPS of centimetres, total stations, a prism) as what measures the motion that the wheels' is compared with.
 
-Nothing says how the robot stands in the frame of its positions, so that each window has a heading of its own. Three positions of a window
+The robot's heading in the frame of its positions is unknown, so that each window has a heading of its own. Three positions of a window
 leave the lengths of two chords and the angle between them (`motion_models.calibration.chords`).
 """
 
