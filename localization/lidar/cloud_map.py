@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.lidar.submap import EMPTY_KEY, probe_slots
 from localization.trajectory import IntArray
 from motion_models import se3
 from motion_models.compiled import kernel, subroutine
@@ -24,7 +25,6 @@ from motion_models.se3 import Transform3
 
 Point = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
-_EMPTY = -(1 << 62)
 _FIRST_VOXELS = 1 << 14
 _MIN_POINTS = 6
 """Points without which voxels have no surface."""
@@ -156,20 +156,14 @@ def thin(points: FloatArray, cell: float) -> FloatArray:
 
 
 def _make_grid(cell: float, noise: float, voxels: int) -> CloudGrid:
-    slots = np.full((2 * voxels, 2), _EMPTY, dtype=np.int64)
+    slots = np.full((2 * voxels, 2), EMPTY_KEY, dtype=np.int64)
     return CloudGrid(cell, noise, slots, np.empty((voxels, 3), np.int64), np.zeros((voxels, 10)), np.full((voxels, 13), np.nan))
 
 
 @subroutine
 def _find_slot(slots: IntArray, i: int, j: int, k: int) -> int:
     """Index of the slot that holds cell (i, j, k), or of the empty one where it belongs."""
-    key = ((i & 0x1FFFFF) << 42) | ((j & 0x1FFFFF) << 21) | (k & 0x1FFFFF)
-    mask = slots.shape[0] - 1
-    scattered = key * -7046029254386353131  # 2^64 / golden ratio (Knuth, multiplicative hashing)
-    at = ((scattered >> 32) ^ scattered) & mask
-    while slots[at, 0] != _EMPTY and slots[at, 0] != key:
-        at = (at + 1) & mask
-    return int(at)
+    return probe_slots(slots, ((i & 0x1FFFFF) << 42) | ((j & 0x1FFFFF) << 21) | (k & 0x1FFFFF))
 
 
 @subroutine
@@ -194,7 +188,7 @@ def _insert(grid: CloudGrid, n: int, points: FloatArray) -> tuple[int, float]:
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         i, j, k = math.floor(x / grid.cell), math.floor(y / grid.cell), math.floor(z / grid.cell)
         at = _find_slot(grid.slots, i, j, k)
-        if grid.slots[at, 0] == _EMPTY:
+        if grid.slots[at, 0] == EMPTY_KEY:
             _set_slot(grid.slots, at, i, j, k, n)
             grid.cells[n, 0], grid.cells[n, 1], grid.cells[n, 2] = i, j, k
             n += 1
@@ -226,7 +220,7 @@ def _insert(grid: CloudGrid, n: int, points: FloatArray) -> tuple[int, float]:
 def _neighbour(grid: CloudGrid, i: int, j: int, k: int, n: int) -> int:
     """Row of the voxel in the ``n``-th of the 27 cells around cell (i, j, k), which is the 13th; -1 where there is none."""
     at = _find_slot(grid.slots, i + n // 9 - 1, j + n // 3 % 3 - 1, k + n % 3 - 1)
-    return int(grid.slots[at, 1]) if grid.slots[at, 0] != _EMPTY else -1
+    return int(grid.slots[at, 1]) if grid.slots[at, 0] != EMPTY_KEY else -1
 
 
 @subroutine

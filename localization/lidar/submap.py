@@ -18,7 +18,8 @@ POOLED_VOXELS = 5
 """Voxels whose points are pooled for one surface: fewer give no direction along sparse walls, more round off corners."""
 MAX_RINGS = 4
 """How many voxels away the pooled ones may be; what is sparser than that has no surface."""
-_EMPTY = -(1 << 62)
+EMPTY_KEY = -(1 << 62)
+"""Key of a slot that holds no voxel."""
 
 
 class VoxelGrid(NamedTuple):
@@ -49,7 +50,7 @@ class VoxelGrid(NamedTuple):
 def make_grid(points: Points2, cell: float, noise_m: float) -> VoxelGrid:
     """Voxels with edge ``cell`` [m] of ``points`` (N, 2) [m], whose ranges have sigma ``noise_m`` [m]."""
     origin = np.floor(points.mean(axis=0) / cell) * cell if len(points) else np.zeros(2)
-    slots = np.full((1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), 2), _EMPTY, dtype=np.int64)
+    slots = np.full((1 << max(4, math.ceil(math.log2(2 * len(points) + 1))), 2), EMPTY_KEY, dtype=np.int64)
     cells, sums = np.empty((len(points), 2), dtype=np.int64), np.zeros((len(points), 6))
     n = _fill(points, cell, origin, slots, cells, sums)
     return VoxelGrid(cell, noise_m**2, origin, slots, cells[:n], sums[:n], np.full((n, 6), np.nan))
@@ -61,22 +62,27 @@ def voxel_means(points: Points2, cell: float) -> Points2:
 
 
 @subroutine
-def find_slot(slots: IntArray, i: int, j: int) -> int:
-    """Index of the slot that holds cell (i, j), or of the empty one where it belongs."""
-    key = (i << 32) ^ (j & 0xFFFFFFFF)
+def probe_slots(slots: IntArray, key: int) -> int:
+    """Index of the slot that holds ``key``, or of the empty one where it belongs (open addressing, linear probing)."""
     mask = slots.shape[0] - 1
     scattered = key * -7046029254386353131  # 2^64 / golden ratio (Knuth, multiplicative hashing)
     at = ((scattered >> 32) ^ scattered) & mask
-    while slots[at, 0] != _EMPTY and slots[at, 0] != key:
+    while slots[at, 0] != EMPTY_KEY and slots[at, 0] != key:
         at = (at + 1) & mask
     return int(at)
+
+
+@subroutine
+def find_slot(slots: IntArray, i: int, j: int) -> int:
+    """Index of the slot that holds cell (i, j), or of the empty one where it belongs."""
+    return probe_slots(slots, (i << 32) ^ (j & 0xFFFFFFFF))
 
 
 @subroutine
 def find_voxel(slots: IntArray, i: int, j: int) -> int:
     """Row of the voxel in cell (i, j); -1 where there is none."""
     at = find_slot(slots, i, j)
-    return int(slots[at, 1]) if slots[at, 0] != _EMPTY else -1
+    return int(slots[at, 1]) if slots[at, 0] != EMPTY_KEY else -1
 
 
 @kernel
@@ -87,7 +93,7 @@ def _fill(points: Points2, cell: float, origin: FloatArray, slots: IntArray, cel
         x, y = points[p, 0] - origin[0], points[p, 1] - origin[1]
         i, j = math.floor(x / cell), math.floor(y / cell)
         at = find_slot(slots, i, j)
-        if slots[at, 0] == _EMPTY:
+        if slots[at, 0] == EMPTY_KEY:
             slots[at, 0], slots[at, 1] = (i << 32) ^ (j & 0xFFFFFFFF), n
             cells[n, 0], cells[n, 1] = i, j
             n += 1
