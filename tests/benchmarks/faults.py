@@ -1,9 +1,13 @@
 """A campaign of mutated logs: faults of sensors and of files, all drives, formats and models, by seed. Prints what was survived.
 
-python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs]
+python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs] [--scenes] [--seeds 1]
 
 `--pairs` prints faults that no check knows by name instead, without the test of pairs of sensors and with it: the largest error of the
 position at its sigma [m], what wheels and scans alone make of the drive, and what is reported.
+
+`--scenes` prints drives among people, vehicles, dust, glass and mirrors (`tests.helpers.moving_scenes`): the error of the position that
+is most sigmas large, of those above 10 cm (else the largest), the error at the end, the largest of wheels and of KISS-ICP alone [m], and
+what is reported. "wrong": over 5 sigma and 10 cm, or over 1 m and 3 sigma, whatever is reported.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from typing import Any
 from unittest import mock
 
 from localization.sensor_checks import SensorChecks
-from tests.helpers import fault_drives
+from tests.helpers import fault_drives, moving_scenes
 from tests.helpers.event_faults import faults_of_stamps, faults_of_turns
 from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
 
@@ -30,9 +34,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="cases whose description has this in it")
     parser.add_argument("--verbose", action="store_true", help="print each case")
     parser.add_argument("--pairs", action="store_true", help="faults without a name, instead of the campaign")
+    parser.add_argument("--scenes", action="store_true", help="scenes that move, instead of the campaign")
+    parser.add_argument("--seeds", type=int, default=1, help="of each scene")
     options = parser.parse_args([] if arguments is None else arguments)
-    if options.pairs:
-        for line in _table_of_pairs(options.only):
+    if options.pairs or options.scenes:
+        for line in _table_of_pairs(options.only) if options.pairs else _table_of_scenes(options.only, options.seeds):
             print(line, flush=True)
         return
     with tempfile.TemporaryDirectory(prefix="skidloc-faults-") as name:
@@ -87,6 +93,19 @@ def _table_of_pairs(only: str) -> Iterator[str]:
         cells += [f"{error:.3f}" for error in alone] + [""] * (2 - len(alone))
         known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in after.warnings if warning not in before.warnings)
         yield f"| {place} | {name} | {' | '.join(cells)} | {known} |"
+
+
+def _table_of_scenes(only: str, seeds: int) -> Iterator[str]:
+    yield "| scene | seed | EKF, worst | at the end | wheels alone | KISS-ICP alone | | reported |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for name, make in moving_scenes.SCENES.items():
+        for seed in range(seeds if only in name else 0):
+            drive = make(seed)
+            ekf, wheels, lidar = (fault_drives.run(drive, estimator=e) for e in ("ekf", "odometry", "lidar"))
+            cells = [f"{error:.3f} at {sigma:.3f}" for error, sigma in (ekf.least_consistent, ekf.last)]
+            cells += [f"{peer.worst[0]:.3f}" for peer in (wheels, lidar)] + ["wrong" if ekf.is_wrong else ""]
+            known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in ekf.warnings)
+            yield f"| {name} | {seed} | {' | '.join(cells)} | {known} |"
 
 
 if __name__ == "__main__":

@@ -112,6 +112,21 @@ class Outcome:
         return float(self.errors[-1]), float(self.sigmas[-1])
 
     @property
+    def least_consistent(self) -> tuple[float, float]:
+        """Error and sigma [m] where the error is most sigmas large, of those beyond 10 cm; the largest error where none is."""
+        is_large = self.errors > _SILENT_M
+        if not is_large.any():
+            return self.worst
+        i = int(np.argmax(np.where(is_large, self.errors / np.maximum(self.sigmas, 1e-9), 0.0)))
+        return float(self.errors[i]), float(self.sigmas[i])
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether an error is beyond 5 sigma and 10 cm, or beyond a metre at less than its third as sigma."""
+        is_wrong = (self.errors > _SILENT_SIGMAS * self.sigmas) & (self.errors > _SILENT_M)
+        return bool((is_wrong | ((self.errors > _SILENT_FAR_M) & (self.errors > 3.0 * self.sigmas))).any())
+
+    @property
     def is_silent(self) -> bool:
         """Whether an error is beyond 5 sigma and 10 cm, or beyond a metre, and nothing is reported."""
         is_wrong = (self.errors > _SILENT_SIGMAS * self.sigmas) & (self.errors > _SILENT_M)

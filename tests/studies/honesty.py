@@ -92,12 +92,12 @@ def _random_room(seed: int) -> Room:
     return Room(np.concatenate(walls), (-0.5, -1.5, 0.0))
 
 
-def drive_with(room: Room, noise: Noise, seed: int, tour: FloatArray = TOUR) -> rooms.Drive:
-    """The ``tour`` (n, 3), see `rooms.path`, in ``room``. All noise follows from ``seed``."""
+def drive_with(room: Room, noise: Noise, seed: int, tour: FloatArray = TOUR, scanner: rooms.Beams | None = None) -> rooms.Drive:
+    """The ``tour`` (n, 3), see `rooms.path`, in ``room``. All noise follows from ``seed``, but for that of a given ``scanner``."""
     rng = np.random.default_rng([seed, 77])
     slips = draw_slip(tour, noise, rng)
     sigma = noise.lidar * LidarConfig().range_noise_m
-    scanner = rooms.Beams(beams=_BEAMS, noise=0.0 if noise.heavy_ranges else sigma)
+    scanner = scanner or rooms.Beams(beams=_BEAMS, noise=0.0 if noise.heavy_ranges else sigma)
     drive = rooms.drive_through(room.walls, tour + slips, seed, room.start, scanner, _NO_SLIP, wheels=lambda times, twists: tour)
     events = [_with_heavy_tails(e, sigma, rng) if noise.heavy_ranges and isinstance(e, Scan) else e for e in drive.events]
     return replace(drive, events=sorted([*events, *_gyro(drive, noise.gyro, rng)], key=lambda event: event.stamp_ns))
