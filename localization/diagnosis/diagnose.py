@@ -51,6 +51,7 @@ from localization.diagnosis.selection import (
     statistic,
     strongest_beyond_tolerance,
 )
+from localization.diagnosis.spells import find_spells, with_intervals
 from localization.diagnosis.verdict import (
     attribute_rows,
     confirming_drive,
@@ -128,7 +129,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     causes = candidate_causes(predictor, config.moments)
     first = linearize(predictor, causes, {}, TOLERANCE)
     rng = np.random.default_rng(config.seed)
-    linearization, chosen = _choose_causes(predictor, first)
+    linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
     return _conclude(predictor, first, linearization, _drop_insignificant(linearization, chosen, rng, config), rng, config)
 
 
@@ -157,6 +158,22 @@ def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Lin
             linearization = linearize(predictor, causes, current, TOLERANCE)
     index = {e.key: i for i, e in enumerate(causes)}
     return linearization, tuple(sorted(index[e.key] for e in current))
+
+
+def _choose_parts(
+    predictor: DrivePredictor, first: Linearization, linearization: Linearization, chosen: tuple[int, ...]
+) -> tuple[Linearization, tuple[int, ...]]:
+    """The drive and the causes ``chosen`` on it, or the best set with causes in a part of the drive, where these explain it better."""
+    spells = find_spells(predictor, linearization, chosen)
+    if not spells:
+        return linearization, chosen
+    state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *spells), {}, TOLERANCE))
+    located = with_intervals(predictor, state, best)
+    if not located:
+        return linearization, chosen
+    causes = tuple(located.get(i, cause) for i, cause in enumerate(state.causes))
+    sizes = {causes[i]: float(size) for i, size in zip(best, state.problem.fit(best)[0], strict=True)}
+    return linearize(predictor, causes, sizes, TOLERANCE), best
 
 
 def _drop_insignificant(

@@ -113,12 +113,23 @@ class Finding:
             "size": self.size,
             "sigma": self.sigma,
             "unit": self.definition.unit,
+            "spell": _spell_dict(self.definition),
             "p_value": self.p_value,
             "aliases": [name for name, _ in self.aliases],
             "alias_sizes": dict(self.aliases),
             "evidence": self.evidence,
             "gain": self.gain.to_dict(),
         }
+
+
+def _spell_dict(cause: Cause) -> dict[str, Any] | None:
+    """Start and end of the part of the drive in which ``cause`` holds [s], with their 95 % intervals; None for the whole drive."""
+    if cause.spell is None:
+        return None
+    start, end = cause.spell
+    intervals = cause.spell_95 or ((start, start), (end, end))
+    is_open = math.isinf(end)
+    return {"start_s": start, "end_s": None if is_open else end, "start_95": intervals[0], "end_95": None if is_open else intervals[1]}
 
 
 RowStatus = Literal["noise", "attributed", "within tolerance", "unexplained"]

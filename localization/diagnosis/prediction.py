@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -217,7 +218,30 @@ class DrivePredictor:
         return found
 
     def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
-        """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured."""
+        """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured.
+
+        What holds in a part of the drive changes the windows in it, and one that it shares by its share.
+        """
+        if not hypothesis.spells:
+            return self._discrepancies(hypothesis)
+        lasting = dataclasses.replace(hypothesis, spells={})
+        rows = self._discrepancies(lasting)
+        changes = (
+            spell.share(*self.window_times_s)[:, None] * (self._discrepancies(lasting + more) - rows)
+            for spell, more in hypothesis.spells.items()
+        )
+        return np.asarray(rows + sum(changes))
+
+    @cached_property
+    def window_times_s(self) -> tuple[FloatArray, FloatArray]:
+        """(M,) start and (M,) end of the motion to every measured pose, from the drive's start [s]."""
+        batch = self.batch
+        begins = self.drive.starts_s[batch.owner]
+        total = np.r_[0.0, np.cumsum(batch.dt)]
+        return begins, begins + total[batch.ends] - total[batch.first[batch.owner] + batch.lead[batch.owner]]
+
+    def _discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
+        """`discrepancies` of a hypothesis that holds in the whole drive."""
         hypothesis = self.baseline.hypothesis + hypothesis
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)

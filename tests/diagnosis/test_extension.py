@@ -16,21 +16,15 @@ from localization.commands.diagnose import Diagnose
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.extension import extend
-from motion_models import se2
-from motion_models.calibration.maneuvers import Maneuver, make_batch, windows_text
-from motion_models.calibration.prediction import predict
-from motion_models.preintegration import preintegrate
+from motion_models.calibration.maneuvers import Maneuver, windows_text
 from motion_models.registry import make_model
-from motion_models.robot import Robot, WheelNoise
 from motion_models.robot_file import load_robot
-from motion_models.se2 import FloatArray
 from motion_models.terms import Term, parse_expression
+from tests.helpers.diagnosis_windows import SIGMA, errors, windows
 from tests.helpers.extended import cases
 
 ROBOTS = {"husky_a200": "skid_steer", "pioneer_3dx": "diff_drive"}
 """Each with its model."""
-SIGMA = np.array([0.003, 0.003, 0.002])
-"""Scan matching's, of one window [m, m, rad]."""
 _V = ("", "v", "abs(v)", "v^2", "v*abs(v)")
 _W = ("", "wz", "abs(wz)", "wz^2", "wz*abs(wz)")
 _CAUSES = ("vx[v]", "vy[wz]", "wz[wz]", "vy[v*wz]", "vx[v*abs(wz)]", "wz[abs(v)*wz]", "wz[wz*abs(wz)]")
@@ -47,25 +41,6 @@ def random_term(seed: int) -> Term:
         term = Term(component, parse_expression("*".join(parts)), float(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.25)))
         if term.is_symmetric and term.name not in _CAUSES:
             return term
-
-
-def windows(robot: Robot, model: str, seed: int, count: int = 40) -> list[Maneuver]:
-    """Windows of two seconds, of steady and changing rates, as ``robot`` drives them and a reference measures them."""
-    rng = np.random.default_rng(seed)
-    made, found, n = make_model(model, robot), [], 20
-    for i in range(count):
-        rates = rng.uniform(-5.0, 5.0, 2) + np.linspace(-1.0, 1.0, n)[:, None] * rng.uniform(-2.0, 2.0, 2)
-        true = preintegrate(made, np.full(n, 0.1), rates, robot.center_of_gravity, made.nominal, WheelNoise()).delta
-        measured = se2.compose(true, se2.exp(SIGMA * rng.normal(size=3)))[None]
-        found.append(Maneuver(np.full(n, 0.1), rates, measured, np.array([n]), robot.center_of_gravity, np.diag(SIGMA**2), str(i)))
-    return found
-
-
-def errors(robot: Robot, model: str, drive: list[Maneuver]) -> FloatArray:
-    """(M,) length of the error of each window over its noise, by the robot's own file."""
-    batch, made = make_batch(drive), make_model(model, robot)
-    poses, _, _ = predict(made, batch, made.nominal, np.zeros(5), np.empty(0, dtype=np.int64), WheelNoise())
-    return np.linalg.norm(se2.between(poses, batch.measured) / SIGMA, axis=1)
 
 
 def run(tmp_path: Path, drive: list[Maneuver], robot: str) -> tuple[str, dict[str, Any]]:
@@ -86,19 +61,19 @@ def test_extend_finds_a_random_effect_and_its_file_drives_better(tmp_path: Path,
     """What the effect adds to the error of other windows falls by 70 % at least with the file that was written."""
     hidden, plain, model = random_term(seed), load_robot(name), ROBOTS[name]
     real = dataclasses.replace(plain, terms={model: (hidden,)})
-    output, content = run(tmp_path, windows(real, model, seed), name)
+    output, content = run(tmp_path, windows([real] * 40, model, seed), name)
     assert content["extension"]["heldout"]["is_better"], (hidden, output)
     assert "in robot.toml odometry falls from" in output or content["verdict"] == "unexplained"
     found = load_robot(tmp_path / "out" / "robot.toml")
     assert found.terms[model]
-    fresh = windows(real, model, 1000 + seed)
+    fresh = windows([real] * 40, model, 1000 + seed)
     before, after, floor = (np.mean(errors(robot, model, fresh) ** 2) for robot in (plain, found, real))
     assert after - floor < 0.09 * (before - floor), (hidden, output)  # of squares: 70 % of the root mean square
 
 
 @pytest.mark.parametrize(("name", "seed"), cases(DRAWN, ["pioneer_3dx_0"], NAMES, pytest.mark.slow))
 def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name: str, seed: int) -> None:
-    output, content = run(tmp_path, windows(load_robot(name), ROBOTS[name], 500 + seed), name)
+    output, content = run(tmp_path, windows([load_robot(name)] * 40, ROBOTS[name], 500 + seed), name)
     assert content["verdict"] == "consistent", output
     assert not load_robot(tmp_path / "out" / "robot.toml").terms
 
@@ -107,7 +82,7 @@ def test_extend_where_some_windows_have_headings_alone_states_metres_of_the_othe
     """Along walls scans fix no position: such windows take no part in the path, and do not turn all of it into headings."""
     name, seed = "pioneer_3dx", 3
     plain, model = load_robot(name), ROBOTS[name]
-    drive = windows(dataclasses.replace(plain, terms={model: (random_term(seed),)}), model, seed)
+    drive = windows([dataclasses.replace(plain, terms={model: (random_term(seed),)})] * 40, model, seed)
     by_heading = np.diag([np.inf, np.inf, SIGMA[2] ** 2])
     drive = [dataclasses.replace(m, cov=by_heading) if i in (5, 8) else m for i, m in enumerate(drive)]
     table, made = drive_of_table("drive.csv", plain, drive, "windows"), make_model(model, plain)

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,18 @@ class Motion:
 Change = Callable[[Motion, float], FloatArray]
 """New rates (N, 2) or twists (N, 3) from the motion and the cause's size; they are the old ones at size 0."""
 Changes = tuple[tuple[Change, float], ...]
+
+
+class Spell(NamedTuple):
+    """Part of a drive, from the drive's start [s]."""
+
+    start_s: float
+    end_s: float = math.inf
+
+    def share(self, begins_s: FloatArray, ends_s: FloatArray) -> FloatArray:
+        """(n,) share of each interval from ``begins_s`` to ``ends_s`` (n,) that lies in it."""
+        inside = np.minimum(ends_s, self.end_s) - np.maximum(begins_s, self.start_s)
+        return np.asarray(np.clip(inside / np.maximum(ends_s - begins_s, 1e-9), 0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -91,6 +103,8 @@ class Hypothesis:
     """Sideways grip is more by this share from `friction_change_at_s` on."""
     friction_change_at_s: float = _part("floor", lasts=False)
     wheel_lag_s: float = _part("rates", lasts=False)
+    spells: Mapping[Spell, Hypothesis] = field(default_factory=dict, metadata={"stage": "floor", "lasts": False})
+    """Further deviations, in parts of the drive."""
 
     def __add__(self, other: Hypothesis) -> Hypothesis:
         """Both deviations at once."""
@@ -119,7 +133,7 @@ def _sum(name: str, one: Any, other: Any) -> Any:
     if isinstance(one, tuple):
         return tuple(x + y for x, y in zip(one, other, strict=True))
     if isinstance(one, Mapping):
-        return {key: one.get(key, 0.0) + other.get(key, 0.0) for key in {**one, **other}}
+        return {**one, **{key: one[key] + value if key in one else value for key, value in other.items()}}
     return one + other
 
 
@@ -230,21 +244,27 @@ class Cause:
     """Magnitude beyond which another cause is more likely, where that is not by ``prior_sigma``; 0: by that."""
     axis: str = ""
     """Where two causes have one id: its axis, in words."""
+    spell: Spell | None = None
+    """Part of the drive in which it holds; None for the whole."""
+    spell_95: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """95 % intervals of the spell's start and end [s]."""
 
     @property
     def label(self) -> str:
-        """The id as tables show it, with the axis where there are two."""
-        return f"{self.id} ({self.axis})" if self.axis else self.id
+        """The id as tables show it, with the axis where there are two, and the part of the drive in which it holds."""
+        text = f"{self.id} ({self.axis})" if self.axis else self.id
+        return text if self.spell is None else f"{text} {describe_spell(self.spell)}"
 
     @property
     def key(self) -> str:
-        """Unique also among several moments of one change."""
-        return self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
+        """Unique also among several moments of one change, and parts of the drive."""
+        text = self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
+        return text if self.spell is None else f"{text}[{self.spell.start_s:g}:{self.spell.end_s:g}]"
 
     @property
     def group(self) -> str:
         """Name of the group of causes of which only one is tried at a time."""
-        return self.key if self.axis else self.id
+        return (self.id if self.at_s is None else f"{self.id}@{self.at_s:g}") if self.axis else self.id
 
     @property
     def plausible(self) -> float:
@@ -284,6 +304,35 @@ class Cause:
     def is_coefficient(self) -> bool:
         """Whether the size is a coefficient of a slip law, which has no unit that is read by itself."""
         return "= " in self.meaning
+
+
+def describe_spell(spell: Spell) -> str:
+    """When it is, as ``from t = 31 s``, ``until t = 20 s`` or ``from t = 12 to 25 s``."""
+    if math.isinf(spell.end_s):
+        return f"from t = {spell.start_s:.0f} s"
+    return f"until t = {spell.end_s:.0f} s" if spell.start_s <= 0.0 else f"from t = {spell.start_s:.0f} to {spell.end_s:.0f} s"
+
+
+def in_spell(cause: Cause, spell: Spell, spell_95: tuple[tuple[float, float], tuple[float, float]] | None = None) -> Cause:
+    """``cause`` in one part of a drive alone, with the 95 % intervals of its moments. A robot file does not hold it."""
+    when = describe_spell(spell)
+    moments = () if spell_95 is None else (spell_95[0] if spell.start_s > 0.0 else (), spell_95[1] if math.isfinite(spell.end_s) else ())
+    spread = " and ".join(f"{m[0]:.1f} to {m[1]:.1f} s" for m in moments if m)
+    words = f"{when} ({spread})" if spread else when
+
+    def inject(b: Hypothesis, s: float) -> Hypothesis:
+        return b + Hypothesis(spells={spell: cause.inject(Hypothesis(), s)})
+
+    return dataclasses.replace(
+        cause,
+        meaning=f"{cause.meaning}, {when}",
+        inject=inject,
+        words=(f"{words}, {cause.words[0]}", f"{words}, {cause.words[1]}"),
+        correct=lambda d, s: d.with_step(f"{cause.id} of {s:+.3g} {cause.unit} holds {when}, not in the whole drive, and is not written."),
+        variants=_itself,
+        spell=spell,
+        spell_95=spell_95,
+    )
 
 
 def with_sizes(sizes: Mapping[Cause, float]) -> Hypothesis:

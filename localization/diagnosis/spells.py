@@ -1,0 +1,179 @@
+"""Change points: causes that hold in a part of a drive, as a payload that is taken up on the way.
+
+A cause of signature s_i with an onset at t_0 has the signature s_i w(t_0), w the share of each window after t_0. Its size is fitted beside
+the causes of a set B, and all others within tolerance; with score u and its variance v (sizes in units of their prior),
+
+    2 log evidence gained = u^2 / (v + 1) - log(1 + v).
+
+Onsets are chosen by evidence, at the price of their number and of a change point (log n for each moment, as for a size; Zhang & Siegmund
+2007 have 3/2 log n for a moment and the size after it). The set with the onset takes the place of the one without where windows that were
+held out are more likely by it. The interval of an onset is that of its posterior, by a flat prior.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.diagnosis.causes.cause import Cause, Spell, in_spell
+from localization.diagnosis.linearization import Linearization, Regression, regression
+from localization.diagnosis.prediction import DrivePredictor
+from localization.diagnosis.selection import cost, folds, price
+from motion_models.se2 import FloatArray
+
+_OF_WHOLE_DRIVES = ("friction_change", "wheel_radius_drift", "encoder_dropout", "missing_joint_messages")
+"""Causes that change on the way by themselves."""
+_FEWEST_WINDOWS = 24
+"""Of a drive, as for changes of the floor."""
+_FEWEST_INSIDE = 6
+"""Windows of a part, and outside of it: of fewer a cause is not told from an outlier."""
+_MARGIN = 7.0
+"""Twice the log-odds by which a part must be better than the whole drive: odds of 33."""
+_MOST = 3
+"""Parts that compete with whole drives in the search."""
+_SUBSTEPS = 8
+"""Moments within a window at which an onset is tried, for its interval."""
+_TAIL = 0.025
+
+
+class _Option(NamedTuple):
+    cost: float
+    cause: int
+    spell: Spell
+
+
+def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> tuple[Cause, ...]:
+    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes, which hold in the whole of it; none for
+    tables and short drives."""
+    if predictor.drive.kind != "log" or len(predictor.drive.maneuvers) < _FEWEST_WINDOWS:
+        return ()
+    least = _cost(state, chosen)
+    options: dict[str, _Option] = {}
+    bases = {(), chosen, *(tuple(j for j in chosen if j != i) for i in chosen)}
+    for option in itertools.chain.from_iterable(_options(predictor, state, base, _spells(predictor)) for base in sorted(bases)):
+        name = state.causes[option.cause].id
+        if option.cost < min(least - _MARGIN, options[name].cost if name in options else math.inf):
+            options[name] = option
+    best = sorted(options.values())[:_MOST]
+    if not best or heldout_lead(predictor, state, chosen, best[0]) <= 0.0:
+        return ()
+    return tuple(in_spell(state.causes[o.cause], o.spell) for o in best)
+
+
+def with_intervals(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> dict[int, Cause]:
+    """Causes among those ``chosen`` that hold in a part of the drive, with their most likely moments."""
+    found = {}
+    for i in chosen:
+        if state.causes[i].spell is not None:
+            found[i] = _located(predictor, state, tuple(j for j in chosen if j != i), i)
+    return found
+
+
+def _cost(state: Linearization, chosen: tuple[int, ...]) -> float:
+    return cost(state.problem, [e.group for e in state.causes], chosen)
+
+
+def _spells(predictor: DrivePredictor) -> list[Spell]:
+    """Parts of the drive that begin and end with windows: to its end, from its start, and between."""
+    starts, n = predictor.drive.starts_s, len(predictor.drive.maneuvers)
+    inner = range(_FEWEST_INSIDE, n - _FEWEST_INSIDE + 1)
+    inner = range(inner.start, inner.stop, max(1, len(inner) // 24))
+    one = [spell for i in inner for spell in (Spell(float(starts[i])), Spell(0.0, float(starts[i])))]
+    pairs = itertools.combinations(inner, 2)
+    return one + [Spell(float(starts[i]), float(starts[j])) for i, j in pairs if j - i >= _FEWEST_INSIDE]
+
+
+def _options(predictor: DrivePredictor, state: Linearization, base: tuple[int, ...], spells: Sequence[Spell]) -> list[_Option]:
+    """The best part of the drive for each cause beside those of ``base``."""
+    problem, causes = state.problem, state.causes
+    groups = {causes[i].group for i in base}
+    tried = [i for i, c in enumerate(causes) if c.id not in _OF_WHOLE_DRIVES and c.group not in groups and c.spell is None]
+    log_n = math.log(max(problem.count, 2))
+    parts = np.array([1.0 + (s.start_s > 0.0 and math.isfinite(s.end_s)) for s in spells])
+    prices = 2.0 * math.log(len(spells)) + log_n * parts
+    gains = spell_gains(predictor, state, base, tried, spells)
+    before = price(problem.count, len({c.group for c in causes}), len(base) + 1) - problem.gain(base)
+    found = []
+    for i, row in zip(tried, gains, strict=True):
+        best = int(np.argmin(prices - row))
+        found.append(_Option(before + float(prices[best] - row[best]), i, spells[best]))
+    return found
+
+
+def spell_gains(
+    predictor: DrivePredictor, state: Linearization, base: tuple[int, ...], tried: Sequence[int], spells: Sequence[Spell]
+) -> FloatArray:
+    """(causes, spells) twice the log-evidence that each cause ``tried`` gains in each part of the drive, beside the causes ``base``; sizes
+    beyond its bounds gain nothing."""
+    problem, noise = state.problem, state.noise
+    shares = np.array([s.share(*predictor.window_times_s) for s in spells])
+    S = noise.whiten(state.signatures).reshape(-1, len(state.causes)) * problem.scale
+    y, z = noise.whiten(state.linear).ravel(), noise.whiten(state.nuisances).reshape(S.shape[0], -1)
+    used = np.linalg.norm(z, axis=0) > 1e-9
+    q = np.linalg.qr(z[:, used])[0]
+    y, S = y - q @ (q.T @ y), S - q @ (q.T @ S)
+    variances = np.square(problem.tolerance)
+    variances[list(base)] = 1.0
+    A = S.T @ S + np.diag(1.0 / variances)
+    left = y - S @ np.linalg.solve(A, S.T @ y)
+    gains = np.zeros((len(tried), len(spells)))
+    for row, i in zip(gains, tried, strict=True):
+        columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, :]).reshape(len(y), -1) * problem.scale[i]
+        columns -= q @ (q.T @ columns)
+        u = columns.T @ left
+        v = np.sum(columns**2, axis=0) - np.sum((S.T @ columns) * np.linalg.solve(A, S.T @ columns), axis=0)
+        v = np.maximum(v, 0.0)
+        sizes = u / (v + 1.0) * problem.scale[i]
+        low, high = state.causes[i].bounds
+        row[:] = np.where((sizes >= low) & (sizes <= high), u**2 / (v + 1.0) - np.log1p(v), 0.0)
+    return gains
+
+
+def heldout_lead(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...], option: _Option) -> float:
+    """Twice the log-odds of the set with the cause in its part of the drive against those ``chosen`` by windows that were held out, in
+    folds: p(fold | rest) = p(all) / p(rest)."""
+    share = option.spell.share(*predictor.window_times_s)
+    column = state.signatures[..., option.cause, None] * share[:, None, None]
+    signatures = np.concatenate([state.signatures, column], axis=-1)
+    scale = np.r_[state.problem.scale, state.problem.scale[option.cause]]
+    tolerance = np.r_[state.problem.scale * state.problem.tolerance, 0.0]
+    y, s, z = (state.noise.whiten(rows) for rows in (state.linear, signatures, state.nuisances))
+
+    def problem_of(used: NDArray[np.bool_]) -> Regression:
+        rows = y[used].ravel()
+        return regression(rows, s[used].reshape(len(rows), -1), z[used].reshape(len(rows), -1), scale, tolerance)
+
+    whole = problem_of(np.ones(len(y), dtype=bool))
+    new, group = len(state.causes), state.causes[option.cause].group
+    rivals = [(*(j for j in chosen if j != i and state.causes[j].group != group), new) for i in (-1, *chosen)] + [(new,)]
+    best = max(rivals, key=lambda s: whole.gain(s) - price(whole.count, new, len(s)))
+    rest = [problem_of(~held) for held in folds(len(y))]
+    return sum(whole.gain(best) - r.gain(best) - whole.gain(chosen) + r.gain(chosen) for r in rest)
+
+
+def _located(predictor: DrivePredictor, state: Linearization, others: tuple[int, ...], i: int) -> Cause:
+    """Cause ``i``, which holds in a part of the drive, with the most likely moments, one after the other, and their 95 % intervals."""
+    cause = state.causes[i]
+    spell = cause.spell
+    assert spell is not None
+    whole = next(j for j, c in enumerate(state.causes) if c.spell is None and c.id == cause.id and c.axis == cause.axis)
+    begins, ends = predictor.window_times_s
+    grid = np.unique(np.concatenate([begins + (ends - begins) * k / _SUBSTEPS for k in range(_SUBSTEPS)]))
+    intervals = {"start_s": (spell.start_s, spell.start_s), "end_s": (spell.end_s, spell.end_s)}
+    for name in intervals:
+        at = getattr(spell, name)
+        if at <= 0.0 or math.isinf(at):
+            continue
+        moments = grid[grid < spell.end_s] if name == "start_s" else grid[grid > spell.start_s]
+        tried = [spell._replace(**{name: float(t)}) for t in moments]
+        gains = spell_gains(predictor, state, others, [whole], tried)[0]
+        weights = np.exp(0.5 * (gains - gains.max())) * np.gradient(moments)
+        cumulative = np.cumsum(weights) / weights.sum()
+        low, high = (float(moments[int(np.searchsorted(cumulative, q))]) for q in (_TAIL, 1.0 - _TAIL))
+        spell, intervals[name] = tried[int(np.argmax(gains))], (low, high)
+    return in_spell(state.causes[whole], spell, (intervals["start_s"], intervals["end_s"]))
