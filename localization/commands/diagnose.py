@@ -24,6 +24,7 @@ from localization.diagnosis.extension import ExtendedResult, extend, suggests_ex
 from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
+    confirmed_findings,
     correctable_findings,
     describe_outliers,
     describe_p,
@@ -31,9 +32,10 @@ from localization.diagnosis.findings import (
     describe_sizes,
     describe_tolerated,
     is_contesting,
+    sentence,
     unit_of,
 )
-from localization.diagnosis.handover import Reader, check_written_robot
+from localization.diagnosis.handover import Reader, check_findings
 from localization.diagnosis.linearization import default_model
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
@@ -46,7 +48,7 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
 
-NOT_BETTER = "the corrected robot is not better on the second half of the drive beyond its scatter: robot.toml keeps the old values."
+NOT_BETTER = "the corrected robot is not better on the half held out beyond its scatter: robot.toml keeps the old values."
 _WHOLE_SHARE = 0.9
 """Share of a correction that a model holds, below which that is said."""
 
@@ -108,7 +110,7 @@ class Diagnose:
         extended = None
         if self.extend:
             with console.status("searching for terms"):
-                extended = extend(found, drive, model, self.config)
+                extended = extend(found, drive, model, self.config, self._reader)
                 found = extended.found
         if self.out is not None and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):
@@ -162,6 +164,13 @@ class Diagnose:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
 
+    @property
+    def _reader(self) -> Reader | None:
+        """How the log is read with another robot; None for a table."""
+        if self.source.suffix.lower() == ".csv":
+            return None
+        return Reader(lambda robot: self._drive_of_log(self.source, robot), self._log)
+
     def _with_suited_model(self, found: DiagnosisResult, drive: Drive) -> DiagnosisResult:
         """``found`` with what the model that suits the robot would find, where a simpler one was chosen and differs from the drive."""
         d, name = found.diagnosis, default_model(drive.robot)
@@ -175,17 +184,17 @@ class Diagnose:
     def _with_written_robot(self, found: DiagnosisResult) -> DiagnosisResult:
         """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""
         d = found.diagnosis
-        if d.handover is None or found.predictor is None or found.linearization is None or self.source.suffix.lower() == ".csv":
+        if d.handover is None or found.predictor is None or found.linearization is None or self._reader is None:
             return found
-        reader = Reader(lambda robot: self._drive_of_log(self.source, robot), self._log)
         named = [f.definition.key for f in correctable_findings(d)]
         try:
-            handover = check_written_robot(reader, found.predictor, found.linearization, named)
+            handover = check_findings(found.predictor, found.linearization, named, self._reader)
         except SkidlocError as error:  # a robot that no command runs with keeps its old values
             note = f"the corrected robot cannot be replayed: {error}"
             handover = dataclasses.replace(d.handover, gain=Interval(0.0, 0.0, 0.0))
             d = dataclasses.replace(d, warnings=(*d.warnings, note))
-        return dataclasses.replace(found, diagnosis=dataclasses.replace(d, handover=handover or d.handover))
+        d = dataclasses.replace(d, handover=handover or d.handover)
+        return dataclasses.replace(found, diagnosis=dataclasses.replace(d, sentence=sentence(d)))
 
     def _write_robot(
         self, folder: Path, found: DiagnosisResult, robot: Robot, extended: ExtendedResult | None
@@ -197,14 +206,12 @@ class Diagnose:
             write_text_file(folder / "robot.toml", robot_toml(relocated(extended.robot, folder), remarks="\n".join(remarks)))
             return [], ()
         new, manual_steps = robot, ()  # type: Robot, tuple[str, ...]
-        is_worse = d.handover is not None and not d.handover.is_better
-        correctable = [] if predictor is None or not d.is_confirmed else correctable_findings(d)
-        held = [f for f in correctable if predictor is not None and is_held(predictor, f)]
-        corrected = [] if is_worse else held
-        if predictor is not None and (sizes := {f.definition: f.size for f in correctable if f in corrected or f not in held}):
+        corrected: list[Finding] = []
+        if predictor is not None and (sizes := {f.definition: f.size for f in confirmed_findings(d)}):
+            corrected = [f for f in confirmed_findings(d) if is_held(predictor, f)]
             patch = correct_robot(predictor, sizes)
-            new, manual_steps = (patch.robot if corrected else robot), patch.manual_steps
-        if is_worse:
+            new, manual_steps = patch.robot, patch.manual_steps
+        if d.handover is not None and not d.handover.is_better:
             manual_steps = (NOT_BETTER, *manual_steps)
         remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}."]
         for title, findings in (

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, with_sizes
-from localization.diagnosis.findings import Finding, HandoverCheck
-from localization.diagnosis.linearization import Linearization, make_regression
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor
+from localization.diagnosis.findings import Finding
+from localization.diagnosis.prediction import DrivePredictor
 from motion_models.base import MotionModel
-from motion_models.calibration.cross_validation import root_mean_gain
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel
 from motion_models.registry import MODELS, make_model, params_of
@@ -26,8 +23,6 @@ _ROUNDS = 12
 _ANCHOR_WEIGHT = 1e-3  # weight of the old coefficients beside one sample's twist, so that what the drive does not show stays
 _TURN_M = 0.3  # one radian counts as so many metres in the match of twists
 _TWIST = 1e-4
-_MIN_HALF_WINDOWS = 8
-BLOCK = 2  # neighbouring windows share their errors: a scan between them, and the floor
 
 
 @dataclass(frozen=True)
@@ -100,77 +95,6 @@ def held_shares(predictor: DrivePredictor, sizes: Mapping[Cause, float], names: 
         if change > 0.0:
             shares[name] = 1.0 - left / change
     return shares
-
-
-def check_handover(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HandoverCheck | None:
-    """Correct the robot by the first half of the drive, and predict the second half with it; ``named`` are the keys of the findings.
-
-    What was measured is corrected by the mount and the clocks that the robot file holds, not by what is to be corrected in drivers. Errors
-    of a reference are no part of the check, before or after. None for drives of a table, without motion in either half, and where the robot
-    file holds none of the findings.
-    """
-    half = len(predictor.drive.maneuvers) // 2
-    sizes = first_half_sizes(predictor, linearization, named)
-    if sizes is None:
-        return None
-    corrected, hypothesis = correct_robot(predictor, sizes), with_sizes(sizes)
-    if corrected.robot == predictor.drive.robot:
-        return None
-    after = predictor_after(predictor, corrected, predictor.model.name)
-    is_lidar = predictor.drive.is_lidar_reference
-    rows = predictor.discrepancies(of_reference(hypothesis, is_lidar)), after.discrepancies(_of_sensors(hypothesis))
-    return compared_halves(rows[0][half:], rows[1][half:])
-
-
-def first_half_sizes(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> dict[Cause, float] | None:
-    """Sizes of the causes with keys ``named`` by the first half of the drive alone; None for tables, and halves with too few windows."""
-    half = len(predictor.drive.maneuvers) // 2
-    if predictor.drive.kind != "log" or half < _MIN_HALF_WINDOWS or not named:
-        return None
-    is_first = np.arange(len(linearization.rows)) < half
-    first = [np.where(is_first.reshape(-1, *(1,) * (a.ndim - 1)), a, np.nan) for a in _arrays(linearization)]
-    chosen = [i for i, cause in enumerate(linearization.causes) if cause.key in named]
-    causes = tuple(linearization.causes[i] for i in chosen)
-    problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
-    sizes = problem.fit(tuple(range(len(causes))))[0]
-    return dict(zip(causes, (float(v) for v in sizes), strict=True))
-
-
-def compared_halves(before: FloatArray, after: FloatArray) -> HandoverCheck | None:
-    """Discrepancies ``before`` and ``after`` (M, 6) of windows that were held out; None where nothing was measured in both."""
-    shown = [c for c in range(4) if all(np.isfinite(r[:, c]).any() for r in (before, after))]
-    if not shown:
-        return None
-    before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[:, c] ** 2))) for c in shown} for r in (before, after))
-    scale = np.array([max(before_rms[CHANNELS[c]], 1e-12) * math.sqrt(len(shown)) for c in shown])
-    squares = [np.sum(np.nan_to_num(r[:, shown] / scale) ** 2, axis=1) for r in (before, after)]
-    gain = root_mean_gain(squares[0], squares[1], np.arange(len(before)) // BLOCK, np.random.default_rng(0))
-    return HandoverCheck(before_rms, after_rms, len(before), gain)
-
-
-def _arrays(linearization: Linearization) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return linearization.linear, linearization.signatures, linearization.nuisances
-
-
-def _of_sensors(hypothesis: Hypothesis) -> Hypothesis:
-    """The part of ``hypothesis`` by which the robot file corrects what was measured."""
-    names = (
-        "wheel_time_offset_s",
-        "gyro_time_offset_s",
-        "gyro_scale",
-        "lidar_offset",
-        "lidar_time_offset_s",
-        "range_scale",
-        "range_bias_m",
-    )
-    return Hypothesis(**{name: getattr(hypothesis, name) for name in names})
-
-
-def of_reference(hypothesis: Hypothesis, is_lidar_reference: bool) -> Hypothesis:
-    """The part of ``hypothesis`` that is a reference's, none where the LiDAR measured the motion."""
-    if is_lidar_reference:
-        return Hypothesis()
-    return Hypothesis(lidar_offset=hypothesis.lidar_offset, lidar_time_offset_s=hypothesis.lidar_time_offset_s)
 
 
 def _matched(

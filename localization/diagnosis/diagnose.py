@@ -12,7 +12,6 @@ import numpy as np
 from localization.calibration.calibrate import describe_clocks
 from localization.diagnosis.causes import MISSING_MESSAGES
 from localization.diagnosis.causes.cause import Cause, with_sizes
-from localization.diagnosis.corrected_robot import check_handover
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import (
     MAX_NOISE_OVER_REFERENCE,
@@ -27,6 +26,7 @@ from localization.diagnosis.findings import (
     noise_notes,
     sentence,
 )
+from localization.diagnosis.handover import check_findings
 from localization.diagnosis.linearization import (
     TOLERANCE,
     Linearization,
@@ -245,7 +245,7 @@ def _conclude(
         suspected=None if suspected is None else suspected[0],
     )
     named = [f.definition.key for f in correctable_findings(result)] or [causes[i].key for i in chosen]
-    result = dataclasses.replace(result, handover=check_handover(predictor, linearization, named))
+    result = dataclasses.replace(result, handover=check_findings(predictor, linearization, named))
     result = _with_data_errors(result, drive)
     residuals = Residuals(first.rows, left, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)

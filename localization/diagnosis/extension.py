@@ -1,64 +1,34 @@
 """A motion model that is extended by terms: found on a drive, written to a robot file, read again, and replayed on the half held out.
 
-The gate: with sizes and coefficients of one half of the drive alone, the file is written, read from disk, and predicts the windows of the
-other half by the plain model that replay uses; then the halves change places. Only what shrinks discrepancies beyond the scatter of the
-gain is kept; the file that a user gets has the coefficients of all windows.
+The gate is that of all corrections (`handover.check_written`): with sizes and coefficients of one half of the drive alone the file is
+written, read from disk, and predicts and replays the windows of the other half. Only what shrinks errors beyond their scatter is kept; the
+file that a user gets has the coefficients of all windows.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from localization.diagnosis.causes.cause import Hypothesis
-from localization.diagnosis.corrected_robot import correct_robot
+from localization.diagnosis.causes.cause import Cause
+from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import Gain
+from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.handover import Candidate, Reader, check_written
 from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.terms import SEARCHED, FoundTerm, Search, extended_model, find_terms, halves, merge_terms, sizes_on
-from motion_models import se2
 from motion_models.base import MotionModel
-from motion_models.registry import make_model
 from motion_models.robot import Robot
-from motion_models.robot_file import load_robot, relocated, robot_toml
-from motion_models.se2 import FloatArray
 from motion_models.terms import Term
 
-_BLOCK_WINDOWS, _DRAWS = 4, 1000
 _FEWEST_WINDOWS = 16
 """Of a drive: eight in each half, as many as a diagnosis takes."""
 _TWO_SIDED_95 = 1.96
-
-
-@dataclass(frozen=True)
-class HeldOutReplay:
-    """Windows of a drive by the robot's file, and by the one with terms that were fitted to the half in which a window is not."""
-
-    gain: Gain
-    """Of discrepancies over their noise."""
-    path_before: float
-    """Root mean square of the distance between the wheels' path and the measured one, end to end over the held-out windows whose positions
-    were measured [m]; of the headings where these alone were measured in all [rad]."""
-    path_after: float
-    unit: str
-    windows: int
-
-    @property
-    def is_better(self) -> bool:
-        """Whether discrepancies shrink beyond the scatter of the gain, and the path is no worse."""
-        return self.gain.low > 0.0 and self.path_after <= self.path_before
-
-    def to_dict(self) -> dict[str, Any]:
-        """For `diagnose --json`."""
-        paths = {"path_error_before": self.path_before, "path_error_after": self.path_after, "unit": self.unit, "windows": self.windows}
-        return {**self.gain.to_dict(), **paths, "is_better": self.is_better}
 
 
 @dataclass(frozen=True)
@@ -69,7 +39,13 @@ class Extension:
     terms: tuple[FoundTerm, ...]
     replaced: tuple[str, ...]
     """Findings of the plain model in whose place the terms explain the drive better."""
-    replay: HeldOutReplay
+    check: HandoverCheck | None
+    """Of its file on the half of the drive that it was not fitted to; None where nothing was measured there."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the file is better on the half held out, beyond its scatter."""
+        return self.check is not None and self.check.is_better
 
     def describe(self) -> str:
         """The terms and their gain, as a sentence."""
@@ -78,10 +54,12 @@ class Extension:
         if self.replaced:
             known += f"; it explains the drive better than {' and '.join(self.replaced)}"
         text = f"{', and '.join(parts)} beyond {self.model} ({known}); "
-        r = self.replay
-        if not r.is_better:
+        if self.check is None or not self.is_better:
             return f"{text}on the other half of the drive it improves nothing beyond the noise, so it is not written"
-        return f"{text}with it in robot.toml odometry falls from {r.path_before:.3g} to {r.path_after:.3g} {r.unit} on the other half"
+        fallen = [
+            f"{name} falls from {r.before_m:.3g} to {r.after_m:.3g} m" for name, r in self.check.replays.items() if r.after_m < r.before_m
+        ]
+        return f"{text}with it in robot.toml {' and '.join(fallen) or self.check.describe()} a window on the other half"
 
     def to_dict(self) -> dict[str, Any]:
         """For `diagnose --json`: sizes in SI units with their 95 % intervals."""
@@ -99,7 +77,12 @@ class Extension:
             }
             for t in self.terms
         ]
-        return {"model": self.model, "terms": terms, "replaced": list(self.replaced), "heldout": self.replay.to_dict()}
+        return {
+            "model": self.model,
+            "terms": terms,
+            "replaced": list(self.replaced),
+            "heldout": None if self.check is None else self.check.to_dict(),
+        }
 
 
 @dataclass(frozen=True)
@@ -120,21 +103,29 @@ def describe_term(term: Term) -> str:
     return f"{term.component} is {term.value:+.3g} (+- {term.sigma:.1g}){unit} x {term.expression}"
 
 
-def extend(found: DiagnosisResult, drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None) -> ExtendedResult:
-    """Search terms for the drive of ``found``, the diagnosis of ``model``; diagnose the extended model where its file is better."""
+def extend(
+    found: DiagnosisResult, drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, reader: Reader | None = None
+) -> ExtendedResult:
+    """Search terms for the drive of ``found``, the diagnosis of ``model``; diagnose the extended model where its file is better.
+
+    With a ``reader`` the log is replayed with the file; else its windows are predicted.
+    """
     config = config or DiagnosisConfig()
     search = find_terms(found, np.random.default_rng(config.seed)) if len(drive.maneuvers) >= _FEWEST_WINDOWS else None
     if search is None or not search.terms or found.linearization is None or found.predictor is None:
         return ExtendedResult(found, None)
-    robot, replay = _gate(found.predictor, search)
-    causes = search.state.causes
+    predictor, causes = found.predictor, search.state.causes
+    used, held = halves(len(drive.maneuvers))
+    by_half, sizes = _robot_by(predictor, search, used[predictor.batch.owner])
+    check = check_written(predictor, search.state.noise, Candidate(by_half, sizes, held), reader)
     kept = {causes[i].id for i in search.kept}
     replaced = tuple(dict.fromkeys(f.cause for f in found.diagnosis.findings if f.cause in {c.id for c in causes} - kept))
-    extension = Extension(model.name, search.terms, replaced, replay)
-    if not replay.is_better:
+    extension = Extension(model.name, search.terms, replaced, check)
+    if not extension.is_better:
         return ExtendedResult(found, extension)
-    again = examine(drive, extended_model(found.predictor, [t.term for t in search.terms]), config)
-    return ExtendedResult(_with_extension(again, extension), extension, robot)
+    whole = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))[0]
+    again = examine(drive, extended_model(predictor, [t.term for t in search.terms]), config)
+    return ExtendedResult(_with_extension(again, extension), extension, whole.robot)
 
 
 def _with_extension(again: DiagnosisResult, extension: Extension) -> DiagnosisResult:
@@ -146,70 +137,14 @@ def _with_extension(again: DiagnosisResult, extension: Extension) -> DiagnosisRe
     return dataclasses.replace(again, diagnosis=dataclasses.replace(d, verdict=verdict, sentence=f"{text[0].upper()}{text[1:]}.{rest}"))
 
 
-def _gate(predictor: DrivePredictor, search: Search) -> tuple[Robot, HeldOutReplay]:
-    """The robot by all windows, and the replay of each half by a file of the other half's sizes."""
-    state = search.state
-    both = [half[predictor.batch.owner] for half in halves(len(predictor.drive.maneuvers))]
-
-    def robot_of(used: FloatArray) -> tuple[Robot, FloatArray]:
-        sizes, terms = sizes_on(predictor, search, used)
-        plausible = {state.causes[i]: size for i, size in sizes.items() if abs(size) <= state.causes[i].largest_plausible}
-        corrected = correct_robot(predictor, plausible)
-        old = predictor.drive.robot.terms
-        name = predictor.model.name
-        return dataclasses.replace(corrected.robot, terms={**old, name: merge_terms(old.get(name, ()), terms)}), corrected.cg_shift
-
-    before = replay_rows(predictor, predictor.drive.robot, np.zeros_like(predictor.batch.cg))
-    after = np.empty_like(before)
-    for used, held in (both, both[::-1]):
-        half_robot, shift = robot_of(used)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "robot.toml"
-            path.write_text(robot_toml(relocated(half_robot, Path(folder))), encoding="utf-8")
-            after[held] = replay_rows(predictor, load_robot(path), shift)[held]
-    return robot_of(np.ones(len(before), dtype=bool))[0], _compare(predictor, before, after, state.noise.sigmas, both[1])
-
-
-def replay_rows(predictor: DrivePredictor, robot: Robot, shift: FloatArray) -> FloatArray:
-    """(M, 3) discrepancies of every window by the plain model of ``robot``, as replay predicts it; its CG is moved by ``shift`` (N, 2)."""
-    drive = predictor.drive
-    factors = robot.geometry.radius_multipliers / drive.robot.geometry.radius_multipliers
-    shifts = np.split(shift, np.cumsum([len(m.wheels) for m in drive.maneuvers])[:-1])
-    maneuvers = tuple(dataclasses.replace(m, wheels=m.wheels * factors, cg=m.cg + s) for m, s in zip(drive.maneuvers, shifts, strict=True))
-    changed = dataclasses.replace(drive, robot=robot, maneuvers=maneuvers)
-    plain = DrivePredictor(changed, make_model(predictor.model.name, robot), has_inertia=False, baseline=predictor.baseline)
-    return plain.discrepancies(Hypothesis())[:, :3]
-
-
-def _compare(predictor: DrivePredictor, before: FloatArray, after: FloatArray, sigmas: FloatArray, used: FloatArray) -> HeldOutReplay:
-    """Both on all windows, each by a file of the half in which it is not; the path on the windows ``used`` (M,)."""
-    scaled = [np.nansum((rows / sigmas[:, :3]) ** 2, axis=1) for rows in (before, after)]
-    counts = np.isfinite(before).sum(axis=1).astype(float)
-    block = np.arange(len(before)) // _BLOCK_WINDOWS
-    sums = [np.bincount(block, weights=s) for s in scaled]
-    number = np.bincount(block, weights=counts)
-    draws = np.random.default_rng(0).multinomial(len(number), np.full(len(number), 1.0 / len(number)), size=_DRAWS)
-    old, new = (np.sqrt((draws @ s) / np.maximum(draws @ number, 1.0)) for s in sums)
-    rms = [math.sqrt(float(s.sum() / max(number.sum(), 1.0))) for s in sums]
-    low, high = np.quantile(1.0 - new / np.maximum(old, 1e-12), [0.025, 0.975])
-    gain = Gain(rms[0], rms[1], 1.0 - rms[1] / max(rms[0], 1e-12), float(low), float(high))
-    positioned = np.logical_and(used, np.isfinite(before[:, 0]))
-    has_positions = bool(positioned.any())
-    shown = positioned if has_positions else used
-    old_path, new_path = (_path_error(predictor.batch.measured[shown], rows[shown], has_positions) for rows in (before, after))
-    return HeldOutReplay(gain, old_path, new_path, "m" if has_positions else "rad", int(shown.sum()))
-
-
-def _path_error(measured: FloatArray, rows: FloatArray, has_positions: bool) -> float:
-    """Root mean square distance [m] of the predicted path from the measured one, windows end to end; or of the headings [rad]."""
-    if not has_positions:
-        return float(np.sqrt(np.nanmean(np.cumsum(np.nan_to_num(rows[:, 2])) ** 2)))
-    truth, path, squares = np.zeros(3), np.zeros(3), []
-    for motion, off in zip(measured, rows, strict=True):
-        truth = se2.compose(truth, motion)
-        path = se2.compose(path, se2.compose(motion, se2.inverse(off)))
-        squares.append(float(np.sum((truth - path)[:2] ** 2)))
-    return math.sqrt(sum(squares) / max(len(squares), 1))
+def _robot_by(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> tuple[CorrectedRobot, dict[Cause, float]]:
+    """The robot with terms and kept causes as the windows ``used`` (M,) alone have them, and the sizes of these causes."""
+    by_index, terms = sizes_on(predictor, search, used)
+    causes, old, name = search.state.causes, predictor.drive.robot.terms, predictor.model.name
+    sizes = {causes[i]: size for i, size in by_index.items() if abs(size) <= causes[i].largest_plausible}
+    corrected = correct_robot(predictor, sizes)
+    robot = dataclasses.replace(corrected.robot, terms={**old, name: merge_terms(old.get(name, ()), terms)})
+    return dataclasses.replace(corrected, robot=robot), sizes
 
 
 def suggests_extension(found: DiagnosisResult) -> bool:

@@ -235,7 +235,7 @@ class Replayed(NamedTuple):
 
 @dataclass(frozen=True)
 class HandoverCheck:
-    """Discrepancies of the second half of a drive by the old robot, and by one that was corrected by the first half alone."""
+    """Discrepancies of a half of a drive by the old robot, and by one that was corrected by the other half alone."""
 
     before: dict[str, float]
     """Root mean square by component, as `prediction.CHANNELS`."""
@@ -252,11 +252,15 @@ class HandoverCheck:
         return self.gain.low > 0.0 and not any(one.is_worse for one in self.replays.values())
 
     def describe(self) -> str:
-        """Errors of the second half before and after, as a sentence without a stop."""
+        """Errors of the half held out before and after, as a sentence without a stop."""
         rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in self.before)
-        text = f"second half of the drive ({self.windows} windows), corrected by the first half alone: {rows} (root mean square)"
+        text = f"half of the drive ({self.windows} windows), corrected by the other half alone: {rows} (root mean square)"
+        return f"{text}; {self.describe_replays()}" if self.replays else text
+
+    def describe_replays(self) -> str:
+        """Errors of the estimators on windows held out, replayed with both files, as a clause."""
         replayed = ", ".join(f"{name} {one.before_m:.3g} -> {one.after_m:.3g} m" for name, one in self.replays.items())
-        return f"{text}; replayed with the written file: {replayed} a window" if replayed else text
+        return f"replayed with the written file, the half held out: {replayed} a window"
 
     def to_dict(self) -> dict[str, Any]:
         """For `diagnose --json`; root mean squares by component [m or rad]."""
@@ -304,11 +308,11 @@ class Diagnosis:
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether the robot may be corrected by the findings: where a part of the drive stays unexplained, only what improves windows that
-        sizes were not fitted to."""
-        if self.verdict != "unexplained":
-            return True
-        return self.handover.is_better if self.handover is not None else self.gain is not None and self.gain.low > 0.0
+        """Whether the robot may be corrected by the findings: by the file that they make, on the part of the drive that did not make it;
+        where there is no such file and a part of the drive stays unexplained, by windows that sizes were not fitted to."""
+        if self.handover is not None:
+            return self.handover.is_better
+        return self.verdict != "unexplained" or (self.gain is not None and self.gain.low > 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """The format of `diagnose --json`, whose keys stay as they are."""
@@ -424,12 +428,19 @@ def unit_of(name: str) -> str:
 
 
 def correctable_findings(d: Diagnosis) -> list[Finding]:
-    """Findings that a robot is corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing
-    whose size depends on one of these."""
+    """Findings that a robot may be corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing
+    whose size depends on one of these; where a part stays unexplained, only what by itself improves windows that it was not fitted to."""
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
     contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
     contested |= {f.cause for f in estimated if not f.is_plausible}
+    if d.verdict == "unexplained":
+        contested |= {f.cause for f in estimated if f.gain.low <= 0.0}
     return [f for f in estimated if f.cause not in contested and f.is_independent_of(contested)]
+
+
+def confirmed_findings(d: Diagnosis) -> list[Finding]:
+    """Findings that the sentence orders to correct, and that a robot file is written with: they improve what they were not fitted to."""
+    return correctable_findings(d) if d.is_confirmed else []
 
 
 def sentence(d: Diagnosis) -> str:
@@ -445,8 +456,11 @@ def sentence(d: Diagnosis) -> str:
         tolerated = describe_tolerated(d)
         text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
         return text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
-    estimated = correctable_findings(d) if d.is_confirmed else []
-    parts = [f"{part[0].upper()}{part[1:]}" for part in ([_correction(d, estimated)] if estimated else []) + missing]
+    estimated = correctable_findings(d)
+    orders = [_correction(d, estimated)] if estimated and d.is_confirmed else []
+    if estimated and not d.is_confirmed and d.verdict != "unexplained":
+        orders = [_not_better(estimated)]
+    parts = [f"{part[0].upper()}{part[1:]}" for part in orders + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
     if left:
         unnamed = "Something without a name is left" if parts else f"{d.model} is wrong here, but not in a way that has a name"
@@ -455,17 +469,25 @@ def sentence(d: Diagnosis) -> str:
 
 
 def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
-    """What to correct, strongest finding first."""
+    """What to correct, strongest finding first, and what that gains on windows that did not correct it."""
     first = findings[0]
     text = f"Correct {first.definition.label}, off by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
     whole = d.gain or first.gain
-    if whole.relative >= _SHOWN_GAIN:
+    if d.handover is not None and d.handover.replays:
+        text += f"; {d.handover.describe_replays()}"
+    elif whole.relative >= _SHOWN_GAIN:
         text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
     if first.aliases:
         text += f". This drive cannot separate it from {describe_sizes(first.aliases)}"
     if len(findings) > 1:
         text += f". Then {', '.join(_further(f) for f in findings[1:])}"
     return text
+
+
+def _not_better(findings: Sequence[Finding]) -> str:
+    """Findings that improve nothing: causes, and why nothing is to be corrected."""
+    listed = ", ".join(_further(f) for f in findings)
+    return f"{listed}; a robot file with it improves nothing beyond the scatter of the half held out, so that nothing is to be corrected"
 
 
 def _further(f: Finding) -> str:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from localization.diagnosis.causes.cause import with_sizes
-from localization.diagnosis.corrected_robot import BLOCK, compared_halves, correct_robot, first_half_sizes, of_reference
+from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
+from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot, predictor_after
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.findings import HandoverCheck, Replayed
-from localization.diagnosis.linearization import Linearization
+from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import DrivePredictor
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from localization.logs.reader import Log
 from localization.pipeline import Run, Trial, replay
 from motion_models import se2
@@ -32,6 +33,13 @@ _LEAD_NS = 4_000_000_000
 """Before the first held-out window, for an estimator to begin [ns]."""
 _SAME_WINDOW_S = 0.3
 """Windows of two readings of a log that begin so close are one: clocks that are corrected move them by less."""
+_MIN_HALF_WINDOWS = 8
+_BLOCK = 2  # neighbouring windows share their errors: a scan between them, and the floor
+_SENSOR_FIELDS = (
+    *("wheel_time_offset_s", "gyro_time_offset_s", "gyro_scale", "lidar_offset", "lidar_time_offset_s", "range_scale"),
+    "range_bias_m",
+)
+"""What of a hypothesis a robot file corrects when messages are read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,43 +50,121 @@ class Reader:
     log: Callable[[Robot], Log]
 
 
-def check_written_robot(
-    reader: Reader, predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]
-) -> HandoverCheck | None:
-    """Correct the robot by the first half of the drive, write its file, read it again, and predict and replay the second half with it.
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A robot that was corrected by a part of a drive alone, and the rest, on which its file is checked."""
 
-    ``named`` are the keys of the findings. Everything that the file holds acts as it does in other commands: units, clocks, ranges and
-    mounts when messages are decoded. None where the file would hold none of the findings, or the drive is too short.
+    corrected: CorrectedRobot
+    sizes: Mapping[Cause, float]
+    """Of the causes that it was corrected by."""
+    held: NDArray[np.bool_]
+    """(W,) windows that did not correct it."""
+
+
+def check_findings(
+    predictor: DrivePredictor, linearization: Linearization, named: Sequence[str], reader: Reader | None = None
+) -> HandoverCheck | None:
+    """Correct the robot by the first half of the drive, and check its file on the second half, as `check_written`.
+
+    ``named`` are the keys of the findings. None where the file would hold none of them, for tables, and for drives that are too short.
     """
-    sizes = first_half_sizes(predictor, linearization, named)
+    sizes = _first_half_sizes(predictor, linearization, named)
     if sizes is None:
         return None
-    old = predictor.drive.robot
-    corrected = correct_robot(predictor, sizes).robot
-    if corrected == old:
+    held = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
+    return check_written(predictor, linearization.noise, Candidate(correct_robot(predictor, sizes), sizes, held), reader)
+
+
+def check_written(predictor: DrivePredictor, noise: Noise, candidate: Candidate, reader: Reader | None) -> HandoverCheck | None:
+    """Write the robot file of the ``candidate``, read it again, and predict and replay the windows that are held out with it.
+
+    With a ``reader`` the log is read with the file, so that units, clocks, ranges and mounts act as they do in other commands, and is
+    replayed by `odometry` and `ekf`; without one windows are predicted, which is the odometry of a table. Errors of a reference are no part
+    of the check. None where the file changes nothing, or nothing was measured.
+    """
+    if candidate.corrected.robot == predictor.drive.robot:
         return None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.toml"
-        path.write_text(robot_toml(relocated(corrected, path.parent)), encoding="utf-8")
-        new = load_robot(path)
-        drive = reader.drive(new)
-        if not drive.maneuvers:
-            return None
-        model = make_model(predictor.model.name, new)
-        after = DrivePredictor(drive, model, has_inertia=predictor.has_inertia, baseline=predictor.baseline)
-        of_marker = of_reference(with_sizes(sizes), drive.is_lidar_reference)
-        first, second = _paired(predictor.drive, drive)
-        rows = predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second]
-        found = compared_halves(*rows)
-        if found is None:
-            return None
-        if not drive.has_headings:  # chords between positions are no poses to compare with
-            return found
-        runs = (old, predictor.drive, first), (new, drive, second)
-        errors = [_replay_errors(reader.log(robot), robot, predictor.model.name, cut, windows) for robot, cut, windows in runs]
-    noise = _window_noise(linearization.noise, first, 0.5 * old.geometry.track_width_m)
-    compared = {name: _compared(errors[0][name], errors[1][name], noise) for name in errors[0]}
-    return dataclasses.replace(found, replays={name: one for name, one in compared.items() if one is not None})
+        path.write_text(robot_toml(relocated(candidate.corrected.robot, path.parent)), encoding="utf-8")
+        written = dataclasses.replace(candidate.corrected, robot=load_robot(path))
+        candidate = dataclasses.replace(candidate, corrected=written)
+        if reader is None:
+            return _check_predicted(predictor, candidate)
+        return _check_replayed(predictor, noise, candidate, reader)
+
+
+def _check_predicted(predictor: DrivePredictor, candidate: Candidate) -> HandoverCheck | None:
+    """Windows held out, as the file predicts them."""
+    drive, hypothesis = predictor.drive, with_sizes(candidate.sizes)
+    after = predictor_after(predictor, candidate.corrected, predictor.model.name)
+    held = candidate.held[predictor.batch.owner]
+    rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
+    found = _compared_rows(rows[0][held], rows[1][held])
+    if found is None or drive.kind == "log":
+        return found
+    weight = np.array([1.0, 1.0, 0.5 * drive.robot.geometry.track_width_m])
+    before, now = (np.nansum((r[held, :3] * weight) ** 2, axis=1) for r in rows)
+    odometry = _compared(before, now, np.zeros(len(before)))
+    return found if odometry is None else dataclasses.replace(found, replays={"odometry": odometry})
+
+
+def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidate, reader: Reader) -> HandoverCheck | None:
+    """Windows held out, of the log as it is read and replayed with the file."""
+    old, new, name = predictor.drive.robot, candidate.corrected.robot, predictor.model.name
+    drive = reader.drive(new)
+    if not drive.maneuvers:
+        return None
+    after = DrivePredictor(drive, make_model(name, new), has_inertia=predictor.has_inertia, baseline=predictor.baseline)
+    of_marker = _of_reference(with_sizes(candidate.sizes), drive.is_lidar_reference)
+    first, second = _paired(predictor.drive, drive, candidate.held)
+    found = _compared_rows(predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second])
+    if found is None or not drive.has_headings:  # chords between positions are no poses to compare with
+        return found
+    runs = (old, predictor.drive, first), (new, drive, second)
+    errors = [_replay_errors(reader.log(robot), robot, name, cut, windows) for robot, cut, windows in runs]
+    variances = _window_noise(noise, first, 0.5 * old.geometry.track_width_m)
+    compared = {estimator: _compared(errors[0][estimator], errors[1][estimator], variances) for estimator in errors[0]}
+    return dataclasses.replace(found, replays={estimator: one for estimator, one in compared.items() if one is not None})
+
+
+def _first_half_sizes(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> dict[Cause, float] | None:
+    """Sizes of the causes with keys ``named`` by the first half of the drive alone; None for tables, and halves with too few windows."""
+    half = len(predictor.drive.maneuvers) // 2
+    if predictor.drive.kind != "log" or half < _MIN_HALF_WINDOWS or not named:
+        return None
+    is_first = np.arange(len(linearization.rows)) < half
+    arrays = linearization.linear, linearization.signatures, linearization.nuisances
+    first = [np.where(is_first.reshape(-1, *(1,) * (a.ndim - 1)), a, np.nan) for a in arrays]
+    chosen = [i for i, cause in enumerate(linearization.causes) if cause.key in named]
+    causes = tuple(linearization.causes[i] for i in chosen)
+    problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
+    sizes = problem.fit(tuple(range(len(causes))))[0]
+    return dict(zip(causes, (float(v) for v in sizes), strict=True))
+
+
+def _compared_rows(before: FloatArray, after: FloatArray) -> HandoverCheck | None:
+    """Discrepancies ``before`` and ``after`` (M, 6) of windows that were held out; None where nothing was measured in both."""
+    shown = [c for c in range(4) if all(np.isfinite(r[:, c]).any() for r in (before, after))]
+    if not shown:
+        return None
+    before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[:, c] ** 2))) for c in shown} for r in (before, after))
+    scale = np.array([max(before_rms[CHANNELS[c]], 1e-12) * math.sqrt(len(shown)) for c in shown])
+    squares = [np.sum(np.nan_to_num(r[:, shown] / scale) ** 2, axis=1) for r in (before, after)]
+    gain = root_mean_gain(squares[0], squares[1], np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
+    return HandoverCheck(before_rms, after_rms, len(before), gain)
+
+
+def _of_sensors(hypothesis: Hypothesis) -> Hypothesis:
+    """The part of ``hypothesis`` by which the robot file corrects what was measured."""
+    return Hypothesis(**{name: getattr(hypothesis, name) for name in _SENSOR_FIELDS})
+
+
+def _of_reference(hypothesis: Hypothesis, is_lidar_reference: bool) -> Hypothesis:
+    """The part of ``hypothesis`` that is a reference's, none where the LiDAR measured the motion."""
+    if is_lidar_reference:
+        return Hypothesis()
+    return Hypothesis(lidar_offset=hypothesis.lidar_offset, lidar_time_offset_s=hypothesis.lidar_time_offset_s)
 
 
 def _compared(before: FloatArray, after: FloatArray, noise: FloatArray) -> Replayed | None:
@@ -87,21 +173,20 @@ def _compared(before: FloatArray, after: FloatArray, noise: FloatArray) -> Repla
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
-    gain = root_mean_gain(before[known], after[known], np.arange(int(known.sum())) // BLOCK, np.random.default_rng(0))
+    gain = root_mean_gain(before[known], after[known], np.arange(int(known.sum())) // _BLOCK, np.random.default_rng(0))
     return Replayed(
         math.sqrt(float(before[known].mean())), math.sqrt(float(after[known].mean())), gain, math.sqrt(float(noise[known].mean()))
     )
 
 
-def _paired(before: Drive, after: Drive) -> tuple[IntArray, IntArray]:
-    """Indices of the windows of the second half of ``before``, and of the same windows ``after``."""
-    half = len(before.maneuvers) // 2
+def _paired(before: Drive, after: Drive, held: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
+    """Indices of the windows of ``before`` that are ``held`` (W,) out, and of the same windows ``after``."""
     starts = after.spans_ns[:, 0]
     pairs = []
-    for i in range(half, len(before.maneuvers)):
+    for i in np.flatnonzero(held):
         j = int(np.argmin(np.abs(starts - before.spans_ns[i, 0])))
         if abs(int(starts[j] - before.spans_ns[i, 0])) <= _SAME_WINDOW_S * 1e9:
-            pairs.append((i, j))
+            pairs.append((int(i), j))
     first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     return first, second
 

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Hypothesis, with_sizes
 from localization.diagnosis.diagnose import DiagnosisResult
@@ -210,7 +211,7 @@ class _Design(NamedTuple):
     columns: FloatArray
     """(M, 6, K) causes, then candidates."""
 
-    def problem(self, noise: Noise, used: FloatArray | None = None) -> _Regression:
+    def problem(self, noise: Noise, used: NDArray[np.bool_] | None = None) -> _Regression:
         """Whitened, of the windows ``used`` (M,) or all."""
         y, b, t = noise.whiten(self.linear), noise.whiten(self.base), noise.whiten(self.columns)
         if used is not None:
@@ -349,7 +350,7 @@ def merge_terms(own: Sequence[Term], added: Sequence[Term]) -> tuple[Term, ...]:
     return tuple(found.values())
 
 
-def sizes_on(predictor: DrivePredictor, search: Search, used: FloatArray) -> tuple[dict[int, float], tuple[Term, ...]]:
+def sizes_on(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> tuple[dict[int, float], tuple[Term, ...]]:
     """Sizes of the kept causes by index, and the terms, as the windows ``used`` (M,) alone have them."""
     state = search.state
     candidates = [Candidate(t.term.component, t.term.expression, 0.0) for t in search.terms]
@@ -365,7 +366,7 @@ def sizes_on(predictor: DrivePredictor, search: Search, used: FloatArray) -> tup
     return {i: float(v) for i, v in zip(search.kept, values[:k], strict=True)}, terms
 
 
-def halves(windows: int) -> tuple[FloatArray, FloatArray]:
+def halves(windows: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Two halves of so many windows, (windows,) each: blocks of four in turn, so that both have all kinds of motion."""
     first = (np.arange(windows) // 4) % 2 == 0
     return first, ~first

@@ -416,14 +416,13 @@ def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
     """Verdict and sentence, as the command prints them, then what to do about findings to be corrected and about missing messages."""
     from localization.diagnosis.causes import MISSING_MESSAGES
     from localization.diagnosis.corrected_robot import correct_robot
-    from localization.diagnosis.findings import correctable_findings, describe_sizes
+    from localization.diagnosis.findings import confirmed_findings, describe_sizes
 
     d = found.diagnosis
     values = {"verdict": d.verdict, "windows": str(d.windows), "model": d.model}
+    corrected = confirmed_findings(d)
     if found.predictor is not None:
-        robot = correct_robot(found.predictor, {f.definition: f.size for f in correctable_findings(d)}).robot
-    is_worse = d.handover is not None and not d.handover.is_better
-    corrected = [] if is_worse else correctable_findings(d)
+        robot = correct_robot(found.predictor, {f.definition: f.size for f in corrected}).robot
     remedies = []
     for i, finding in enumerate(d.findings, 1):
         values[f"finding_{i}"] = f"{finding.cause} {finding.size:+.4g} +- {finding.sigma:.2g} {finding.definition.unit}"

@@ -99,7 +99,7 @@ def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys
     log = bag(tmp_path / "drive.mcap", {"wheel_radius_difference": 0.04, "wheel_time_offset": 0.06}, 1, "husky_a200")
     out = tmp_path / "out"
     assert main(["diagnose", str(log), "--robot", "husky_a200", "--model", "diff_drive", "--out", str(out)]) == 0
-    assert "second half of the drive" in capsys.readouterr().out
+    assert "corrected by the other half alone" in capsys.readouterr().out
     content = json.loads((out / "diagnosis.json").read_text())["handover"]
     assert content["is_better"]
     assert all(content["rms_after"][name] < 0.6 * content["rms_before"][name] for name in ("x", "y", "yaw"))

@@ -78,8 +78,8 @@ def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name
     assert not load_robot(tmp_path / "out" / "robot.toml").terms
 
 
-def test_extend_where_some_windows_have_headings_alone_states_metres_of_the_others() -> None:
-    """Along walls scans fix no position: such windows take no part in the path, and do not turn all of it into headings."""
+def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> None:
+    """Along walls scans fix no position: such windows take no part in x and y, and the others do."""
     name, seed = "pioneer_3dx", 3
     plain, model = load_robot(name), ROBOTS[name]
     drive = windows([dataclasses.replace(plain, terms={model: (random_term(seed),)})] * 40, model, seed)
@@ -88,6 +88,7 @@ def test_extend_where_some_windows_have_headings_alone_states_metres_of_the_othe
     table, made = drive_of_table("drive.csv", plain, drive, "windows"), make_model(model, plain)
     extension = extend(examine(table, made), table, made).extension
     assert extension is not None
-    assert extension.replay.unit == "m"
-    assert extension.replay.windows == 19  # of the second half, windows 4 to 7, 12 to 15, ..., without window 5
-    assert extension.replay.path_after < extension.replay.path_before
+    assert extension.check is not None
+    assert extension.check.windows == 20  # of the second half, windows 4 to 7, 12 to 15, ...
+    assert set(extension.check.before) >= {"x", "y", "yaw"}
+    assert extension.check.replays["odometry"].after_m < extension.check.replays["odometry"].before_m
