@@ -72,7 +72,7 @@ class Scan:
     frame_id: str = ""
     is_planar: bool = True
 
-    @property
+    @cached_property
     def middle_s(self) -> float:
         """Middle of the scan duration, after `stamp_ns` [s]."""
         return 0.5 * (float(self.offsets.min()) + float(self.offsets.max())) if len(self.offsets) else 0.0

@@ -44,6 +44,8 @@ class GyroBuffer:
         self._noise, self._mounts = noise, mounts
         self._keep_ns = int(keep_s / _NS)
         self._stamps: list[int] = []
+        self.newest_ns: int | None = None
+        """Stamp of the newest sample; None before the first."""
         self._rates: list[float] = []
         self._angles: list[float] = []
         self._sum_squared_differences: list[float] = []  # second ones, of the rate
@@ -103,6 +105,7 @@ class GyroBuffer:
             self._sum_squared_differences.append(0.0)
         self._rate_before, self._rate = self._rate, rate
         self._stamps.append(stamp_ns)
+        self.newest_ns = stamp_ns
         self._rates.append(rate)
         if self._stamps[0] < stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._stamps, stamp_ns - self._keep_ns)
@@ -115,11 +118,6 @@ class GyroBuffer:
     def __len__(self) -> int:
         """Stored samples."""
         return len(self._stamps)
-
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest sample; None before the first."""
-        return self._stamps[-1] if self._stamps else None
 
     def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
         """The turn from ``start_ns`` to ``end_ns``; ``by_wheels`` [rad] gives its sign alone, where the mount does not.
@@ -219,6 +217,7 @@ class GyroBuffer:
     def _reset(self) -> None:
         self._reject()
         self._stamps.clear()
+        self.newest_ns = None
         self._rates.clear()
         self._angles.clear()
         self._sum_squared_differences.clear()

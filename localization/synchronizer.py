@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
+import operator
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
-from motion_models.extended_model import Series, in_series
+from motion_models.extended_model import Series, in_series, needs_series
 from motion_models.friction.model import BoolArray
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.preintegration import integrate_twists
@@ -74,26 +75,21 @@ class UnknownVelocity:
 
     def __init__(self, config: StepConfig) -> None:
         self._least = np.array([config.lost_speed_m_s, config.lost_speed_m_s, config.lost_rate_rad_s])
-        self._sigma = self._least
-        self._lasted_s = np.zeros(3)  # for which the motion along x, along y and the turn are unknown
-
-    def set_measured(self, twist: Twist2) -> None:
-        """Set the last measured twist (3,): the next unknown velocity may be as large."""
-        speed = math.hypot(twist[0], twist[1])
-        self._sigma = np.maximum(self._least, [speed, speed, abs(twist[2])])
-
-    def restart(self, lasted_s: float = 0.0) -> None:
-        """The pose was measured ``lasted_s`` ago [s]: the velocity acts only from there on."""
-        self._lasted_s = np.full(3, lasted_s)
+        self.measured: Twist2 = np.zeros(3)
+        """(3,) the last measured twist: the next unknown velocity may be as large."""
+        self.lasted_s: FloatArray | float = 0.0
+        """For how long the motion along x, along y and the turn (3,), or all alike, have been unknown [s]: 0 where the pose was measured
+        now."""
 
     def increment(self, missing_s: float, has_turn: bool) -> Cov3:
         """Covariance (3, 3) of the motion in the next ``missing_s`` [s]. ``has_turn``: a gyro measures the turn of each step, so that
         the turn before is known."""
-        is_unknown = np.array([True, True, not has_turn])
-        since = self._lasted_s * is_unknown
+        is_unknown, speed = np.array([True, True, not has_turn]), math.hypot(self.measured[0], self.measured[1])
+        sigma = np.maximum(self._least, [speed, speed, abs(self.measured[2])])
+        since = self.lasted_s * is_unknown
         until = since + missing_s
-        self._lasted_s = until * is_unknown
-        after, before = (np.minimum((self._sigma * t) ** 2, _MAX_VARIANCE) for t in (until, since))
+        self.lasted_s = until * is_unknown
+        after, before = (np.minimum((sigma * t) ** 2, _MAX_VARIANCE) for t in (until, since))
         return np.diag(after - before)
 
 
@@ -105,7 +101,7 @@ class Synchronizer:
 
     def __init__(self, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: StepConfig | None = None):
         self.config = config or StepConfig()
-        self.model, self._wheel_noise = model, robot.wheel_noise
+        self.model, self._wheel_noise, self._needs_series = model, robot.wheel_noise, needs_series(model)
         self.params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity)
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
@@ -122,11 +118,12 @@ class Synchronizer:
         self._scans: deque[tuple[int, Scan]] = deque()  # and the middle of its sweep
         self._empty_scans, self._late_scans, self._no_wheel_data_s = 0, 0, 0.0
         self._velocity = UnknownVelocity(self.config)  # in gaps of the wheel data
+        self._wait_ns, self._max_step_ns = _ns(self.config.wait_s), _ns(self.config.max_step_s)
         self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
         self._start_ns: int | None = None
         self._first_wheel_ns: int | None = None
         self._now_ns = -(1 << 62)
-        self._clock_offset_s = 0.0
+        self._clock_offset_ns = 0
 
     def set_calibration(self, params: FloatArray | None, clock_offset_s: float) -> None:
         """Use ``params`` (k,) of the motion model (None: unchanged) and the wheels' clock offset from the next step on.
@@ -135,11 +132,11 @@ class Synchronizer:
         """
         if params is not None:
             self.params = params
-        self._clock_offset_s = clock_offset_s
+        self._clock_offset_ns = _ns(clock_offset_s)
 
     def restart_gap(self) -> None:
         """Restart the gap in the wheel data: a matched scan measured the pose, so the unknown velocity acts only from here on."""
-        self._velocity.restart()
+        self._velocity.lasted_s = 0.0
 
     def insert(self, event: Event) -> None:
         """Store ``event`` in the buffer of its sensor."""
@@ -160,8 +157,9 @@ class Synchronizer:
             self._wheels.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
             self._empty_scans += not len(event.points)
+            middle_ns = event.middle_ns
             # one that was overtaken goes where it belongs, if that still waits
-            self._scans.insert(bisect.bisect_right(self._scans, event.middle_ns, key=lambda scan: scan[0]), (event.middle_ns, event))
+            self._scans.insert(bisect.bisect_right(self._scans, middle_ns, key=operator.itemgetter(0)), (middle_ns, event))
 
     def turn(self, start_ns: int, end_ns: int) -> Turn | None:
         """By the gyro's samples so far, as `GyroBuffer.turn`; changes nothing."""
@@ -212,20 +210,20 @@ class Synchronizer:
         """End of the next step and the scan there, or None."""
         if self._scans:
             middle_ns, _ = self._scans[0]
-            is_late = self._now_ns > middle_ns + _ns(self.config.wait_s)
+            is_late = self._now_ns > middle_ns + self._wait_ns
             return self._scans.popleft() if is_last or is_late or self._has_rates_until(middle_ns) else None
         if self._start_ns is None and self._first_wheel_ns is not None and (is_last or self._now_ns > self._first_wheel_ns + _SCAN_WAIT_NS):
             self._start_ns = self._first_wheel_ns
         if self._start_ns is None or self._wheels.newest_ns is None:
             return None
-        end_ns = self._wheels.newest_ns - _ns(self._clock_offset_s)
+        end_ns = self._wheels.newest_ns - self._clock_offset_ns
         if self._has_lidar:
             end_ns = min(end_ns, self._now_ns)  # wheels stamped too early must not overtake a scan that is still to come
-            least = self.config.max_step_s + (0.0 if is_last else self.config.wait_s)
-            return None if end_ns - self._start_ns < _ns(least) else (self._start_ns + _ns(self.config.max_step_s), None)
+            least_ns = self._max_step_ns + (0 if is_last else self._wait_ns)
+            return None if end_ns - self._start_ns < least_ns else (self._start_ns + self._max_step_ns, None)
         # the gyro's clock may be ahead of the wheels': holding its last rate would hide the offset between the two clocks
         gyro_ns = self._gyro.newest_ns
-        if gyro_ns is not None and not is_last and self._now_ns <= gyro_ns + _ns(self.config.wait_s):
+        if gyro_ns is not None and not is_last and self._now_ns <= gyro_ns + self._wait_ns:
             end_ns = min(end_ns, gyro_ns)
         least_ns = 1 if is_last else _ns(self.config.no_lidar_step_s)
         return None if end_ns - self._start_ns < least_ns else (end_ns, None)
@@ -234,13 +232,13 @@ class Synchronizer:
         """Whether the rates of the wheels, and of a gyro that is not silent, are known until ``stamp_ns``: which of them comes first must
         not matter."""
         known_ns, gyro_ns = self._wheels.rates_known_until_ns, self._gyro.newest_ns
-        is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + _ns(self.config.wait_s)
-        return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + _ns(self._clock_offset_s)
+        is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + self._wait_ns
+        return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + self._clock_offset_ns
 
     def preintegrate(self, interval: StepInterval) -> Step:
         """The wheels' motion, the gyro's turn and the scan of ``interval``."""
         start_ns, end_ns, scan = interval
-        shift = _ns(self._clock_offset_s)
+        shift = self._clock_offset_ns
         dt, rates, cg, missing = self._wheels.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
         tilt = None if self.attitude is None else self.attitude.advance(end_ns, dt, rates)
         motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg, tilt)
@@ -254,12 +252,12 @@ class Synchronizer:
             self._no_wheel_data_s += missing
             motion = replace(motion, cov=motion.cov + self._velocity.increment(missing, has_turn=turn is not None))
         if missing < (end_ns - start_ns) * 1e-9 - _MIN_KNOWN_S:  # wheels measured the velocity in this step
-            self._velocity.restart(missing)
+            self._velocity.lasted_s = missing
         if scan is not None and len(scan.points) and not len(scan.offsets):
             self._timeless += 1
             self._has_turned |= bool(motion.delta[2])
         if has_wheels:
-            self._velocity.set_measured(last)
+            self._velocity.measured = last
         twist = last if has_wheels else turn_twist(turn)
         body_turn, gravity = None, None
         if self._body_rates is not None and self.attitude is not None:
@@ -279,8 +277,10 @@ class Synchronizer:
         before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
         n = len(before)
         rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
-        since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self._first_wheel_ns or start_ns)) * 1e-9
-        model = in_series(self.model, Series(np.r_[np.zeros(n), dt], since))
+        model = self.model
+        if self._needs_series:
+            since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self._first_wheel_ns or start_ns)) * 1e-9
+            model = in_series(model, Series(np.r_[np.zeros(n), dt], since))
         if tilt is None or self._slope_effect is None:
             twist = model.twist(rates, cg, self.params)
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])

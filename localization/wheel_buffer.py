@@ -37,9 +37,15 @@ class WheelBuffer:
     """
 
     def __init__(self, cg: FloatArray, keep_s: float = 10.0) -> None:
-        self._cg, self._cg_cov = cg, np.zeros((2, 2))
+        self._cg = cg
+        self.cg_cov: FloatArray = np.zeros((2, 2))
+        """(2, 2) covariance of the CG [m^2]."""
         self._keep_ns = int(keep_s / _NS)
         self._last: WheelSample | None = None
+        self.newest_ns: int | None = None
+        """Stamp of the newest sample; None before the first."""
+        self.rates_known_until_ns: int | None = None
+        """Up to when rates are known; None before two samples."""
         self._ends: list[int] = []
         self._intervals: list[WheelInterval] = []
 
@@ -47,47 +53,34 @@ class WheelBuffer:
         """Stored intervals."""
         return len(self._intervals)
 
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest sample; None before the first."""
-        return None if self._last is None else self._last.stamp_ns
-
-    @property
-    def rates_known_until_ns(self) -> int | None:
-        """Up to when rates are known; None before two samples."""
-        return self._ends[-1] if self._ends else None
-
     def set_cg(self, sample: CgSample) -> None:
         """Set the CG of the samples to come."""
-        self._cg, self._cg_cov = sample.position, sample.covariance
-
-    @property
-    def cg_cov(self) -> FloatArray:
-        """(2, 2) covariance of the CG [m^2]."""
-        return self._cg_cov
+        self._cg, self.cg_cov = sample.position, sample.covariance
 
     def insert(self, sample: WheelSample) -> None:
         """Store the next sample. One that does not come after the newest, or has no number for a side, changes nothing."""
         # plain numbers: numpy takes five times as long on two of them, and this is done for every message of the wheels
-        position, velocity = sample.position.tolist(), sample.velocity.tolist()
-        if not all(isfinite(p) or isfinite(v) for p, v in zip(position, velocity, strict=True)):
+        (p_left, p_right), (v_left, v_right) = sample.position.tolist(), sample.velocity.tolist()
+        if not ((isfinite(p_left) or isfinite(v_left)) and (isfinite(p_right) or isfinite(v_right))):
             return
         last = self._last
+        if last is not None and sample.stamp_ns <= last.stamp_ns:  # its motion is in the next sample's angles as well
+            return
+        self._last, self.newest_ns = sample, sample.stamp_ns
         if last is None:
-            self._last = sample
             return
-        if sample.stamp_ns <= last.stamp_ns:  # its motion is in the next sample's angles as well
-            return
-        self._last = sample
         seconds = (sample.stamp_ns - last.stamp_ns) * _NS
-        rates = [(p - before) / seconds for p, before in zip(position, last.position.tolist(), strict=True)]
-        has_angles = all(map(isfinite, rates))
+        before_left, before_right = last.position.tolist()
+        left, right = (p_left - before_left) / seconds, (p_right - before_right) / seconds
+        has_angles = isfinite(left) and isfinite(right)
         if not has_angles:
-            rates = [_mean_of_known(v, before) for v, before in zip(velocity, last.velocity.tolist(), strict=True)]
-        if not all(map(isfinite, rates)):
+            before_left, before_right = last.velocity.tolist()
+            left, right = _mean_of_known(v_left, before_left), _mean_of_known(v_right, before_right)
+        if not (isfinite(left) and isfinite(right)):
             return
         self._ends.append(sample.stamp_ns)
-        (left, right), (x, y) = rates, self._cg.tolist()
+        self.rates_known_until_ns = sample.stamp_ns
+        x, y = self._cg.tolist()
         self._intervals.append(WheelInterval(last.stamp_ns, left, right, x, y, has_angles))
         if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
@@ -97,8 +90,8 @@ class WheelBuffer:
         """Rates (n, 2) and CG (n, 2) of the interval at ``stamp_ns``, else of the next or the last one; n = 0 if it begins more than
         ``max_hold_s`` away."""
         i = min(bisect.bisect_right(self._ends, stamp_ns), len(self._ends) - 1)
-        known = self._intervals[i : i + 1] if i >= 0 and abs(self._intervals[i].start_ns - stamp_ns) <= max_hold_s / _NS else []
-        table = np.array([row[1:5] for row in known]).reshape(-1, 4)
+        is_known = i >= 0 and abs(self._intervals[i].start_ns - stamp_ns) <= max_hold_s / _NS
+        table = np.array(self._intervals[i][1:5] if is_known else ()).reshape(-1, 4)
         return table[:, :2], table[:, 2:]
 
     def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:

@@ -72,11 +72,6 @@ class ExtendedModel(ModelWrapper):
         added = np.diag([t.sigma**2 for t in self.terms])
         return FieldPrior(block_diag(inner.cov, added), block_diag(inner.spread, np.zeros_like(added)))
 
-    @property
-    def needs_series(self) -> bool:
-        """Whether a term depends on accelerations or time."""
-        return any(name in _SERIES for term in self.terms for name in term.expression.variables)
-
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""
         k = len(self.inner.param_names)
@@ -129,7 +124,7 @@ class ExtendedModel(ModelWrapper):
         v, wz = found.value[..., 0], found.value[..., 2]
         rates, center = np.broadcast_to(wheels, (*lead, 2)), np.broadcast_to(cg, (*lead, 2))
         values = {"v": v, "wz": wz, "left": rates[..., 0], "right": rates[..., 1], "cg_x": center[..., 0], "cg_y": center[..., 1]}
-        if not self.needs_series:
+        if not needs_series(self):
             return values
         if self.series is None or self.series.dt.shape != lead:
             return {**values, "dv": np.zeros(lead), "dwz": np.zeros(lead), "t": np.zeros(lead)}
@@ -153,10 +148,15 @@ def terms_of(model: object) -> tuple[Term, ...]:
     return ()
 
 
+def needs_series(model: object) -> bool:
+    """Whether a term of ``model`` depends on accelerations or time."""
+    return any(name in _SERIES for term in terms_of(model) for name in term.expression.variables)
+
+
 def in_series(model: Any, series: Series) -> Any:
     """``model`` for samples taken as ``series`` has it, where its terms depend on accelerations or time; else the same."""
     if isinstance(model, ExtendedModel):
-        return dataclasses.replace(model, series=series) if model.needs_series else model
+        return dataclasses.replace(model, series=series) if needs_series(model) else model
     inner = getattr(model, "inner", None)
     if inner is None or (changed := in_series(inner, series)) is inner:
         return model

@@ -354,7 +354,7 @@ def test_unknown_velocity_turns_from_the_last_turn_of_the_gyro_on():
         np.testing.assert_allclose(np.sqrt(velocity.increment(0.1, has_turn=True)[2, 2]), 0.05)
     found = np.sum([velocity.increment(0.1, has_turn=False) for _ in range(10)], axis=0)
     np.testing.assert_allclose(np.diag(found), [0.25 * (11.0**2 - 10.0**2)] * 2 + [0.25])
-    velocity.restart()
+    velocity.lasted_s = 0.0
     np.testing.assert_allclose(np.diag(velocity.increment(0.2, has_turn=False)), 0.01)
 
 

@@ -46,10 +46,15 @@ class SensorChecks:
             Standstill(faults, window, step_config),
             self._disagreement,
         )
-        self._consistency, self._places = Consistency(faults), KnownPlaces(self._inflation)
+        self._preparing, self._comparing_estimates = self._that_override("prepare"), self._that_override("compare_estimate")
+        self._consistency, self._places = Consistency(faults), KnownPlaces(faults)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None
+
+    def _that_override(self, method: str) -> tuple[Check, ...]:
+        """The checks with a ``method`` of their own."""
+        return tuple(check for check in self._checks if getattr(type(check), method) is not getattr(Check, method))
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
@@ -61,7 +66,7 @@ class SensorChecks:
         if not np.isfinite(step.predicted.delta).all():
             return step  # the estimator refuses it
         self._faults.start_step(step)
-        for check in self._checks:
+        for check in self._preparing:
             step = check.prepare(step)
         self._inflation.add_step(step)
         if self._window.add(step, self._faults.now_s):
@@ -92,7 +97,7 @@ class SensorChecks:
         before, self._pose = self._pose, estimate.pose if estimate.odometry is None else estimate.odometry[0]
         delta = np.zeros(3) if before is None else se2.between(before, self._pose)
         if before is not None and self._step is not None:
-            for check in self._checks:
+            for check in self._comparing_estimates:
                 check.compare_estimate(self._step, delta, estimate.nis)
             self._consistency.compare_estimate(delta, estimate.nis)
         inflated = self._inflation.inflate(estimate, delta)
@@ -102,7 +107,7 @@ class SensorChecks:
 
     def _compare_places(self, scan: Scan, pose: Pose2) -> None:
         """A place from before the faults may show ``pose`` (3,): then differences of sensors count from here on."""
-        if self._places.update(lambda: self._window.project(scan), pose, self._faults.now_s, self._faults.latest_s):
+        if self._places.update(lambda: self._window.project(scan), pose):
             self._disagreement.restart()
             self._consistency.restart()
 

@@ -112,7 +112,9 @@ class Consistency:
         if step.turn is not None and step.has_wheels:
             self._clipping.add(step.turn.angle / step.duration, step.duration)
         has_ended = False
-        for pair, innovation in _innovations(step, residuals).items():
+        for pair, innovation in _innovations(step, residuals):
+            if innovation is None:
+                continue
             regressors, self._totals_at[pair] = self._totals - self._totals_at[pair], self._totals.copy()
             if self._windows[pair].add(*innovation, regressors, self._faults.now_s, self._poses):
                 self._compare(pair)
@@ -133,10 +135,14 @@ class Consistency:
         self._poses = se2.compose(self._poses, np.array([delta, self._file_delta, by_gyro]))
         if nis is not None:
             self._matched_s = self._faults.now_s
+        inflation = self._faults.inflation
+        if not self._episodes:
+            inflation.are_wheels_outvoted, inflation.ongoing_pair = False, None
+            return
         differences = [self._difference(e) for e in self._episodes.values() if self._is_inflating(e)]
         is_lidar_right = self._has_scans and bool(self._windows[LIDAR_GYRO].bins) and DIFFERENCES[LIDAR_GYRO] not in self._episodes
-        self._faults.inflation.are_wheels_outvoted = is_lidar_right and DIFFERENCES[GYRO_WHEELS] in self._episodes
-        self._faults.inflation.ongoing_pair = max(differences, key=lambda d: float(d @ d), default=None)
+        inflation.are_wheels_outvoted = is_lidar_right and DIFFERENCES[GYRO_WHEELS] in self._episodes
+        inflation.ongoing_pair = max(differences, key=lambda d: float(d @ d), default=None)
 
     def restart(self) -> None:
         """The pose is known: differences that last count from here on."""
@@ -190,6 +196,8 @@ class Consistency:
 
     def _is_explained(self, fault: Fault, named: Sequence[Fault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
+        if not self._faults.declared:
+            return False
         found = [self._faults.found[other].at_s for other in named if other in self._faults]
         if not found:
             return False
@@ -224,15 +232,12 @@ class Consistency:
             self._episodes[other] = episode
 
 
-def _innovations(step: Step, residuals: Residuals) -> Mapping[Pair, tuple[float, float]]:
-    """Innovation and variance of each pair that ``step`` has measured."""
-    found = {
-        GYRO_WHEELS: residuals.turn if step.turn is not None and step.has_wheels else None,
-        LIDAR_GYRO: residuals.scan_turn if step.turn is not None else None,
-        LIDAR_WHEELS_TURNS: residuals.scan_turn if step.turn is None and step.has_wheels else None,
-        LIDAR_WHEELS_WAYS: residuals.scan_way if step.has_wheels else None,
-    }
-    return {pair: innovation for pair, innovation in found.items() if innovation is not None}
+def _innovations(step: Step, residuals: Residuals) -> Sequence[tuple[Pair, tuple[float, float] | None]]:
+    """Innovation and variance of each pair; None where ``step`` has not measured it."""
+    ways = LIDAR_WHEELS_WAYS, residuals.scan_way if step.has_wheels else None
+    if step.turn is None:
+        return (LIDAR_WHEELS_TURNS, residuals.scan_turn if step.has_wheels else None), ways
+    return (GYRO_WHEELS, residuals.turn if step.has_wheels else None), (LIDAR_GYRO, residuals.scan_turn), ways
 
 
 def _farthest(learned: Sequence[LearnedParameter]) -> LearnedParameter | None:

@@ -24,6 +24,7 @@ class CovarianceInflation:
     def __init__(self) -> None:
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
         self._pending, self._spread = np.zeros((3, 3)), np.zeros((3, 3))
+        self._has_spread = False
         self._since_ns: int | None = None
         self.are_wheels_outvoted = False
         """The wheels contradict the gyro, which the LiDAR confirms: their distance from the estimate is no error of it."""
@@ -54,17 +55,17 @@ class CovarianceInflation:
 
     def add(self, difference: FloatArray) -> None:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""
-        self._pending, self.count = self._pending + np.outer(difference, difference), self.count + 1
+        self._pending, self.count, self._has_spread = self._pending + np.outer(difference, difference), self.count + 1, True
 
     @property
     def is_inflating(self) -> bool:
         """Whether the covariance has anything of a fault."""
-        return bool(self.total.any())
+        return (self._has_spread or self.is_lasting) and bool(self.total.any())
 
     @property
     def is_lasting(self) -> bool:
         """Whether sensors disagree at present."""
-        return len(self._lasting) > 0
+        return self.ongoing_pair is not None or (self.ongoing is not None and not self.are_wheels_outvoted)
 
     @property
     def _lasting(self) -> list[FloatArray]:
@@ -78,18 +79,19 @@ class CovarianceInflation:
 
     def set_known(self, spread: Cov3) -> None:
         """A place from before the faults has shown the pose: its covariance ``spread`` (3, 3) is what is left of them."""
-        self._spread, self._pending = spread, np.zeros((3, 3))
+        self._spread, self._pending, self._has_spread = spread, np.zeros((3, 3)), True
         self.restart()
 
     def inflate(self, estimate: Estimate, delta: Pose2) -> Estimate:
         """``estimate``, which moved by ``delta`` (3,) in the last step, with the covariance of all differences so far."""
         self._estimated = se2.compose(self._estimated, delta)
-        A = se2.adjoint(se2.inverse(delta))
-        self._spread = A @ self._spread @ A.T + self._pending
-        self._pending = np.zeros((3, 3))
-        spread = self.total
-        if not spread.any() or estimate.covariance is None:
+        if self._has_spread:
+            A = se2.adjoint(se2.inverse(delta))
+            self._spread = A @ self._spread @ A.T + self._pending
+            self._pending = np.zeros((3, 3))
+        if estimate.covariance is None or not self.is_inflating:
             return estimate
+        spread = self.total
         if self._since_ns is None:
             self._since_ns = estimate.stamp_ns
         odometry = estimate.odometry

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import math
+import operator
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
@@ -75,6 +76,7 @@ class Window(NamedTuple):
         return regressor, describe(gains[best][1])
 
 
+_END_S = operator.attrgetter("end_s")
 _STANDING = {
     "turns": "The wheels stand: the {first}'s bias has changed, or the robot was turned by something else.",
     "ways": "The wheels stand: objects move past the {first}, or the robot was moved by something else.",
@@ -114,16 +116,14 @@ class InnovationWindows:
 
     def worst(self) -> Window | None:
         """That of the windows that end now whose sum is farthest from zero, in sigmas; None before the first is full."""
-        ends = [b.end_s for b in self.bins]
-        found = [window for seconds in WINDOWS_S if (window := self._window(ends, seconds)) is not None]
-        return max(found, key=lambda window: window.sigmas, default=None)
-
-    def _window(self, ends: Sequence[float], seconds: float) -> Window | None:
-        last = self.bins[-1]
-        before = max(bisect.bisect_right(ends, last.end_s - seconds) - 1, 0)
-        first = self.bins[before]
-        if last.seconds - first.seconds < _MIN_FILLED * seconds:
-            return None
-        total, variance = last.innovation - first.innovation, last.variance - first.variance
-        sigmas = abs(total) / math.sqrt(variance + self.pair.floor**2)
-        return Window(list(self.bins)[before:], seconds, total, sigmas)
+        bins, last, worst = list(self.bins), self.bins[-1], None
+        for seconds in WINDOWS_S:
+            before = max(bisect.bisect_right(bins, last.end_s - seconds, key=_END_S) - 1, 0)
+            first = bins[before]
+            if last.seconds - first.seconds < _MIN_FILLED * seconds:
+                continue
+            total, variance = last.innovation - first.innovation, last.variance - first.variance
+            sigmas = abs(total) / math.sqrt(variance + self.pair.floor**2)
+            if worst is None or sigmas > worst.sigmas:
+                worst = Window(bins[before:], seconds, total, sigmas)
+        return worst

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.sensor_checks.inflation import CovarianceInflation
+from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.scan_motion import Profile, align_from, make_profile
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
@@ -39,22 +39,23 @@ class _Place(NamedTuple):
 class KnownPlaces:
     """Places are kept while no fault lasts; the first scan is one, as its pose is the origin by definition."""
 
-    def __init__(self, inflation: CovarianceInflation) -> None:
-        self._inflation = inflation
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults, self._inflation = faults, faults.inflation
         self._places: list[_Place] = []
         self._compared_s = -math.inf
-        self._was_lasting, self._faults = False, 0
+        self._was_lasting, self._count = False, 0
 
-    def update(self, scan: Callable[[], tuple[Points2, FloatArray]], pose: Pose2, now_s: float, begin_s: float) -> bool:
+    def update(self, scan: Callable[[], tuple[Points2, FloatArray]], pose: Pose2) -> bool:
         """Keep a scan, or compare it: its points (M, 2) of the body frame and the LiDAR's position (2,) from the estimated ``pose`` (3,).
-        ``begin_s`` of the latest fault [s].
 
         Returns whether a place has shown the pose: differences of sensors count from here on."""
-        inflation = self._inflation
-        if (inflation.is_lasting and not self._was_lasting) or inflation.count > self._faults:
+        inflation, now_s = self._inflation, self._faults.now_s
+        is_lasting = inflation.is_lasting
+        if (is_lasting and not self._was_lasting) or inflation.count > self._count:
+            begin_s = self._faults.latest_s
             self._places = [p for i, p in enumerate(self._places) if not i or p.at_s < begin_s - _MARGIN_S]
-        self._was_lasting, self._faults = inflation.is_lasting, inflation.count
-        if not inflation.is_lasting:
+        self._was_lasting, self._count = is_lasting, inflation.count
+        if not is_lasting:
             self._keep(scan, pose, now_s)
         if not inflation.is_inflating or now_s - self._compared_s < _EVERY_S:
             return False

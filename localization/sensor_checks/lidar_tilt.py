@@ -38,7 +38,7 @@ class LidarTilt(Check):
 
     def prepare(self, step: Step) -> Step:
         """``step`` as it is."""
-        if step.scan is not None:
+        if step.scan is not None and not step.scan.is_planar:
             self.add(step.scan)
         return step
 

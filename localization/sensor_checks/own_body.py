@@ -10,7 +10,9 @@ import numpy as np
 from localization.events import Scan, Step
 from localization.sensor_checks.check import Check
 from localization.sensor_checks.faults import Fault, FaultLog
-from motion_models.se2 import FloatArray
+from localization.trajectory import BoolArray
+from motion_models.compiled import kernel
+from motion_models.se2 import FloatArray, Points2
 
 LIDAR_OWN_BODY = Fault(
     "{percent:.0f} % of the LiDAR's points are the robot itself (same ranges while it drives and turns). They are left out"
@@ -44,21 +46,20 @@ class OwnBody(Check):
             each.add_motion(step.predicted.delta)
         if step.scan is None:
             return step
-        body = self._filters.setdefault(step.scan.frame_id, OwnBodyFilter())
+        if step.scan.frame_id not in self._filters:
+            self._filters[step.scan.frame_id] = OwnBodyFilter()
+        body = self._filters[step.scan.frame_id]
         scan = body.filter(step.scan)
         if body.share > _MIN_OWN_SHARE:
             self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * body.share})
-        return replace(step, scan=scan)
+        return step if scan is step.scan else replace(step, scan=scan)
 
 
 class OwnBodyFilter:
     """Removes points of the robot itself from the scans of one LiDAR: their beams have the same range while the robot drives and turns."""
 
     def __init__(self) -> None:
-        self._range = np.full(_BODY_BEARINGS, np.nan)
-        self._travel = np.zeros(_BODY_BEARINGS)
-        self._headings = np.zeros((2, _BODY_BEARINGS))  # least and greatest since the range is the same [rad]
-        self._is_own = np.zeros(_BODY_BEARINGS, dtype=bool)
+        self._bearings = np.full((_BODY_BEARINGS, 5), np.nan)  # as `_find_own` has it
         self._travelled = self._heading = 0.0
         self.share = 0.0
         """Largest share of a scan's points that were the robot itself, 0 to 1."""
@@ -73,28 +74,39 @@ class OwnBodyFilter:
         points = scan.points
         if not scan.is_planar or not len(points):
             return scan
-        r2 = points[:, 0] ** 2 + points[:, 1] ** 2
-        near = np.flatnonzero(r2 < _MAX_BODY_RANGE_M**2)  # no point that is not finite
-        if not len(near):
-            self._range, self._travelled = np.full(_BODY_BEARINGS, np.nan), 0.0
-            return scan
-        r = np.sqrt(r2[near])
-        bins = np.floor(np.arctan2(points[near, 1], points[near, 0]) * (_BODY_BEARINGS / (2.0 * math.pi))).astype(np.intp) % _BODY_BEARINGS
-        nearest = np.full(_BODY_BEARINGS, np.inf)
-        np.minimum.at(nearest, bins, r)
-        nearest[np.isinf(nearest)] = np.nan
-        is_same = np.abs(nearest - self._range) <= _SAME_RANGE_M
-        self._travel = np.where(is_same, self._travel + self._travelled, 0.0)
-        least, greatest = self._headings
-        self._headings = np.where(is_same, [np.minimum(least, self._heading), np.maximum(greatest, self._heading)], self._heading)
-        self._range = np.where(is_same, self._range, nearest)
-        self._travelled = 0.0
-        has_turned = self._headings[1] - self._headings[0] >= _MIN_BODY_TURN_RAD
-        self._is_own = is_same & (self._is_own | ((self._travel >= _MIN_BODY_TRAVEL_M) & has_turned))
         is_own = np.zeros(len(points), dtype=bool)
-        is_own[near] = self._is_own[bins] & (np.abs(r - self._range[bins]) <= _SAME_RANGE_M)
+        _find_own(np.array(points[:, :2]), self._travelled, self._heading, self._bearings, is_own)
+        self._travelled = 0.0
         share = float(is_own.mean())
         if share < _MIN_BODY_SHARE:
             return scan
         self.share = max(self.share, share)
         return replace(scan, points=points[~is_own], offsets=scan.offsets[~is_own] if len(scan.offsets) else scan.offsets)
+
+
+@kernel
+def _find_own(points: Points2, travelled: float, heading: float, bearings: FloatArray, is_own: BoolArray) -> None:
+    """Set ``is_own`` (N,) of the ``points`` (N, 2) that are the robot itself; ``bearings`` (360, 5) are updated, ``travelled`` [m] later.
+
+    Of each bearing: range to the nearest point [m], for how long a way it is the same [m], least and greatest ``heading`` meanwhile [rad],
+    and whether it is the robot itself, 0 or 1.
+    """
+    n = points.shape[0]
+    nearest, ranges, bins = np.full(_BODY_BEARINGS, np.inf), np.empty(n), np.empty(n, dtype=np.int64)
+    for i in range(n):
+        x, y = points[i, 0], points[i, 1]
+        ranges[i], bins[i] = math.sqrt(x * x + y * y), -1
+        if ranges[i] < _MAX_BODY_RANGE_M:
+            bins[i] = k = math.floor(math.atan2(y, x) * (_BODY_BEARINGS / (2.0 * math.pi))) % _BODY_BEARINGS
+            nearest[k] = min(nearest[k], ranges[i])
+    for k in range(_BODY_BEARINGS):
+        b = bearings[k]
+        if not abs(nearest[k] - b[0]) <= _SAME_RANGE_M:  # also where there is no point, before or now
+            b[0], b[1], b[2], b[3], b[4] = nearest[k], 0.0, heading, heading, 0.0
+            continue
+        b[1], b[2], b[3] = b[1] + travelled, min(b[2], heading), max(b[3], heading)
+        if b[1] >= _MIN_BODY_TRAVEL_M and b[3] - b[2] >= _MIN_BODY_TURN_RAD:
+            b[4] = 1.0
+    for i in range(n):
+        k = bins[i]
+        is_own[i] = k >= 0 and bearings[k, 4] == 1.0 and abs(ranges[i] - bearings[k, 0]) <= _SAME_RANGE_M

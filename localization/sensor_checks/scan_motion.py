@@ -14,8 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from motion_models import se2
-from motion_models.compiled import kernel
-from motion_models.se2 import FloatArray, Points2, Pose2
+from motion_models.compiled import kernel, subroutine
+from motion_models.linear_equations import solve
+from motion_models.se2 import FloatArray, Points2, Pose2, Triple, triple
 
 _BEARINGS = 180
 """Number of bearings of a profile, each 2 deg wide: each has a beam of any scanner in use, however its beams lie to the bins."""
@@ -155,45 +156,53 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
 
 def _refine(a: Profile, b: Profile, guess: Pose2, min_inliers: float) -> ScanMotion | None:
     """a_T_b of the body by point-to-line Gauss-Newton from the sensor's ``guess`` (3,); None where the scans do not fit."""
-    a_T_b, structure, inliers = _align_profiles(a.points, a.normals, b.points, guess)
-    if inliers < max(min_inliers * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(a_T_b).all():
+    structure = np.empty((2, 2))
+    found, inliers = _align_profiles(a.points, a.normals, b.points, triple(guess), structure)
+    if inliers < max(min_inliers * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(found).all():
         return None
+    a_T_b = np.array(found)
     body_T_a, body_T_b = (np.array([*profile.center, 0.0]) for profile in (a, b))
     moved = se2.compose(se2.compose(body_T_a, a_T_b), se2.inverse(body_T_b))
     return ScanMotion(moved, float(np.linalg.eigvalsh(structure / inliers)[0]) >= _MIN_STRUCTURE)
 
 
-def _align_profiles(surface: FloatArray, normals: FloatArray, points: FloatArray, a_T_b: Pose2) -> tuple[Pose2, FloatArray, int]:
-    """Motion (3,) of the sensor from a first ``a_T_b`` on, sum of n n^T (2, 2) over the inliers, and their number: 0 where too few points
-    are associated."""
-    structure, inliers = np.zeros((2, 2)), 0
+@kernel
+def _align_profiles(
+    surface: FloatArray, normals: FloatArray, points: FloatArray, guess: Triple, structure: FloatArray
+) -> tuple[Triple, int]:
+    """Motion of the sensor from ``guess`` on, and the number of inliers: 0 where too few points are associated. ``structure`` (2, 2)
+    becomes the sum of n n^T over the inliers."""
+    A, gradient, a_T_b, inliers = np.empty((3, 3)), np.empty(3), guess, 0
     for k in range(_ITERATIONS):
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** (k / (_ITERATIONS - 1))
-        A, gradient, structure = np.zeros((3, 3)), np.zeros(3), np.zeros((2, 2))
-        inliers = _add_normal_equations(surface, normals, points, a_T_b, scale, A, gradient, structure)
+        inliers = _fill_normal_equations(surface, normals, points, a_T_b, scale, A, gradient, structure)
         if inliers < _MIN_BEARINGS // 2:
-            return a_T_b, structure, 0
-        a_T_b = a_T_b - np.linalg.solve(A + _DAMPING * inliers * np.eye(3), gradient)
-    return a_T_b, structure, inliers
+            return a_T_b, 0
+        for p in range(3):
+            A[p, p] += _DAMPING * inliers
+        x, y, yaw = solve(A, gradient)
+        a_T_b = (a_T_b[0] - x, a_T_b[1] - y, a_T_b[2] - yaw)
+    return a_T_b, inliers
 
 
-@kernel
-def _add_normal_equations(
+@subroutine
+def _fill_normal_equations(
     surface: FloatArray,
     normals: FloatArray,
     points: FloatArray,
-    a_T_b: Pose2,
+    a_T_b: Triple,
     scale: float,
     A: FloatArray,
     gradient: FloatArray,
     structure: FloatArray,
 ) -> int:
-    """Add J^T W J to ``A`` (3, 3) and J^T W r to ``gradient`` (3,), for the distances r of ``points`` (M, 2), moved by ``a_T_b`` (3,), from
+    """Fill ``A`` (3, 3) with J^T W J and ``gradient`` (3,) with J^T W r, for the distances r of ``points`` (M, 2), moved by ``a_T_b``, from
     the lines of a profile.
 
-    Also n n^T to ``structure`` (2, 2) over the inliers, whose number is returned: nearer to their line than the larger of ``scale`` and
+    Also ``structure`` (2, 2) with n n^T over the inliers, whose number is returned: nearer to their line than the larger of ``scale`` and
     `_INLIER_M`.
     """
+    A[:], gradient[:], structure[:] = 0.0, 0.0, 0.0
     inliers = 0
     c, s = math.cos(a_T_b[2]), math.sin(a_T_b[2])
     for i in range(points.shape[0]):

@@ -61,9 +61,9 @@ class Standstill(Check):
         if not step.is_standing:
             self._turned_s = self._stood_s = self._trusted_s = 0.0
             self._is_confirmed = False
-            self._velocity.restart()
+            self._velocity.lasted_s = 0.0
             if step.has_wheels:
-                self._velocity.set_measured(step.twist)
+                self._velocity.measured = step.twist
             return step
         self._stood_s += step.duration
         self._turned_s = self._turned_s + step.duration if _is_turning(step) else 0.0
@@ -75,7 +75,7 @@ class Standstill(Check):
             self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, numbers)
         if not contradicted_s:
             self._trusted_s += step.duration
-            self._velocity.restart()
+            self._velocity.lasted_s = 0.0
             return step
         unknown_s = step.duration
         if moving:
@@ -85,7 +85,7 @@ class Standstill(Check):
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """A matched scan measured the pose."""
         if nis is not None:
-            self._velocity.restart()
+            self._velocity.lasted_s = 0.0
             self._trusted_s = 0.0
 
     def _moving(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -81,13 +81,13 @@ class Direction(NamedTuple):
         return True if size - self.bound > most else False if size <= most else None
 
 
-def travel_direction(bins: Iterable[Bin]) -> Direction | None:
+def travel_direction(bins: Collection[Bin]) -> Direction | None:
     """Direction of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known.
 
     With products z_k = lidar_k conj(wheels_k) it is the angle of their sum. Its error is sum Im(z_k exp(-i angle)) / sum |z_k|, with
     Student's t for a variance that is measured by n - 1 of these.
     """
-    rows = np.array([(*b.wheels, *b.lidar) for b in bins])
+    rows = np.hstack([[b.wheels for b in bins], [b.lidar for b in bins]])
     rows = rows[np.isfinite(rows).all(axis=1)]
     wheels, turned, lidar = rows[:, 0] + 1j * rows[:, 1], np.abs(rows[:, 2]), rows[:, 3] + 1j * rows[:, 4]
     shorter, longer = np.minimum(np.abs(wheels), np.abs(lidar)), np.maximum(np.abs(wheels), np.abs(lidar))

@@ -108,13 +108,13 @@ class TurnRates(Check):
         is_unknown = WHEELS_OPPOSITE in faults or (self._is_spinning and WHEELS_SPIN in faults)
         if is_unknown and step.has_wheels and not step.is_standing:
             return without_wheels(step, self._velocity.increment(step.duration, has_turn=step.turn is not None))
-        self._velocity.restart()
+        self._velocity.lasted_s = 0.0
         return step
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """A matched scan measured the pose."""
         if nis is not None:
-            self._velocity.restart()
+            self._velocity.lasted_s = 0.0
 
 
 class _Relation(NamedTuple):

@@ -44,10 +44,11 @@ class Window:
         self._mounts, self._config = mounts, config
         self._scans = ScanOdometry()
         self._open = _Accumulator()
+        self._durations_s = np.zeros(0)
         self.bins: deque[Bin] = deque(maxlen=WINDOW_BINS)
         self.has_scans = False
         """Whether any scan has come."""
-        self.end_s = 0.0
+        self.begin_s = self.end_s = 0.0
         """After the first step [s]."""
 
     def add(self, step: Step, now_s: float) -> bool:
@@ -60,7 +61,8 @@ class Window:
         lidar = np.full(3, np.nan) if step.scan is None else self._register(step.scan)
         self.bins.append(self._open.close(lidar))
         self._open = _Accumulator(has_scan_at_start=step.scan is not None)
-        self.end_s = now_s
+        self._durations_s = np.array([b.duration_s for b in self.bins])
+        self.begin_s, self.end_s = max(now_s - float(self._durations_s.sum()), 0.0), now_s
         return len(self.bins) >= MIN_BINS
 
     def _register(self, scan: Scan) -> FloatArray:
@@ -77,17 +79,9 @@ class Window:
         return sweep.project(sweep.points), np.array([mount.x, mount.y])
 
     @property
-    def begin_s(self) -> float:
-        """After the first step [s]."""
-        return max(self.end_s - float(self._durations().sum()), 0.0)
-
-    @property
     def turn_rates(self) -> FloatArray:
         """(3, n) by wheels, gyro and LiDAR [rad/s]; NaN where unknown."""
-        return np.array([[b.wheels[2], b.gyro, b.lidar[2]] for b in self.bins]).T / self._durations()
-
-    def _durations(self) -> FloatArray:
-        return np.array([b.duration_s for b in self.bins])
+        return np.array([[b.wheels[2], b.gyro, b.lidar[2]] for b in self.bins]).T / self._durations_s
 
 
 @dataclass

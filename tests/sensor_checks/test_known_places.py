@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from localization.sensor_checks.faults import Fault, FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from motion_models import se2
@@ -18,27 +19,34 @@ def _scan(pose: np.ndarray):
     return lambda: (np.column_stack([r * np.cos(ANGLES), r * np.sin(ANGLES)]), np.zeros(2))
 
 
+def _add_fault(faults: FaultLog, begin_s: float, now_s: float) -> None:
+    faults.declare(Fault("of a test"), begin_s, {})
+    faults.inflation.add(np.array([5.0, 0.0, 0.5]))
+    faults.now_s = now_s
+
+
 @pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.05)], ids=["right", "off"])
 def test_known_place_replaces_the_covariance_of_faults_by_its_distance(off: tuple[float, float, float]) -> None:
     """A fault of 5 m, and a scan 1 m from the place where the drive began: what is left is how far the estimate is off there."""
-    inflation = CovarianceInflation()
-    places = KnownPlaces(inflation)
-    assert not places.update(_scan(np.zeros(3)), np.zeros(3), 0.0, 0.0)
-    inflation.add(np.array([5.0, 0.0, 0.5]))
+    faults = FaultLog(CovarianceInflation())
+    places = KnownPlaces(faults)
+    assert not places.update(_scan(np.zeros(3)), np.zeros(3))
+    _add_fault(faults, 10.0, 20.0)
     true = np.array([0.8, 0.6, 0.2])
-    assert places.update(_scan(true), se2.compose(true, np.array(off)), 20.0, 10.0)
-    assert np.sqrt(np.diagonal(inflation.total)) == pytest.approx(np.abs(se2.log(np.array(off))), abs=0.02)
+    assert places.update(_scan(true), se2.compose(true, np.array(off)))
+    assert np.sqrt(np.diagonal(faults.inflation.total)) == pytest.approx(np.abs(se2.log(np.array(off))), abs=0.02)
 
 
 def test_place_of_the_time_of_the_fault_shows_nothing() -> None:
-    inflation = CovarianceInflation()
-    places = KnownPlaces(inflation)
-    places.update(_scan(np.zeros(3)), np.zeros(3), 0.0, 0.0)
+    faults = FaultLog(CovarianceInflation())
+    places = KnownPlaces(faults)
+    places.update(_scan(np.zeros(3)), np.zeros(3))
     far = np.array([4.0, 3.0, 0.0])
-    places.update(_scan(far), far, 12.0, 0.0)
-    inflation.add(np.array([5.0, 0.0, 0.5]))
-    assert not places.update(_scan(far), far, 20.0, 10.0)
-    assert inflation.total[0, 0] == 25.0
+    faults.now_s = 12.0
+    places.update(_scan(far), far)
+    _add_fault(faults, 10.0, 20.0)
+    assert not places.update(_scan(far), far)
+    assert faults.inflation.total[0, 0] == 25.0
 
 
 @pytest.mark.parametrize(("begin", "end"), [(0.3, 0.6), pytest.param(0.0, 2.0, marks=pytest.mark.extended)], ids=["for a while", "always"])
