@@ -128,6 +128,12 @@ class MapFusion(FilteredOdometry):
         self.localizer.search_everywhere()
         self._take_pose()
 
+    def replace_map(self, places: PlaceMap) -> None:
+        """Localize in ``places`` instead of the present map, and search all of it. Odometry goes on."""
+        self.localizer = Localizer(places, is_background=True)
+        self._drive = None if self._drive is None else []
+        self._take_pose()
+
     def _take_pose(self) -> None:
         """The map's frame is where the localizer has the last keyframe."""
         self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(self.odometry.state["key"]))

@@ -77,6 +77,7 @@ class PlaceMap:
 
     def __init__(self, keyframes: KeyframeMap, range_noise_m: float) -> None:
         """``range_noise_m``: sigma of a range, added to the thickness of surfaces [m]. Raises `MapError` without points."""
+        self.range_noise_m = range_noise_m
         arrays = (keyframes.poses, keyframes.covariances, keyframes.points)
         self.fingerprint = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:12]
         self.grid: Grid = draw_grid(keyframes, CELL_M)

@@ -17,9 +17,10 @@ import numpy as np
 
 from localization.calibration.lidar_yaw import LidarYawCheck, corrected
 from localization.errors import CheckpointError
-from localization.estimators import Estimate
+from localization.estimators import Estimate, MapFusion, PriorMap
 from localization.events import Event, Scan
 from localization.logs.decode import MessageStats
+from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
@@ -63,6 +64,7 @@ class Node:
         self._conflicts = TransformConflicts(run.node.frames.base_link_frame, is_ros1=transport.is_ros1)
         self._transforms = discovered.transforms
         self._stats = MessageStats()
+        self._shared = {"stats": self._stats, **shared_of(trial)}
         self._stream = LiveStream(discovered, run.robot, self._stats, transport.epoch_ns, is_ros1=transport.is_ros1)
         self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
         self._predictor = _predictor(trial, run) if run.node.predict else None
@@ -122,9 +124,7 @@ class Node:
         self._subscribe()
         state = SessionState(pipeline, StartPose(), self._stream.wheel_angles, self.payloads.loads)
         name = f"{self._trial.model.name}_{self._trial.estimator}"
-        self.session = Session.start(
-            self._run.files, state, name, self._made, {"stats": self._stats, **shared_of(self._trial)}, self._report
-        )
+        self.session = Session.start(self._run.files, state, name, self._made, self._shared, self._report)
         self.session.health = Health(config.max_latency_s)
         self._doctor = Doctor(self._run.robot, self._trial.model.name, mounts, 60.0 * config.diagnose_every_min)
         with ExitStack() as failing:
@@ -168,6 +168,7 @@ class Node:
             has_estimate = False
             for received in self._transport.take(_POLL_S, self._batch_s()):
                 has_estimate |= self._receive(received)
+            self._commands.take_loaded_map()
             now = time.monotonic()
             if now >= self._next_status + (0.0 if has_estimate else (_AFTER_ESTIMATE - 1.0) * _STATUS_PERIOD_S):
                 self._next_status = now + _STATUS_PERIOD_S
@@ -203,6 +204,15 @@ class Node:
         self._publisher.restart()
         if self._predictor is not None:
             self._predictor.stop()
+
+    def replace_map(self, places: PlaceMap) -> None:
+        """Localize in another saved map from now on: by what the estimator has learned, and without a jump of odometry."""
+        estimator = self.session.pipeline.estimator
+        assert isinstance(estimator, MapFusion)
+        estimator.replace_map(places)
+        self._trial = replace(self._trial, prior=PriorMap(places))
+        self._shared.update(shared_of(self._trial))
+        self._made.update(fingerprints(map=places.fingerprint))
 
     @property
     def payloads(self) -> Payloads:

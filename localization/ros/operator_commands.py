@@ -6,6 +6,7 @@ Topics work with every transport, services with rclpy alone.
 from __future__ import annotations
 
 import math
+import queue
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -19,7 +20,8 @@ from localization.estimators import MapFusion
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
-from localization.maps import SavedMap, save_map
+from localization.maps import KeyframeMap, SavedMap, load_map, save_map
+from localization.maps.place_search import PlaceMap
 from localization.output import versions
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
@@ -33,8 +35,8 @@ SET_POSE, INITIAL_POSE = "set_pose", "initialpose"
 """Topics of a given pose: that of robot_localization, and that of RViz and nav2."""
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 RESET, PAUSE, TARE_PAYLOAD, PAYLOAD = "~/reset", "~/pause", "~/tare_payload", "~/payload"
-RELOCALIZE, SAVE_MAP = "~/relocalize", "~/save_map"
-_GLOBAL_LOCALIZATION, _SERIALIZE_MAP = "reinitialize_global_localization", "~/serialize_map"
+RELOCALIZE, SAVE_MAP, LOAD_MAP = "~/relocalize", "~/save_map", "~/load_map"
+_GLOBAL_LOCALIZATION, _SERIALIZE_MAP, _DESERIALIZE_MAP = "reinitialize_global_localization", "~/serialize_map", "~/deserialize_map"
 """Services by the names of AMCL and slam_toolbox."""
 _TOPIC_TYPES = {
     SET_POSE: POSE_TYPE,
@@ -45,7 +47,10 @@ _TOPIC_TYPES = {
     PAYLOAD: "geometry_msgs/msg/InertiaStamped",
     RELOCALIZE: "std_msgs/msg/Empty",
     SAVE_MAP: "std_msgs/msg/String",
+    LOAD_MAP: "std_msgs/msg/String",
 }
+_NO_SUCH_MAP, _INVALID_MAP = 1, 2
+"""Results of nav2_msgs/LoadMap: RESULT_MAP_DOES_NOT_EXIST, RESULT_INVALID_MAP_DATA."""
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 _MIN_SIGMA = 1e-3
 """Sigmas of a pose without a covariance: RViz sends one, `ros2 topic pub` mostly zeros [m, rad]."""
@@ -71,6 +76,9 @@ class CommandedNode(Protocol):
     def restart(self, start: StartPose) -> None:
         """Begin anew at ``start``."""
 
+    def replace_map(self, places: PlaceMap) -> None:
+        """Localize in another saved map from now on."""
+
     def insert_present_cg(self) -> None:
         """Give the pipeline the centre of gravity with the present payloads."""
 
@@ -83,6 +91,7 @@ class OperatorCommands:
         self._commands = {names.resolve(topic): topic for topic in _TOPIC_TYPES}
         self._decoders = {topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in _TOPIC_TYPES.items()}
         self.topics = list(self._commands)
+        self._loaded: queue.SimpleQueue[tuple[str, PlaceMap | MapError]] = queue.SimpleQueue()
         for full, topic in self._commands.items():
             transport.subscribe(full, _TOPIC_TYPES[topic], is_latched=False)
         transport.offer_service(names.resolve(RESET), "std_srvs/srv/Empty", self.reset)
@@ -92,6 +101,8 @@ class OperatorCommands:
             transport.offer_service(names.resolve(name), "std_srvs/srv/Empty", self.relocalize)
         transport.offer_service(names.resolve(SAVE_MAP), "nav2_msgs/srv/SaveMap", self.save_map)
         transport.offer_service(names.resolve(_SERIALIZE_MAP), "slam_toolbox/srv/SerializePoseGraph", self.save_map)
+        transport.offer_service(names.resolve(LOAD_MAP), "nav2_msgs/srv/LoadMap", self.load_map)
+        transport.offer_service(names.resolve(_DESERIALIZE_MAP), "slam_toolbox/srv/DeserializePoseGraph", self.load_map)
 
     def execute(self, received: Received) -> bool:
         """Execute the command that ``received`` holds; False where it is of another topic."""
@@ -120,6 +131,8 @@ class OperatorCommands:
             return self.relocalize()
         if topic == SAVE_MAP:
             return self.save_map(message.data)
+        if topic == LOAD_MAP:
+            return self.load_map(message.data)
         frame = frame_name(message.header.frame_id)
         if topic == PAYLOAD:
             com = message.inertia.com
@@ -193,6 +206,40 @@ class OperatorCommands:
             self._report(f"save_map: {error}")
         else:
             self._report(f"save_map: {len(saved.map.poses)} keyframes are in '{path}'.")
+
+    def load_map(self, name: str) -> ServiceReply:
+        """Localize in the map of the file ``name`` instead of the present one, as soon as it is ready; odometry goes on.
+
+        The file is read and checked at once. Until its search images are drawn, in a thread, and where it is refused, all stays as it is.
+        """
+        pipeline, path = self._node.session.pipeline, Path(str(name).removeprefix("file://")).with_suffix(".skidmap")
+        if not isinstance(pipeline.estimator, MapFusion):
+            self._report(f"load_map: {(refused := 'this estimator uses no saved map. Start with one by --map.')}")
+            return ServiceReply(False, refused)
+        try:
+            mapped = load_map(path).map
+        except (MapError, OSError) as error:
+            self._report(f"load_map: {error} The present map stays.")
+            return ServiceReply(False, str(error), _INVALID_MAP if path.exists() else _NO_SUCH_MAP)
+        noise_m = pipeline.estimator.localizer.places.range_noise_m
+        threading.Thread(target=self._draw, args=(str(path), mapped, noise_m), name="load map", daemon=True).start()
+        return ServiceReply(True, f"'{path}' is being loaded")
+
+    def _draw(self, path: str, mapped: KeyframeMap, range_noise_m: float) -> None:
+        try:
+            self._loaded.put((path, PlaceMap(mapped, range_noise_m)))
+        except MapError as error:
+            self._loaded.put((path, error))
+
+    def take_loaded_map(self) -> None:
+        """Go over to the map that `load_map` has made ready, if there is one: called between messages."""
+        while not self._loaded.empty():
+            path, places = self._loaded.get()
+            if isinstance(places, MapError):
+                self._report(f"load_map: '{path}': {places} The present map stays.")
+                continue
+            self._node.replace_map(places)
+            self._report(f"load_map: the whole map of '{path}' is searched.")
 
     def pause(self, is_paused: bool) -> ServiceReply:
         """Use no messages and publish no estimates, or continue. Motion meanwhile is a gap in the wheels' data."""

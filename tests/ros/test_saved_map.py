@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import zipfile
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from localization.estimators import PriorMap
 from localization.logs import open_log
 from localization.logs.serialization import encode, make
-from localization.maps import load_map
+from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Trial, replay
 from localization.ros.diagnostics import OK, WARN
@@ -18,6 +19,7 @@ from localization.ros.publisher import DIAGNOSTICS, MAP
 from localization.ros.settings import NodeConfig, OnlineSettings
 from localization.ros.transports.base import Received
 from motion_models.registry import make_model
+from tests.helpers.floor_plan import make_map
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, track
 from tests.ros.test_operator_commands import pose_message
 
@@ -75,7 +77,7 @@ def test_node_relocalize_searches_again_and_offers_amcls_service(places: PlaceMa
     assert "relocalize: the whole map is searched." in reports
     poses = np.array([pose for pose, _ in track(transport).values()])
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.05  # odom has no jump
-    assert {"/skidloc/relocalize", "/reinitialize_global_localization", "/skidloc/save_map"} <= set(transport.services)
+    assert {"/skidloc/relocalize", "/reinitialize_global_localization", "/skidloc/save_map", "/skidloc/load_map"} <= set(transport.services)
     assert transport.services["/reinitialize_global_localization"](True).is_success
     assert node.session.pipeline.estimator.localization()["state"] == "searching"
     assert not transport.services["/skidloc/save_map"]("of_a_map").is_success
@@ -95,6 +97,48 @@ def test_node_save_map_writes_the_graphs_map_and_nothing_over_a_file(tmp_path) -
     assert not transport.services["/skidloc/save_map"](name).is_success
     assert (tmp_path / "live.skidmap").read_bytes() == before
     assert not transport.services["/skidloc/relocalize"](True).is_success
+    assert "uses no saved map" in transport.services["/skidloc/load_map"](name).message
+
+
+def test_node_load_map_searches_the_new_map_and_refuses_what_is_none(places: PlaceMap, tmp_path) -> None:
+    """Refused: files that are missing, truncated, foreign, of a newer version. The present map and its place stay."""
+    floor = make_map()
+    save_map(tmp_path / "office.skidmap", SavedMap(floor, {}))
+    whole = (tmp_path / "office.skidmap").read_bytes()
+    (tmp_path / "truncated.skidmap").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "foreign.skidmap").write_bytes(b"image: office.pgm")
+    header = zip_member(tmp_path / "office.skidmap", "skidmap.json").replace(b'"version": 1', b'"version": 2')
+    write_zip(tmp_path / "newer.skidmap", {"skidmap.json": header})
+    transport = send("/skidloc/load_map", encode(make("std_msgs/msg/String", data=str(tmp_path / "truncated"))), 8.0)
+    node, reports = run_node(transport, "map", config=NodeConfig(wait_s=0.0), prior=PriorMap(places, np.array([1.0, 0.1, 0.2])))
+    load = transport.services["/skidloc/load_map"]
+    codes = [load(str(tmp_path / name)).code for name in ("none", "truncated", "foreign", "newer")]
+    assert codes == [1, 2, 2, 2]
+    wanted = "is truncated, damaged, or no map file", "no map", "is truncated, damaged, or no map file", "has version 2 of the format"
+    assert all(any(text in report and report.endswith("The present map stays.") for report in reports) for text in wanted)
+    estimator = node.session.pipeline.estimator
+    assert estimator.localizer.places is places
+    assert estimator.localization()["state"] == "localized"
+    before = estimator.odometry.state["pose"]
+    assert load(f"file://{tmp_path / 'office.skidmap'}").is_success
+    for thread in [t for t in threading.enumerate() if t.name == "load map"]:
+        thread.join()
+    node.spin(is_over=iter([False, True]).__next__)
+    assert any("office.skidmap' is searched" in report for report in reports)
+    assert estimator.localizer.places.fingerprint == PlaceMap(floor, 0.02).fingerprint
+    assert estimator.localization()["state"] == "searching"
+    assert np.array_equal(estimator.odometry.state["pose"], before)
+
+
+def zip_member(path, name: str) -> bytes:
+    with zipfile.ZipFile(path) as archive:
+        return archive.read(name)
+
+
+def write_zip(path, members: dict[str, bytes]) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
 
 
 def test_online_settings_with_a_missing_map_are_refused(tmp_path) -> None:

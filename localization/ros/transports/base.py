@@ -30,6 +30,8 @@ class ServiceReply(NamedTuple):
 
     is_success: bool
     message: str
+    code: int = 255
+    """`result` of what failed, where that is a number: as nav2_msgs/LoadMap has them, 255 for all other failures."""
 
 
 ServiceHandler = Callable[[Any], ServiceReply]

@@ -15,9 +15,7 @@ _LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
 _MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
 _SERVICE_PACKAGES = ("std_srvs",)
 _REQUEST_FIELDS = ("data", "filename", "map_url")
-"""What a handler is given: of std_srvs/SetBool, slam_toolbox's SerializePoseGraph and nav2_msgs/SaveMap."""
-_FAILURE = 255
-"""`result` of slam_toolbox's services that failed; 0 is success."""
+"""What a handler is given: of std_srvs/SetBool, slam_toolbox's (De)SerializePoseGraph, and nav2_msgs/SaveMap and LoadMap."""
 
 
 def import_rclpy(*parts: str) -> list[Any]:
@@ -99,10 +97,10 @@ class RclpyTransport(MonotonicTime):
         def answer(request: Any, response: Any) -> Any:
             reply = handler(next((getattr(request, name) for name in _REQUEST_FIELDS if hasattr(request, name)), True))
             if hasattr(response, "success"):
-                response.success, response.message = reply
+                response.success, response.message = reply.is_success, reply.message
             elif hasattr(response, "result"):
                 is_flag = isinstance(response.result, bool)
-                response.result = reply.is_success if is_flag else (0 if reply.is_success else _FAILURE)
+                response.result = reply.is_success if is_flag else (0 if reply.is_success else reply.code)
             return response
 
         self._services.append(self._node.create_service(_interface_class(kind), name, answer))
