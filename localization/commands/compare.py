@@ -17,15 +17,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 
 from localization.commands.common import names, write_json
-from localization.comparison.jobs import OK, Job, Row, job_key, run_job, run_local, run_on_cluster, trials
+from localization.comparison.jobs import OK, Job, Place, Row, job_key, run_job, run_local, run_on_cluster, trials
+from localization.comparison.manifest import Entry, read_manifest
 from localization.comparison.page import CompareHead, check_report, write_comparison_report
+from localization.comparison.remote import is_url
 from localization.comparison.statistics import Findings, against_best, closing, find, headline
-from localization.comparison.table import ResultTable
+from localization.comparison.table import ResultFolder, ResultTable
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, versions
 from localization.pipeline import ReplayConfig
+from motion_models.errors import RobotError
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes
 from motion_models.registry import make_model
@@ -37,12 +40,15 @@ class Compare:
     """Compare motion models and estimators over many logs."""
 
     logs: tyro.conf.Positional[tuple[Path, ...]]
-    """Logs with a reference each: ROS 1 .bag, ROS 2 bag folders, bare .mcap."""
-    robot: str
-    """Name of a shipped robot, or path of a robot TOML file."""
+    """Logs with a reference each: ROS 1 .bag, ROS 2 bag folders, bare .mcap. None with --manifest."""
     out: Path
     """Folder for table.csv and report.html; or the table itself, .csv or .parquet, with the report beside it. What is in the table
     already, and unchanged, is not computed again."""
+    robot: str | None = None
+    """Name of a shipped robot, or path of a robot TOML file; needed where no manifest names it."""
+    manifest: Path | None = None
+    """CSV file with a row for each log: log (path, or URL as s3://bucket/drive.mcap, extra `fleet`), robot, reference, floor, day. Results
+    are kept log by log in results/ beside the table, trajectories in trajectories/. `skidloc table` shows k by robot, floor and day."""
     model: str = "diff_drive,skid_steer"
     """Motion models, separated by commas."""
     estimator: str = "odometry,ekf"
@@ -50,7 +56,8 @@ class Compare:
     corrections: str = "constant"
     """What ekf and graph estimate of the motion model: none, constant, cg_field; forms separated by commas."""
     reference: str | None = None
-    """Topic, or file (.tum, .relations) in whose name {stem} stands for the log's. Default: the robot file's topic."""
+    """Topic, or file (.tum, .relations) in whose name {stem} stands for the log's. Default: the robot file's topic. A manifest may name
+    another for each log."""
     metric: str = "ate_rmse_m"
     """Column that is compared; smaller is better."""
     processes: int = 0
@@ -71,8 +78,10 @@ class Compare:
             raise OutputError(f"--processes is {self.processes}; it must be 1 or more, or 0 for as many as there are cores.")
         table_path, report_path = places(self.out)
         check_report(report_path)
-        jobs, table = self._jobs(console), ResultTable(table_path)
-        for note in self._notes():
+        table = ResultTable(table_path) if self.manifest is None else ResultFolder(table_path)
+        jobs = self._jobs(console, table)
+        notes = self._notes(jobs)
+        for note in notes:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
@@ -82,42 +91,57 @@ class Compare:
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
             task = progress.add_task("logs", total=len(left))
             for job, rows in self._run(left):
-                table.put(rows)
-                table.save(jobs)
+                table.record(job, rows, jobs)
                 progress.advance(task)
                 for reason in dict.fromkeys(row["error"] for row in rows if row["status"] != OK):
                     console.print(f"[yellow]![/] {escape(job.log)}: {escape(reason)}", soft_wrap=True)
-        if not left:
-            table.save(jobs)
-        self._report(console, table, report_path, table.rows(jobs))
+        table.save(jobs)
+        self._report(console, jobs, table, report_path)
 
-    def _jobs(self, console: Console) -> list[Job]:
+    def _jobs(self, console: Console, table: ResultTable | ResultFolder) -> list[Job]:
         """One for each log; what is the same as another would make intervals narrower than they are."""
-        robot, forms = load_robot(self.robot), check_forms(names(self.corrections, "--corrections"))
+        forms = check_forms(names(self.corrections, "--corrections"))
         models, estimators = names(self.model, "--model"), names(self.estimator, "--estimator")
-        for model in models:
-            make_model(model, robot)
         for estimator in estimators:
             check_estimator(estimator, has_lidar=True)
-        wanted = tuple(trials(models, estimators, forms))
+        wanted, entries = tuple(trials(models, estimators, forms)), self._entries()
+        robots = {name: load_robot(name) for name in dict.fromkeys(entry.robot for entry in entries)}
+        for robot, model in itertools.product(robots.values(), models):
+            make_model(model, robot)
+        folder = Path.cwd() if self.manifest is None else self.manifest.parent.absolute()
         jobs: dict[str, Job] = {}
-        for path in dict.fromkeys(self.logs):
-            key = job_key(path, robot, self.reference, self.topic, self.config)
-            first = jobs.setdefault(key, Job(str(path), robot, wanted, key, self.reference, self.topic, self.config))
-            if first.log != str(path):
-                console.print(f"{path} is the same log as {first.log}: counted once.", markup=False, soft_wrap=True)
+        for entry in dict.fromkeys(entries):
+            robot = robots[entry.robot]
+            key = job_key(entry.log, robot, entry.reference, self.topic, self.config, folder)
+            job = Job(entry.log, robot, wanted, key, entry.reference, self.topic, self.config, folder, entry.place)
+            first = jobs.setdefault(key, job)
+            if first.log != entry.log:
+                console.print(f"{entry.log} is the same log as {first.log}: counted once.", markup=False, soft_wrap=True)
         if not jobs:
             raise LogError("no logs to compare on; name some.")
+        if isinstance(table, ResultFolder):
+            return [dataclasses.replace(job, trajectories=table.trajectories(job)) for job in jobs.values()]
         return list(jobs.values())
+
+    def _entries(self) -> list[Entry]:
+        """Logs of the command line or of the manifest. Raises `LogError` and `RobotError`."""
+        if self.manifest is None:
+            if self.robot is None:
+                raise RobotError("--robot is missing: name a shipped robot (`skidloc robots`) or the path of a robot file.")
+            return [Entry(str(log), self.robot, self.reference, Place()) for log in self.logs]
+        if self.logs:
+            raise LogError(f"logs are named on the command line and by --manifest {self.manifest}. Leave one of them out.")
+        return read_manifest(self.manifest, self.robot, self.reference)
 
     def _run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, list[Row]]]:
         if self.dask is not None:
             return run_on_cluster(jobs, self.dask)
-        absent = [job for job in jobs if not Path(job.log).exists()]  # no process needs to be started for that
+        absent = [job for job in jobs if not is_url(job.log) and not (job.folder / job.log).exists()]  # needs no process
         there = [job for job in jobs if job not in absent]
         return itertools.chain(((job, run_job(job)) for job in absent), run_local(there, self.processes or os.cpu_count() or 1))
 
-    def _report(self, console: Console, table: ResultTable, report: Path, rows: Sequence[Row]) -> None:
+    def _report(self, console: Console, jobs: Sequence[Job], table: ResultTable | ResultFolder, report: Path) -> None:
+        rows, notes = table.rows(jobs), self._notes(jobs)
         failed = [row for row in rows if row["status"] != OK]
         if len(failed) == len(rows):
             logs = len({row["log"] for row in rows})
@@ -136,16 +160,18 @@ class Compare:
             console.print(sentence, markup=False, soft_wrap=True)
         if failed:
             console.print(f"The reasons of what failed are in {table.path}.", markup=False, soft_wrap=True)
-        reference = self.reference or "the robot file's topic"
-        head = CompareHead(load_robot(self.robot).name, reference, table.path.name, versions(), self._notes())
+        reference = self.reference or ("" if self.manifest is None else "by the manifest, else ") + "the robot file's topic"
+        robots = ", ".join(dict.fromkeys(job.robot.name for job in jobs))
+        head = CompareHead(robots, reference, table.path.name, versions(), notes)
         write_comparison_report(report, head, found, is_interactive=not self.static)
         console.print(f"report: {report}", markup=False, soft_wrap=True)
         if self.json is not None:
-            write_json(self.json, {**_content(found), "notes": self._notes()})
+            write_json(self.json, {**_content(found), "notes": notes})
 
-    def _notes(self) -> list[str]:
-        """On the robot: where k comes from if its file has none."""
-        return prior_notes(load_robot(self.robot), names(self.model, "--model"))
+    def _notes(self, jobs: Sequence[Job]) -> list[str]:
+        """On the robots: where k comes from if its file has none."""
+        robots, models = {job.robot.name: job.robot for job in jobs}, names(self.model, "--model")
+        return list(dict.fromkeys(note for robot in robots.values() for note in prior_notes(robot, models)))
 
 
 def places(out: Path) -> tuple[Path, Path]:

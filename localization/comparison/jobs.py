@@ -16,34 +16,43 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing.process import BaseProcess
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from localization.calibration.wheel_wiring import open_checked
-from localization.errors import EvaluationError, TransportError
+from localization.comparison.remote import AccessError, is_url, local_copy, url_fingerprint
+from localization.comparison.turning import MeanCg, turning
+from localization.errors import EvaluationError, LogError, OutputError, TransportError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, check_estimator
 from localization.evaluation.reference_files import load_reference
-from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.references import ReferenceTrack, Relations, describe_instant
 from localization.evaluation.scores import score
 from localization.logs import Log, TopicOverrides
-from localization.output import fingerprint, versions
-from localization.pipeline import ReplayConfig, Trial, replay
+from localization.output import fingerprint, output_errors, versions
+from localization.pipeline import ReplayConfig, Run, Trial, replay
+from localization.trajectory import Trajectory, write_tum
 from motion_models.errors import SkidlocError
 from motion_models.online_calibration import Form
 from motion_models.registry import make_model
 from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
 
 OK, FAILED = "ok", "failed"
+INPUT, ACCESS, PROCESS, DEFECT = "input", "access", "process", "defect"
+"""Causes of a failure: the log or its settings, which fail alike each time; a store or a library; a process that died; skidloc."""
 
 CONNECT_TIMEOUT_S = 10.0
 """For a Dask scheduler and its first worker to answer."""
+FAULT_SEPARATOR = " | "
+"""Between the sentences of a row's `faults`."""
 _TRIES = 2
 _POLL_S = 5.0  # after which a lost connection is noticed at the latest
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 _ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?(\[[^\]]+\]|[^/:\[\]\s]+):\d+")
 
 Row = dict[str, Any]
-"""One row of the table: what was run, `status`, `error`, `notes` on problems of the log, `damage` of its files, and the scores."""
+"""One row of the table: what was run, where, `status`, `error` and its `cause`, `notes` on problems of the log, `damage` of its files,
+`faults` of its sensors, how the robot turned, and the scores."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +68,21 @@ class TrialSpec:
         """Model, estimator and corrections, as in tables."""
         form = f" ({self.corrections})" if self.estimator in ESTIMATORS_WITH_CORRECTIONS else ""
         return f"{self.model} {self.estimator}{form}"
+
+    @property
+    def file_name(self) -> str:
+        """Name of the trajectory's file, without its suffix."""
+        form = f"_{self.corrections.replace('+', '_')}" if self.estimator in ESTIMATORS_WITH_CORRECTIONS else ""
+        return f"{self.model}_{self.estimator}{form}"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where and when a log was recorded."""
+
+    floor: str = ""
+    day: str = ""
+    """By default the UTC date of the log's first message."""
 
 
 @dataclass(frozen=True)
@@ -76,10 +100,13 @@ class Job:
     config: ReplayConfig = field(default_factory=ReplayConfig)
     folder: Path = field(default_factory=Path.cwd)
     """Where relative paths start; a worker of a cluster runs in another one."""
+    place: Place = field(default_factory=Place)
+    trajectories: Path | None = None
+    """New folder for the trajectories, one file MODEL_ESTIMATOR.tum for each trial; None: they are not kept."""
 
 
-def job_key(log: Path, robot: Robot, reference: str | None, topics: TopicOverrides, config: ReplayConfig) -> str:
-    """Twelve digits that change with anything that the results depend on."""
+def job_key(log: str, robot: Robot, reference: str | None, topics: TopicOverrides, config: ReplayConfig, folder: Path | None = None) -> str:
+    """Twelve digits that change with anything that the results depend on. Raises `TransportError` for a URL without a library for it."""
     settings = {
         "robot": repr(replace(robot, folder=None)),
         "reference": reference,
@@ -87,11 +114,12 @@ def job_key(log: Path, robot: Robot, reference: str | None, topics: TopicOverrid
         "config": asdict(config),
         "versions": versions(),
     }
-    file = _reference_file(log, reference)
+    folder = folder or Path()
+    file = _reference_file(PurePath(log).stem, reference, folder)
     try:
-        settings["log"] = fingerprint(log)
+        settings["log"] = url_fingerprint(log) if is_url(log) else fingerprint(folder / log)
         settings["reference file"] = fingerprint(file) if file is not None else ""
-    except OSError as error:
+    except (OSError, LogError, AccessError) as error:
         settings["log"] = str(error)
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
 
@@ -99,20 +127,27 @@ def job_key(log: Path, robot: Robot, reference: str | None, topics: TopicOverrid
 def run_job(job: Job) -> list[Row]:
     """Rows of all trials. Any error of the log becomes rows with that error."""
     try:
-        return _run(job)
+        with local_copy(job.log, job.folder) as path:
+            return _run(job, path)
+    except (TransportError, OutputError) as error:
+        return failed_rows(job, str(error), ACCESS)
     except SkidlocError as error:
-        return failed_rows(job, str(error))
+        return failed_rows(job, str(error), INPUT)
     except Exception as error:  # one log must not end a comparison of many
-        return failed_rows(job, f"{type(error).__name__}: {error}")
+        return failed_rows(job, f"{type(error).__name__}: {error}", DEFECT)
 
 
-def failed_rows(job: Job, reason: str) -> list[Row]:
+def failed_rows(job: Job, reason: str, cause: str) -> list[Row]:
     """Rows with an error instead of scores."""
-    return [{**_head(job, trial), "status": FAILED, "error": " ".join(reason.split())} for trial in job.trials]
+    return [_failed(job, trial, reason, cause) for trial in job.trials]
 
 
-def _run(job: Job) -> list[Row]:
-    log, _ = open_checked(job.folder / job.log, job.robot, job.topics.scored_against(job.reference))
+def _failed(job: Job, trial: TrialSpec, reason: str, cause: str = INPUT) -> Row:
+    return {**_head(job, trial), "status": FAILED, "error": " ".join(reason.split()), "cause": cause}
+
+
+def _run(job: Job, path: Path) -> list[Row]:
+    log, _ = open_checked(path, job.robot, job.topics.scored_against(job.reference))
     has_lidar = log.sources.lidar is not None
     rows, able = [], []
     for trial in job.trials:
@@ -120,20 +155,40 @@ def _run(job: Job) -> list[Row]:
             check_estimator(trial.estimator, has_lidar, no_wheels=log.no_wheels)
             able.append(trial)
         except SkidlocError as error:
-            rows.append({**_head(job, trial), "status": FAILED, "error": str(error)})
+            rows.append(_failed(job, trial, str(error)))
     if not able:
         return rows
     reference = _reference(log, job)
     named = [Trial(make_model(trial.model, log.robot), trial.estimator, trial.corrections) for trial in able]
-    runs = replay(log.events(), named, log.robot, log.mounts, has_lidar, job.config)
+    cg = MeanCg(log.robot.center_of_gravity)
+    runs = replay(cg.watch(log.events()), named, log.robot, log.mounts, has_lidar, job.config)
     problems = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
-    for trial, result in zip(able, score(runs, reference), strict=True):
+    date, has_time, _ = describe_instant(log.start_ns).partition("T")
+    day = {"day": job.place.day or (date if has_time else "")}
+    for trial, named_trial, result in zip(able, named, score(runs, reference), strict=True):
         if result.contradictions:
-            rows.append({**_head(job, trial), "status": FAILED, "error": " ".join(result.contradictions)})
+            rows.append(_failed(job, trial, " ".join(result.contradictions)))
             continue
         scores = _scores(result.metrics(log.duration_s, with_timing=False))
-        rows.append({**_head(job, trial), "status": OK, "error": "", **problems, **scores})
+        faults = {"faults": FAULT_SEPARATOR.join(dict.fromkeys(result.run.warnings))}
+        turned = {} if trial.estimator == "lidar" else _turning(named_trial, log.robot, cg.value, result.run)
+        rows.append({**_head(job, trial), **day, "status": OK, "error": "", "cause": "", **problems, **faults, **scores, **turned})
+        if job.trajectories is not None:
+            _write_trajectory(job.trajectories / f"{trial.file_name}.tum", result.run.trajectory)
     return rows
+
+
+def _turning(trial: Trial, robot: Robot, cg: FloatArray, run: Run) -> Row:
+    found = turning(trial.model, robot, cg, run.corrections or "none", run.parameters)
+    return {**found._asdict(), "cg_x_m": float(cg[0]), "cg_y_m": float(cg[1])}
+
+
+def _write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory, over that of an earlier run with other settings. Raises `OutputError`."""
+    with output_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+    write_tum(path, trajectory)
 
 
 def _head(job: Job, trial: TrialSpec) -> Row:
@@ -145,6 +200,8 @@ def _head(job: Job, trial: TrialSpec) -> Row:
         "estimator": trial.estimator,
         "corrections": form,
         "key": job.key,
+        "floor": job.place.floor,
+        "day": job.place.day,
     }
 
 
@@ -160,13 +217,18 @@ def _reference(log: Log, job: Job) -> ReferenceTrack | Relations:
     name = job.reference or log.reference_topic
     if name is None:
         raise EvaluationError(f"{log.path.name} has no reference by the robot file's name; pass --reference.")
-    return load_reference(log, name, _reference_file(log.path, job.reference, job.folder))
+    if is_url(name):
+        url = name.replace("{stem}", log.path.stem)
+        with local_copy(url, job.folder) as file:
+            return load_reference(log, url, file)
+    return load_reference(log, name, _reference_file(log.path.stem, job.reference, job.folder))
 
 
-def _reference_file(log: Path, name: str | None, folder: Path = Path()) -> Path | None:
-    if name is None or (name.startswith("/") and not Path(name).parent.is_dir()):
+def _reference_file(stem: str, name: str | None, folder: Path) -> Path | None:
+    """The file that the reference ``name`` of the log ``stem`` is; None where it is a topic or a URL."""
+    if name is None or is_url(name) or (name.startswith("/") and not Path(name).parent.is_dir()):
         return None
-    path = folder / name.replace("{stem}", log.stem)
+    path = folder / name.replace("{stem}", stem)
     return path if path.exists() or path.suffix in (".tum", ".relations") else None
 
 
@@ -200,7 +262,7 @@ def run_jobs(
 def _rows(future: Future[list[Row]], job: Job) -> list[Row]:
     """Rows of a future that has ended; an error of its process or worker becomes rows with that error."""
     error = future.exception()
-    return future.result() if error is None else failed_rows(job, _describe(error))
+    return future.result() if error is None else failed_rows(job, _describe(error), PROCESS)
 
 
 def _describe(error: BaseException) -> str:

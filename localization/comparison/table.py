@@ -1,22 +1,25 @@
-"""The table of a comparison on disk: CSV or Parquet, rewritten as a whole after each log, so that results are not lost."""
+"""Results of a comparison on disk, CSV or Parquet: one table that is rewritten after each log, or a file for each log of a manifest."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
-from localization.comparison.jobs import OK, Job, Row, TrialSpec
+from localization.comparison.jobs import INPUT, OK, Job, Row, TrialSpec
 from localization.errors import OutputError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS
 from localization.output import output_errors, whole_file
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
-_TEXTS = (*_HEAD, "notes", "damage")
+_TEXTS = (*_HEAD, "floor", "day", "cause", "notes", "damage", "faults")
 _SUFFIXES = (".csv", ".parquet")
+_MOST_CHARACTERS = 60
+"""Of a log's name in names of files; digits of its path distinguish logs."""
 
 Name = tuple[str, str, str, str]
 """Log, model, estimator and corrections."""
@@ -48,16 +51,26 @@ class ResultTable:
         return rows
 
     def missing(self, job: Job) -> tuple[TrialSpec, ...]:
-        """The job's trials that have no row yet, or one of another configuration, log or version, or one that failed."""
+        """The job's trials that have no row yet, or one of another configuration, log or version, or one that failed by a cause that may
+        pass."""
         return tuple(trial for trial in job.trials if not self._is_done(self._rows.get(_name_of(job, trial)), job))
 
     def _is_done(self, row: Row | None, job: Job) -> bool:
-        return row is not None and row["key"] == job.key and row["status"] == OK
+        return row is not None and row["key"] == job.key and (row["status"] == OK or row.get("cause") == INPUT)
+
+    def record(self, job: Job, rows: Iterable[Row], jobs: Sequence[Job]) -> None:
+        """Insert or replace ``rows`` of one of ``jobs``, and save. Raises `OutputError`."""
+        self.put(rows)
+        self.save(jobs)
 
     def put(self, rows: Iterable[Row]) -> None:
         """Insert or replace rows."""
         for row in rows:
             self._rows[_name(row)] = row
+
+    def all_rows(self) -> list[Row]:
+        """All rows, in the order of the file."""
+        return list(self._rows.values())
 
     def rows(self, jobs: Sequence[Job]) -> list[Row]:
         """Rows of ``jobs``, in their order, whatever the order in which they ended."""
@@ -75,6 +88,61 @@ class ResultTable:
             self._write(file, rows)
             file.flush()
             os.fsync(file.fileno())
+
+
+class ResultFolder:
+    """A file with the rows of each log of a manifest, ``FOLDER/results/ROBOT/LOG-DIGITS``, and one table of all, written at the end.
+
+    Time and memory for a log do not depend on how many there were before. Readers of data sets take ``FOLDER/results`` as one.
+    """
+
+    def __init__(self, table: Path) -> None:
+        """``table``: path of the table of all, .csv or .parquet, of which the files of logs have the format. Raises `OutputError`."""
+        ResultTable(table)
+        self.path, self.folder = table, table.parent
+
+    def missing(self, job: Job) -> tuple[TrialSpec, ...]:
+        """See `ResultTable.missing`."""
+        return self._table(job).missing(job)
+
+    def record(self, job: Job, rows: Iterable[Row], jobs: Sequence[Job]) -> None:
+        """Write the file of ``job``. Raises `OutputError`."""
+        self._table(job).record(job, rows, [job])
+
+    def rows(self, jobs: Sequence[Job]) -> list[Row]:
+        """Rows of ``jobs``, in their order."""
+        return [row for job in jobs for row in self._table(job).rows([job])]
+
+    def save(self, jobs: Sequence[Job]) -> None:
+        """Write the table of all. Raises `OutputError`."""
+        table = ResultTable(self.path)
+        table.put(self.rows(jobs))
+        table.save(jobs)
+
+    def trajectories(self, job: Job) -> Path:
+        """Folder of the trajectories of ``job``."""
+        return self.folder.absolute() / "trajectories" / job.robot.name / _file_name(job.log)
+
+    def _table(self, job: Job) -> ResultTable:
+        return ResultTable(self.folder / "results" / job.robot.name / f"{_file_name(job.log)}{self.path.suffix}")
+
+
+def read_results(path: Path) -> list[Row]:
+    """Rows of a table, or of a folder in which a comparison keeps its results, finished or not. Raises `OutputError` without any."""
+    if not path.is_dir():
+        if not path.exists():
+            raise OutputError(f"'{path}' does not exist; name a folder or table that `skidloc compare` has written.")
+        return ResultTable(path).all_rows()
+    files = sorted(file for file in (path / "results").rglob("*") if file.suffix in _SUFFIXES)
+    files = files or [file for file in (path / f"table{suffix}" for suffix in _SUFFIXES) if file.exists()]
+    if not files:
+        raise OutputError(f"folder '{path}' has no results of a comparison: neither results/ nor table.csv.")
+    return [row for file in files for row in ResultTable(file).all_rows()]
+
+
+def _file_name(log: str) -> str:
+    """Name of a log's results: its own, and digits of its path, as logs of several days are often named alike."""
+    return f"{PurePath(log).stem[:_MOST_CHARACTERS]}-{hashlib.sha256(log.encode(errors='surrogateescape')).hexdigest()[:8]}"
 
 
 def _name(row: Mapping[str, Any]) -> Name:

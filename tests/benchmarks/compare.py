@@ -37,7 +37,7 @@ def main() -> None:
         for seed in range(_LOGS):
             path = Path(folder) / f"laps_{seed}.mcap"
             write_simulation(path, simulate("laps", robot, seed, {}, SimulationConfig(experiment=ExperimentConfig(laps=1))))
-            jobs.append(Job(str(path), robot, wanted, job_key(path, robot, None, TopicOverrides(), config)))
+            jobs.append(Job(str(path), robot, wanted, job_key(str(path), robot, None, TopicOverrides(), config)))
         seconds(jobs[:1], 1)  # compile
         print(f"{_LOGS} logs, {len(wanted)} pairs each           1 process   2 processes   ratio")
         ratios = []

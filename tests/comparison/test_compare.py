@@ -35,7 +35,7 @@ pytestmark = pytest.mark.xdist_group("compare")
 def jobs(count=3, estimators=("odometry",)):
     wanted = tuple(trials(["diff_drive"], estimators, ["none"]))
     nothing, config = TopicOverrides(), ReplayConfig()
-    return [Job(str(path), ROBOT, wanted, job_key(path, ROBOT, None, nothing, config)) for path in logs(count)]
+    return [Job(str(path), ROBOT, wanted, job_key(str(path), ROBOT, None, nothing, config)) for path in logs(count)]
 
 
 PAIRS = ("--model", "diff_drive", "--estimator", "odometry,ekf")
@@ -285,7 +285,7 @@ def test_compare_parquet_with_failures_is_read_again(tmp_path):
     pytest.importorskip("pyarrow", reason="the extra 'parquet' is not installed")
     job = jobs(2)
     out = ResultTable(tmp_path / "t.parquet")
-    out.put([row for j in job for row in failed_rows(j, "why")])
+    out.put([row for j in job for row in failed_rows(j, "why", "process")])
     out.save(job)  # no number yet
     assert [row["error"] for row in ResultTable(tmp_path / "t.parquet").rows(job)] == ["why"] * 2
     out.put([dict(row, status="ok", ate_rmse_m=0.1, n_matched=3) for row in out.rows(job)[:1]])
@@ -369,18 +369,18 @@ def test_differences_are_paired_and_corrected():
 
 def test_key_changes_with_each_input_of_the_results(tmp_path):
     path, other = logs(2)
-    keys = {job_key(path, ROBOT, None, TopicOverrides(), ReplayConfig())}
-    keys.add(job_key(other, ROBOT, None, TopicOverrides(), ReplayConfig()))
-    keys.add(job_key(path, dataclasses.replace(ROBOT, name="other"), None, TopicOverrides(), ReplayConfig()))
-    keys.add(job_key(path, ROBOT, "/ground_truth/odom", TopicOverrides(), ReplayConfig()))
-    keys.add(job_key(path, ROBOT, None, TopicOverrides(imu=""), ReplayConfig()))
+    keys = {job_key(str(path), ROBOT, None, TopicOverrides(), ReplayConfig())}
+    keys.add(job_key(str(other), ROBOT, None, TopicOverrides(), ReplayConfig()))
+    keys.add(job_key(str(path), dataclasses.replace(ROBOT, name="other"), None, TopicOverrides(), ReplayConfig()))
+    keys.add(job_key(str(path), ROBOT, "/ground_truth/odom", TopicOverrides(), ReplayConfig()))
+    keys.add(job_key(str(path), ROBOT, None, TopicOverrides(imu=""), ReplayConfig()))
     reference = tmp_path / "drive_0.tum"
     for content in ("1 0 0 0 0 0 0 1\n", "2 0 0 0 0 0 0 1\n"):
         reference.write_text(content)
-        keys.add(job_key(path, ROBOT, str(tmp_path / "{stem}.tum"), TopicOverrides(), ReplayConfig()))
+        keys.add(job_key(str(path), ROBOT, str(tmp_path / "{stem}.tum"), TopicOverrides(), ReplayConfig()))
     assert len(keys) == 7
     moved = dataclasses.replace(ROBOT, folder=tmp_path)
-    assert job_key(path, moved, None, TopicOverrides(), ReplayConfig()) in keys
+    assert job_key(str(path), moved, None, TopicOverrides(), ReplayConfig()) in keys
 
 
 def start(*command):

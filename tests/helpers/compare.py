@@ -39,4 +39,4 @@ def killing(job: Job) -> list[Row]:
 
 
 def quick(job: Job) -> list[Row]:
-    return failed_rows(job, "not run")
+    return failed_rows(job, "not run", "process")
