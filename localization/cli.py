@@ -26,7 +26,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "info": ("Info", "Show what a log holds and what would be used of it."),
     "replay": ("Replay", "Run motion models and estimators over a log and score their trajectories."),
     "compare": ("Compare", "Compare motion models and estimators over many logs."),
-    "table": ("Table", "Show what a comparison learned of each robot by floor and day, with an alarm where k changed."),
+    "table": ("Table", "Show k, centres of rotation and gravity, and faults by robot, floor and day, with an alarm where k changed."),
     "calibrate": ("Calibrate", "Fit a motion model to logs or tables and write the robot file."),
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
     "weigh": ("Weigh", "Estimate the centre of gravity and an unknown load from how the robot turns."),

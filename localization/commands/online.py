@@ -37,6 +37,8 @@ _MAX_GAP_S = 5.0
 _NS = 1e-9
 _SLOWEST = 0.001  # a second of the log in a quarter of an hour
 
+_SERVED_S = 86_400.0
+"""How long a dashboard stays after the log has ended."""
 _LEARNED = 8  # corrections that are shown; grids of them have dozens
 
 
@@ -52,6 +54,8 @@ class Online(OnlineSettings):
     """Live picture: in the terminal, or in rerun's viewer as well (extra `viz`)."""
     view_file: Path | None = None
     """New .rrd file to record rerun's picture to, instead of opening its viewer."""
+    dashboard: bool = False
+    """Serve a live page for browsers of this machine: map, path, covariance, scan, learned parameters, faults."""
     transport: Annotated[TransportName, tyro.conf.arg(aliases=["--door"])] = "auto"
     """Transport of live topics: ROS 2 by DDS itself (extra `ros2`), by rclpy, or by zenoh (extra `zenoh`, experimental); ROS 1 by rospy.
     `auto`: rclpy where it is sourced, else DDS, else zenoh, by what is installed."""
@@ -65,7 +69,7 @@ class Online(OnlineSettings):
     def run(self, console: Console) -> None:
         """Run the command, with output on ``console``."""
         rate, run = parse_rate(self.rate), self.live_run()
-        view = self._view()
+        view = self._view(console)
         try:
             with StopSignal() as stop, run.files.claimed():
                 if self.log is not None:
@@ -100,6 +104,9 @@ class Online(OnlineSettings):
         for note in dict.fromkeys([*prior_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         self._summarize(console, session, seconds, count)
+        if self.dashboard and console.is_terminal:
+            console.print("the dashboard stays until Ctrl-C", markup=False)
+            stop.sleep(_SERVED_S)
 
     def _play_events(self, console: Console, events: Iterable[Event], session: Session, rate: float, stop: StopSignal) -> float:
         """Process ``events`` at ``rate``; the time of the log that was played [s]."""
@@ -157,8 +164,16 @@ class Online(OnlineSettings):
             report(note)
         self._summarize(console, node.session, node.seconds, count)
 
-    def _view(self) -> View | None:
+    def _view(self, console: Console) -> View | None:
         """Raises `TransportError` and `OutputError`. Imported only where it is wanted."""
+        if self.dashboard:
+            if self.view != "terminal" or self.view_file is not None:
+                raise OutputError("--dashboard and rerun's view are both given. Leave one of them out.")
+            from localization.ros.dashboard import Dashboard
+
+            served = Dashboard()
+            console.print(f"dashboard: {served.address}", markup=False, soft_wrap=True)
+            return served
         if self.view == "terminal" and self.view_file is None:
             return None
         from localization.ros.rerun_view import RerunView

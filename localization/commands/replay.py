@@ -44,6 +44,7 @@ from localization.maps.place_search import PlaceMap
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Run, Trial, replay, warnings_of
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
+from localization.report.scan_layer import ScanLayer
 from localization.trajectory import write_tum
 from motion_models.online_calibration import check_forms
 from motion_models.prior import prior_notes, scaling_prior
@@ -130,8 +131,9 @@ class Replay:
         held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
         # the LiDAR alone uses no motion model: it runs once, and counts for each
         once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
+        layer = ScanLayer(log.duration_s, mounts)
         with _progress(console, log) as (events, on_event):
-            found = replay(merge_positions(events, positions), once, robot, mounts, has_lidar, self.config, on_event)
+            found = replay(layer.watch(merge_positions(events, positions)), once, robot, mounts, has_lidar, self.config, on_event)
         by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
         runs = []
         for p in pairs:
@@ -159,6 +161,7 @@ class Replay:
             ],
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
+            scans=layer.scans,
         )
         self._write(head, results, reference)
         if self.save_map is not None:

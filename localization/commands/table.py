@@ -21,7 +21,7 @@ _MOST_FAULTS = 10
 
 @dataclass(frozen=True)
 class Table:
-    """Show k, centre of rotation, centre of gravity and faults of each robot by floor and day, with an alarm where k has changed."""
+    """Show k, centres of rotation and gravity, and faults by robot, floor and day, with an alarm where k changed."""
 
     results: tyro.conf.Positional[Path]
     """Folder or table that `skidloc compare` has written; it may still be at work."""

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -30,12 +31,16 @@ _LOST_AFTER_S = 1.0
 _MILLIMETRES, _TENTHS = 3, 1
 
 
-def explorer(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> Explorer:
-    """The block of ``runs``, thinned."""
-    return Explorer(json.dumps(explorer_data(runs, reference), separators=(",", ":"), allow_nan=False))
+Scans = Sequence[tuple[int, FloatArray]]
+"""Stamps [ns] and points (M, 2) in the body frame [m]."""
 
 
-def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> dict[str, Any]:
+def explorer(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, scans: Scans = ()) -> Explorer:
+    """The block of ``runs``, thinned, with ``scans`` as a layer of the map."""
+    return Explorer(json.dumps(explorer_data(runs, reference, scans), separators=(",", ":"), allow_nan=False))
+
+
+def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, scans: Scans = ()) -> dict[str, Any]:
     """What the page draws: times in seconds since the first run's first pose, metres, degrees."""
     start_ns = int(min(run.result.run.trajectory.stamps_ns[0] for run in runs if len(run.result.run.trajectory)))
     most = max(_MOST_POINTS // max(len(runs), 1), 100)
@@ -48,7 +53,20 @@ def explorer_data(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
         "borders": _borders(runs, reference),
         "reference": None if track is None else _reference(track, start_ns),
         "map": {"x": numbers(points[:, 0], 2), "y": numbers(points[:, 1], 2), "run": "" if drawn is None else drawn.label},
+        "scans": _scans(runs[-1] if drawn is None else drawn, scans, start_ns),
     }
+
+
+def _scans(run: PlottedRun, scans: Scans, start_ns: int) -> list[list[Any]]:
+    """Time, x and y of the points of each of ``scans`` that ``run`` covers, from where it puts the robot at that moment."""
+    trajectory = run.result.run.trajectory
+    stamps = np.array([stamp for stamp, _ in scans], dtype=np.int64)
+    covered = (stamps >= trajectory.stamps_ns[0]) & (stamps <= trajectory.stamps_ns[-1])
+    found: list[list[Any]] = []
+    for (stamp, points), pose in zip(itertools.compress(scans, covered), trajectory.at(stamps[covered]), strict=True):
+        placed = run.placed_points(se2.transform(pose, points))
+        found.append([round((stamp - start_ns) * 1e-9, 2), numbers(placed[:, 0], 2), numbers(placed[:, 1], 2)])
+    return found
 
 
 def _borders(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> dict[str, list[float | None]]:

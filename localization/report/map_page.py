@@ -89,7 +89,14 @@ def _explorer_data(mapped: KeyframeMap, grid: Grid) -> dict[str, Any]:
     runs = [_drive(mapped, i, np.arange(first, last)) for i, (first, last) in enumerate(itertools.pairwise(begins.tolist()))]
     layer = grid_layer(grid, data_url(grid))
     borders = {"x": [layer["left"], layer["left"] + layer["width"]], "y": [layer["top"] - layer["height"], layer["top"]]}
-    return {"runs": runs, "borders": borders, "reference": None, "map": {"x": [], "y": [], "run": ""}, "grid": layer}
+    return {
+        "runs": runs,
+        "borders": borders,
+        "reference": None,
+        "map": {"x": [], "y": [], "run": ""},
+        "grid": layer,
+        "scans": [],
+    }
 
 
 def _drive(mapped: KeyframeMap, number: int, ids: IntArray) -> dict[str, Any]:

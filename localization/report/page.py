@@ -58,7 +58,7 @@ WIDTH_IN = 8.2
 """Width of all figures of a page [in]: 9 pt letters have the size of the page's small text at its full width."""
 
 _DRAWING_SCRIPTS = ("plotly-basic.min.js", "common.js")
-_SCRIPTS = {"explorer": "explore.js", "chart": "charts.js"}
+_SCRIPTS = {"explorer": "explore.js", "live": "live.js", "chart": "charts.js"}
 """Script by the kind of block that it draws."""
 _KEPT = ("series-", "reference", "band")
 _PAPER = {"paper": "#ffffff", "card": "#f6f7f8", "accent": "#005a8c"}
@@ -191,7 +191,14 @@ class Explorer:
         return safe_json(self.json)
 
 
-Block = Table | Bullets | Paragraph | Definitions | Figure | Explorer | Chart
+@dataclass(frozen=True)
+class Live:
+    """Map and time series of an estimator that runs, by events of the page's server (`localization.ros.dashboard`)."""
+
+    kind: ClassVar[str] = "live"
+
+
+Block = Table | Bullets | Paragraph | Definitions | Figure | Explorer | Live | Chart
 
 
 @dataclass(frozen=True)
@@ -227,6 +234,11 @@ class Page:
             names.append("tables.js")
         folder = files("localization.report") / "templates"
         return [Markup((folder / name).read_text(encoding="utf-8")) for name in names]
+
+    @property
+    def is_live(self) -> bool:
+        """Whether a block takes events from the page's own server."""
+        return any(block.kind == "live" for section in self.sections for block in section.blocks)
 
     def without_scripts(self) -> Page:
         """For paper and mail: figures in place of charts."""

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
-from localization.report.interactive import explorer
+from localization.report.interactive import Scans, explorer
 from localization.report.map_page import change_blocks, grid_figure, picture_grid
 from localization.report.page import (
     Block,
@@ -87,6 +87,8 @@ class ReportHead:
     """Versions by library."""
     log_fingerprint: str
     """Hash of the log."""
+    scans: Scans = ()
+    """Some scans of the drive, for the map: stamp [ns] and points (M, 2) in the body frame [m]."""
 
 
 def write_report(
@@ -108,7 +110,7 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     runs = plotted_runs(results)
     sentences = verdict_sentences(results, reference)
     sections = [
-        *(_sections(runs, reference, is_interactive) if runs else []),
+        *(_sections(runs, reference, head.scans, is_interactive) if runs else []),
         Section("About the log", bullets(head.warnings) or [Paragraph("No problem was found in it.")]),
         glossary(_TERMS),
         Section("Sources and versions", [Definitions(_provenance(head, reference))]),
@@ -118,12 +120,14 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     return render(Page(f"Replay of {head.log}", facts, sentences, sections, [run.number for run in runs]))
 
 
-def _sections(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, is_interactive: bool) -> list[Section]:
+def _sections(
+    runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, scans: Scans, is_interactive: bool
+) -> list[Section]:
     """Numbers and figures."""
     best = best_run(runs) if reference is not None else None
     near = [run for run in runs if best is not None and run is not best and run.error is not None and is_close(run, best)]
     notes = " ".join(_about_reference(runs, reference))
-    explore = [explorer(runs, reference)] if is_interactive and any(len(run.result.run.trajectory) for run in runs) else []
+    explore = [explorer(runs, reference, scans)] if is_interactive and any(len(run.result.run.trajectory) for run in runs) else []
     return [
         Section("Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), Paragraph(notes, is_small=True)]),
         Section("Explore", explore),

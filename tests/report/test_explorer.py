@@ -17,7 +17,8 @@ from localization.report.runs import plotted_runs
 from localization.trajectory import Trajectory
 from tests.helpers.browser import run_in_page
 
-HEAD = ReportHead("drive.mcap", "husky_a200", "2026-01-02 03:04:05 UTC", 40.0, [], {}, "c0ffee")
+SCANS = [(k * 4_000_000_000, np.array([[2.0, 1.0], [2.0, -1.0]])) for k in range(11)]
+HEAD = ReportHead("drive.mcap", "husky_a200", "2026-01-02 03:04:05 UTC", 40.0, [], {}, "c0ffee", SCANS)
 STAMPS = np.arange(401, dtype=np.int64) * 100_000_000
 POSES = np.column_stack([0.5 * STAMPS * 1e-9, np.zeros(401), np.zeros(401)])
 PROBE = """
@@ -25,6 +26,8 @@ const box = id => document.getElementById("explore-" + id);
 const change = (id, value, kind) => {box(id).value = value; box(id).dispatchEvent(new Event(kind));};
 const now = () => {const d = box("map").data; return d[d.length - 1].x.slice();};
 const titles = () => (box("time").layout.annotations || []).map(a => a.text);
+const scan = () => {const d = box("map").data; return [d[d.length - 2].x, d[d.length - 2].y];};
+change("slider", 21, "input"); found.scan = scan();
 change("slider", 20, "input"); found.at20 = now(); found.text = box("now").textContent;
 found.log = box("time").layout.yaxis.type; found.titles = titles();
 change("a", 0, "change"); change("b", 1, "change"); found.difference = titles().includes("A to B [m]");
@@ -99,6 +102,7 @@ def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     assert seen["at20"][1] == pytest.approx(10.0, abs=0.1)
     assert (seen["text"], seen["log"], seen["way"]) == ("20.0 s", "log", "way [m]")
     assert {"position error [m]", "heading error [deg]", "position sigma [m]", "NIS (3 expected)", "k_0 ± sigma"} == set(seen["titles"])
+    assert seen["scan"] == [[12.0, 12.0], [1.0, -1.0]]  # the last one before 21 s, from where the robot was at 20 s
     assert seen["difference"]
     assert seen["isStaticHidden"]
     assert seen["bands"] == 1

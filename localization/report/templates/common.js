@@ -17,8 +17,10 @@ const skidloc = (() => {
     },
     layout: more => ({
       paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"), font: {color: colour("ink"), family: "inherit", size: 12},
-      margin: {l: 58, r: 12, t: 8, b: 42}, legend: {orientation: "h", y: 1.06, yanchor: "bottom"}, hovermode: "closest", ...more,
+      margin: {l: 58, r: 34, t: 8, b: 42}, modebar: {orientation: "v"}, legend: {orientation: "h", y: 1.06, yanchor: "bottom"}, hovermode: "closest", ...more,
     }),
+    // Of a logarithmic axis upwards: whole numbers in place of digits between powers.
+    logTicks: {tickformat: "~g", nticks: 4},
     axis: (title, more) => ({title: {text: title}, gridcolor: colour("rule"), linecolor: colour("rule"), zeroline: false, ...more}),
     onTheme: draw => matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw),
   };

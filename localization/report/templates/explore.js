@@ -1,10 +1,11 @@
 // Draws the interactive part of a replay's page with Plotly from the JSON of localization/report/interactive.py.
 (() => {
-  const {colour, config, before, layout, axis} = skidloc;
+  const {colour, config, before, layout, axis, logTicks} = skidloc;
   const data = JSON.parse(document.getElementById("explore-data").textContent);
   const box = id => document.getElementById("explore-" + id);
   const runs = data.runs;
   const end = Math.max(...runs.map(run => run.t[run.t.length - 1]));
+  const scanTimes = data.scans.map(scan => scan[0]);
   let now = end;
 
   const style = run => ({color: colour(run.colour), width: 2, dash: run.dash});
@@ -20,7 +21,7 @@
     sizex: data.grid.width, sizey: data.grid.height, sizing: "stretch", layer: "below"}] : [];
 
   const mapTraces = () => {
-    const traces = [{x: data.map.x, y: data.map.y, mode: "markers", type: "scatter", name: "scans", hoverinfo: "skip",
+    const traces = [{x: data.map.x, y: data.map.y, mode: "markers", type: "scatter", name: "map", hoverinfo: "skip",
                      marker: {size: 2, color: colour("grey"), opacity: .6}, visible: data.map.x.length ? true : "legendonly"}];
     if (data.reference) traces.push({x: data.reference.x, y: data.reference.y, customdata: data.reference.t, mode: "lines", name: "reference",
       line: {color: colour("ink"), width: 1.5, dash: "dot"}, hovertemplate: "reference<br>%{customdata:.1f} s<br>%{x:.2f}, %{y:.2f} m<extra></extra>"});
@@ -32,6 +33,7 @@
         mode: "lines", name: run.loops.length + " loops, " + run.label, hoverinfo: "skip", visible: "legendonly",
         line: {color: colour("accent"), width: 1}});
     });
+    if (data.scans.length) traces.push({x: [], y: [], mode: "markers", name: "scan now", hoverinfo: "skip", marker: {size: 3, color: colour("accent")}});
     traces.push({x: [], y: [], mode: "markers", name: "now", hoverinfo: "skip", showlegend: false,
                  marker: {size: 11, color: [], line: {color: colour("paper"), width: 2}}});
     return traces;
@@ -67,7 +69,7 @@
     const traces = [], more = {hovermode: "x unified", height: 150 * found.length + 100, xaxis: axis(isWay() ? "way [m]" : "time [s]", {anchor: "y" + (found.length > 1 ? found.length : "")})};
     found.forEach(([title, type, series], i) => {
       const name = i ? String(i + 1) : "", top = 1 - i * (height + gap);
-      more["yaxis" + name] = axis("", {type, domain: [Math.max(top - height, 0), top], exponentformat: "power", automargin: true});
+      more["yaxis" + name] = axis("", {type, domain: [Math.max(top - height, 0), top], ...(type === "log" ? logTicks : {}), automargin: true});
       runs.forEach(run => {
         const s = series(run);
         if (s && s[2]) [1, -1].forEach(sign => traces.push({x: s[0], y: s[1].map((m, k) => m + sign * s[2][k]), yaxis: "y" + name, mode: "lines",
@@ -100,6 +102,10 @@
     const points = {x: runs.map((run, i) => run.x[at[i]]), y: runs.map((run, i) => run.y[at[i]]), c: runs.map(run => colour(run.colour))};
     if (data.reference) points.x.push(data.reference.x[track]), points.y.push(data.reference.y[track]), points.c.push(colour("ink"));
     Plotly.restyle(box("map"), {x: [points.x], y: [points.y], "marker.color": [points.c]}, [box("map").data.length - 1]);
+    if (data.scans.length) {
+      const [, x, y] = data.scans[before(scanTimes, now)];
+      Plotly.restyle(box("map"), {x: [x], y: [y]}, [box("map").data.length - 2]);
+    }
     Plotly.relayout(box("time"), {shapes: shapes()});
     box("now").textContent = now.toFixed(1) + " s";
   };
