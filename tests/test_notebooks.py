@@ -32,8 +32,8 @@ SHORTER = {
 ABSOLUTE_PATH = re.compile(r"(?<![\w.])/(?:home|root|tmp|work|usr|opt|var|mnt|Users)/|[A-Z]:\\\\")
 
 
-def test_notebooks_are_nine_and_each_title_is_one_claim():
-    assert [source.name[0] for source in sources()] == list("123456789")
+def test_notebooks_are_ten_and_each_title_is_one_claim():
+    assert [source.name[0] for source in sources()] == list("0123456789")
     for source in sources():
         assert len(re.findall(r"^# \*\*Claim: ", source.read_text(encoding="utf-8"), flags=re.MULTILINE)) == 1
 

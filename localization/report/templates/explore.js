@@ -110,11 +110,12 @@
     box("now").textContent = now.toFixed(1) + " s";
   };
   const draw = () => {
-    const size = Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
-    Plotly.react(box("map"), mapTraces(), layout({height: size, dragmode: "pan", uirevision: "map", images: picture(), xaxis: axis("x [m]", {range: data.borders.x}),
+    const traces = mapTraces(), isNarrow = box("map").clientWidth < 500;
+    const size = isNarrow ? box("map").clientWidth * .9 + 13 * traces.length : Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
+    Plotly.react(box("map"), traces, layout({height: size, dragmode: "pan", uirevision: "map", images: picture(), xaxis: axis("x [m]", {range: data.borders.x}),
       yaxis: axis("y [m]", {range: data.borders.y, scaleanchor: "x", scaleratio: 1})}), config);
-    const [traces, more] = timeFigure();
-    Plotly.react(box("time"), traces, more, {...config, scrollZoom: false});
+    const [curves, more] = timeFigure();
+    Plotly.react(box("time"), curves, {...more, showlegend: !isNarrow}, {...config, scrollZoom: false});
     show(now);
   };
 
