@@ -239,15 +239,22 @@ def print_extension(console: Console, found: DiagnosisResult, extended: Extended
     if extended.extension is None:
         console.print("no term of the library explains what is left.", markup=False)
         return
+    content = extended.extension.to_dict()
     table = Table(box=None, header_style="bold", pad_edge=False)
     for head in ("component", "term", "value", "95 %", "unit", "stability", "log-likelihood"):
         table.add_column(head, no_wrap=True)
-    for row in extended.extension.to_dict()["terms"]:
+    for row in (*content["terms"], *content["effects"]):
         low, high = row["interval"]
         sizes = (f"{row['value']:+.4g}", f"{low:+.3g} to {high:+.3g}", row["unit"])
-        table.add_row(row["component"], row["expression"], *sizes, f"{100 * row['stability']:.0f} %", f"{row['log_likelihood']:+.0f}")
+        table.add_row(
+            row["component"],
+            row.get("expression", row.get("along")),
+            *sizes,
+            f"{100 * row['stability']:.0f} %",
+            f"{row['log_likelihood']:+.0f}",
+        )
     console.print(table)
-    if extended.robot is None:
+    if extended.robot is None and extended.extension.terms:
         console.print(f"not written: {extended.extension.describe()}.", markup=False, soft_wrap=True)
 
 

@@ -18,17 +18,24 @@ from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.findings import Attribution, HandoverCheck
 from localization.diagnosis.handover import Candidate, Reader, check_written
 from localization.diagnosis.prediction import DrivePredictor
-from localization.diagnosis.terms import SEARCHED, FoundTerm, Search, extended_model, find_terms, halves, merge_terms, sizes_on
+from localization.diagnosis.terms import SEARCHED, FoundEffect, FoundTerm, Search, extended_model, find_terms, halves, merge_terms, sizes_on
+from localization.events import Turn
+from localization.gyro import GyroRecord
+from motion_models import se2
 from motion_models.base import MotionModel
+from motion_models.calibration.maneuvers import IntArray
 from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
 from motion_models.terms import Term
 
 _FEWEST_WINDOWS = 16
 """Of a drive: eight in each half, as many as a diagnosis takes."""
 _TWO_SIDED_95 = 1.96
+_NS = 1e-9
+_CHANNEL_OF = {"vx": "x", "vy": "y", "wz": "yaw"}
 
 
 @dataclass(frozen=True)
@@ -40,15 +47,23 @@ class Extension:
     replaced: tuple[str, ...]
     """Findings of the plain model in whose place the terms explain the drive better."""
     check: HandoverCheck | None
-    """Of its file on the half of the drive that it was not fitted to; None where nothing was measured there."""
+    """Of its file on the half of the drive that it was not fitted to; None without terms, and where nothing was measured there."""
+    effects: tuple[FoundEffect, ...] = ()
+    """Effects bound to time, place or sensors, which are not written."""
 
     @property
     def is_better(self) -> bool:
         """Whether the file is better on the half held out, beyond its scatter."""
         return self.check is not None and self.check.is_better
 
+    def describe_effects(self) -> str:
+        """The bound effects as sentences; empty without any."""
+        return " ".join(f"{describe_effect(e)[0].upper()}{describe_effect(e)[1:]}." for e in self.effects)
+
     def describe(self) -> str:
         """The terms and their gain, as a sentence."""
+        if not self.terms:
+            return self.describe_effects().removesuffix(".")
         parts = [describe_term(t.term) for t in self.terms]
         known = "no physical cause known"
         if self.replaced:
@@ -77,12 +92,22 @@ class Extension:
             }
             for t in self.terms
         ]
-        return {
-            "model": self.model,
-            "terms": terms,
-            "replaced": list(self.replaced),
-            "heldout": None if self.check is None else self.check.to_dict(),
-        }
+        effects = [
+            {
+                "component": e.shape.component,
+                "along": e.shape.along,
+                "bound_to": e.shape.kind,
+                "value": e.value,
+                "sigma": e.sigma,
+                "interval": [e.value - _TWO_SIDED_95 * e.sigma, e.value + _TWO_SIDED_95 * e.sigma],
+                "unit": e.shape.unit,
+                "stability": e.stability,
+                "log_likelihood": 0.5 * e.gain,
+            }
+            for e in self.effects
+        ]
+        heldout = None if self.check is None else self.check.to_dict()
+        return {"model": self.model, "terms": terms, "effects": effects, "replaced": list(self.replaced), "heldout": heldout}
 
 
 @dataclass(frozen=True)
@@ -103,6 +128,13 @@ def describe_term(term: Term) -> str:
     return f"{term.component} is {term.value:+.3g} (+- {term.sigma:.1g}){unit} x {term.expression}"
 
 
+def describe_effect(effect: FoundEffect) -> str:
+    """A bound effect with its size, unit and what it follows, as a part of a sentence."""
+    unit = "" if effect.shape.unit == "1" else f" {effect.shape.unit}"
+    size = f"{effect.value:+.3g} (+- {effect.sigma:.1g}){unit}"
+    return f"{effect.shape.component} is {size} x {effect.shape.along} off, bound to a {effect.shape.kind} and not written"
+
+
 def extend(
     found: DiagnosisResult, drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, reader: Reader | None = None
 ) -> ExtendedResult:
@@ -112,20 +144,84 @@ def extend(
     """
     config = config or DiagnosisConfig()
     search = find_terms(found, np.random.default_rng(config.seed)) if len(drive.maneuvers) >= _FEWEST_WINDOWS else None
-    if search is None or not search.terms or found.linearization is None or found.predictor is None:
+    if search is None or not (search.terms or search.effects) or found.linearization is None or found.predictor is None:
         return ExtendedResult(found, None)
     predictor, causes = found.predictor, search.state.causes
-    used, held = halves(len(drive.maneuvers))
-    by_half, sizes = _robot_by(predictor, search, used[predictor.batch.owner])
-    check = check_written(predictor, search.state.noise, Candidate(by_half, sizes, held), reader)
     kept = {causes[i].id for i in search.kept}
     replaced = tuple(dict.fromkeys(f.cause for f in found.diagnosis.findings if f.cause in {c.id for c in causes} - kept))
-    extension = Extension(model.name, search.terms, replaced, check)
+    extension = Extension(model.name, search.terms, replaced, _check(predictor, search, reader), search.effects)
     if not extension.is_better:
-        return ExtendedResult(found, extension)
+        return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
     whole = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))[0]
-    again = examine(drive, extended_model(predictor, [t.term for t in search.terms]), config)
+    left = _without(drive, predictor, search.removed) if search.effects else drive
+    again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config)
     return ExtendedResult(_with_extension(again, extension), extension, whole.robot)
+
+
+def _check(predictor: DrivePredictor, search: Search, reader: Reader | None) -> HandoverCheck | None:
+    """The file with terms of one half of the drive, on the other half; None without terms."""
+    if not search.terms:
+        return None
+    used, held = halves(len(predictor.drive.maneuvers))
+    by_half, sizes = _robot_by(predictor, search, used[predictor.batch.owner])
+    return check_written(predictor, search.state.noise, Candidate(by_half, sizes, held), reader)
+
+
+def _with_effects(
+    found: DiagnosisResult, extension: Extension, search: Search, model: MotionModel, config: DiagnosisConfig
+) -> DiagnosisResult:
+    """The diagnosis of the drive without its bound effects, which are in its table and its sentence."""
+    if not extension.effects or found.predictor is None:
+        return found
+    drive, removed, before = found.predictor.drive, search.removed, found.diagnosis
+    again = examine(_without(drive, found.predictor, removed), model, config, found.predictor.baseline)
+    d = again.diagnosis
+    rows = dict(d.discrepancy)
+    for effect in extension.effects:
+        name = _CHANNEL_OF.get(effect.shape.component, effect.shape.component)
+        if name in rows and name in before.discrepancy:
+            old, row = before.discrepancy[name], dataclasses.replace(rows[name], rms=before.discrepancy[name].rms)
+            share = 1.0 - min((rows[name].rms / max(old.rms, 1e-12)) ** 2, 1.0)
+            attributions = (Attribution(effect.shape.name, effect.value, share, True), *row.attributions)
+            row = dataclasses.replace(row, p_value=old.p_value)
+            rows[name] = row if row.status == "unexplained" else row.with_status("attributed", attributions)
+    rest = "" if d.verdict == "consistent" else f" {d.sentence}"
+    d = dataclasses.replace(
+        d,
+        verdict="explained" if d.verdict == "consistent" else d.verdict,
+        discrepancy=rows,
+        sentence=f"{extension.describe_effects()}{rest}",
+        warnings=before.warnings,
+    )
+    return dataclasses.replace(again, diagnosis=d)
+
+
+def _without(drive: Drive, predictor: DrivePredictor, removed: FloatArray) -> Drive:
+    """``drive`` as it would have been measured without what effects ``removed`` (M, 6) in the discrepancies."""
+    motions = [
+        dataclasses.replace(m, measured=se2.compose(m.measured, se2.exp(-row)))
+        for m, row in zip(drive.maneuvers, np.split(removed[:, :3], np.flatnonzero(np.diff(predictor.batch.owner)) + 1), strict=True)
+    ]
+    forces = None if drive.forces is None else drive.forces - removed[:, 4:]
+    gyro = drive.gyro
+    if gyro is not None and removed[:, 3].any():
+        seconds = predictor.window_times_s[1] - predictor.window_times_s[0]
+        gyro = _CorrectedGyro(gyro, drive.spans_ns, removed[:, 3] / seconds)
+    return dataclasses.replace(drive, maneuvers=tuple(motions), forces=forces, gyro=gyro)
+
+
+class _CorrectedGyro(GyroRecord):
+    """The record of a gyro less ``rates`` (W,) [rad/s] in the ``spans_ns`` (W, 2)."""
+
+    def __init__(self, inner: GyroRecord, spans_ns: IntArray, rates: FloatArray) -> None:
+        self._inner, self._spans, self._rates = inner, spans_ns, rates
+
+    def turn(self, start_ns: int, end_ns: int, by_wheels: float) -> Turn | None:
+        """See `GyroRecord.turn`."""
+        found = self._inner.turn(start_ns, end_ns, by_wheels)
+        inside = np.minimum(end_ns, self._spans[:, 1]) - np.maximum(start_ns, self._spans[:, 0])
+        off = float(np.maximum(inside, 0) @ self._rates) * _NS
+        return None if found is None else dataclasses.replace(found, angle=found.angle - off)
 
 
 def _with_extension(again: DiagnosisResult, extension: Extension) -> DiagnosisResult:
@@ -133,6 +229,7 @@ def _with_extension(again: DiagnosisResult, extension: Extension) -> DiagnosisRe
     d = again.diagnosis
     verdict = "extended" if d.verdict in ("consistent", "explained") else d.verdict
     rest = "" if d.verdict == "consistent" else f" {d.sentence}"
+    rest = f" {extension.describe_effects()}{rest}" if extension.effects else rest
     text = extension.describe()
     return dataclasses.replace(again, diagnosis=dataclasses.replace(d, verdict=verdict, sentence=f"{text[0].upper()}{text[1:]}.{rest}"))
 

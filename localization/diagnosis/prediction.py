@@ -132,6 +132,10 @@ class DrivePredictor:
     batch: Batch = field(init=False)
     headings: FloatArray = field(init=False)
     """(W,) at the start of each maneuver, counted from the first [rad]."""
+    times_s: FloatArray = field(init=False)
+    """(N,) start of every interval, from the drive's start [s]."""
+    kinematic_forces: FloatArray = field(init=False)
+    """(W, 2) mean specific force of the motion itself, by the wheels [m/s^2]."""
 
     def __post_init__(self) -> None:
         self.batch = make_batch(self.drive.maneuvers)
@@ -145,12 +149,12 @@ class DrivePredictor:
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
         self._last = self.batch.ends[np.searchsorted(self.batch.owner, np.arange(len(first) - 1), side="right") - 1]
-        self._times = np.empty(len(self.batch.dt))
+        self.times_s = np.empty(len(self.batch.dt))
         for w, start in enumerate(self.drive.starts_s):
             inside = slice(first[w], first[w + 1])
             dt = self.batch.dt[inside]
-            self._times[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
-        self._kinematic_forces = self._accelerations()
+            self.times_s[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
+        self.kinematic_forces = self._accelerations()
         self._twists: dict[tuple[object, ...], FloatArray] = {}
 
     @property
@@ -274,8 +278,8 @@ class DrivePredictor:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)
             sx, sy = _GRAVITY * math.sin(hypothesis.slope[0]), _GRAVITY * math.sin(hypothesis.slope[1])
-            out[:, 4] = drive.forces[:, 0] - self._kinematic_forces[:, 0] - (c * sx + s * sy)
-            out[:, 5] = drive.forces[:, 1] - self._kinematic_forces[:, 1] - (-s * sx + c * sy)
+            out[:, 4] = drive.forces[:, 0] - self.kinematic_forces[:, 0] - (c * sx + s * sy)
+            out[:, 5] = drive.forces[:, 1] - self.kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
 
     def wheel_shift(self, hypothesis: Hypothesis) -> float:
@@ -341,11 +345,11 @@ class _HypothesisModel:
         p, b = self._p, self._b
         rates = wheels * np.maximum(1.0 + np.array([b.left_radius_scale, b.right_radius_scale]), 0.1)
         if b.wheel_radius_drift:
-            rates = rates * (1.0 + b.wheel_radius_drift * p._times / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
+            rates = rates * (1.0 + b.wheel_radius_drift * p.times_s / max(float(p.drive.starts_s[-1]), 1e-9))[:, None]
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
         if b.changed_rates:
-            rates = changed(b.changed_rates, Motion(rates, np.zeros((len(rates), 3)), p.batch.dt, p._times), "rates")
+            rates = changed(b.changed_rates, Motion(rates, np.zeros((len(rates), 3)), p.batch.dt, p.times_s), "rates")
         value = self._of_model(rates, cg, params) + self._floor(rates, cg)
         if p.drive.robot.drive == DIFF_DRIVE:
             track = p.drive.robot.geometry.track_width_m
@@ -367,7 +371,7 @@ class _HypothesisModel:
             lateral, rotation, forward = b.slip_coefficients
             value = np.stack([vx * (1.0 - forward * np.abs(wz)), vy + lateral * vx * wz, wz * (1.0 - rotation * np.abs(vx))], axis=-1)
         if b.changed_twists:
-            value = changed(b.changed_twists, Motion(rates, value, p.batch.dt, p._times), "twist")
+            value = changed(b.changed_twists, Motion(rates, value, p.batch.dt, p.times_s), "twist")
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
 
@@ -425,7 +429,7 @@ class _HypothesisModel:
             return self._with_inertia(law, rates, centers, params) - nominal
         later = params.copy()
         later[4] = max(later[4] * (1.0 + b.friction_change), 0.05)
-        is_after_change = (p._times >= b.friction_change_at_s)[:, None]
+        is_after_change = (p.times_s >= b.friction_change_at_s)[:, None]
         return np.asarray(
             np.where(is_after_change, self._with_inertia(law, rates, centers, later), self._with_inertia(law, rates, centers, params))
             - nominal

@@ -1,0 +1,235 @@
+"""Effects that are bound to a time, a place, a wheel's angle, a tilt or a sensor: shapes of what a drive leaves that no robot file holds.
+
+They compete with causes and terms (`terms.py`), so that a floor that is slippery in one corner, an eccentric wheel or a gyro that feels
+accelerations is named as such. Columns are those of a twist that is added to the predicted one, integrated along each window, or of what a
+sensor measured beside the motion.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.diagnosis.causes.cause import Hypothesis
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor
+from localization.diagnosis.verdict import moved_by
+from motion_models import se2
+from motion_models.calibration.prediction import series_of
+from motion_models.se2 import FloatArray
+
+_CELLS = (2, 3, 4)
+"""Patches of floor along each side of the area that was driven, in grids."""
+_MIN_SIDE_M = 1.0
+"""Of an area in which places can be told apart."""
+_MIN_TURNS = 3.0
+"""Of a wheel in the drive, for its angle to be told from time."""
+_MIN_TILT_M_S2 = 0.05
+"""Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
+_WARM_UP_SHARE = 0.25
+"""Time constant of what warms up, over the drive's length."""
+_GRAVITY = 9.81
+_TWIST_UNITS = ("m/s", "m/s", "rad/s")
+_PRICE = 3.0
+"""Of an effect that holds in this drive alone, in twice the log-odds beside terms."""
+
+
+class BoundShape(NamedTuple):
+    """A shape of unit size."""
+
+    component: str
+    """vx, vy, wz, gyro, force_x or force_y."""
+    along: str
+    """What it follows, in words."""
+    kind: str
+    """time, place, wheel angle, tilt or sensor."""
+    unit: str
+    price: float = _PRICE
+
+    @property
+    def name(self) -> str:
+        """As in tables."""
+        return f"{self.component}[{self.along}]"
+
+
+def bound_columns(predictor: DrivePredictor, hypothesis: Hypothesis) -> tuple[list[BoundShape], FloatArray]:
+    """Shapes that the drive can show, and (M, 6, K) what each of unit size changes in the discrepancies."""
+    twist = predictor.corrected_twist(hypothesis)
+    moved, of_twist = _moved_columns(predictor, twist)
+    measured, of_sensors = _sensor_columns(predictor, twist)
+    columns = np.concatenate([moved, measured], axis=-1)
+    is_shown = np.sqrt(np.nanmean(np.nan_to_num(columns) ** 2, axis=(0, 1))) > 1e-9
+    shapes = [shape for shape, shown in zip((*of_twist, *of_sensors), is_shown, strict=True) if shown]
+    return shapes, np.nan_to_num(columns[..., is_shown])
+
+
+def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[FloatArray, list[BoundShape]]:
+    """Of additions to the twist."""
+    batch = predictor.batch
+    densities = [*_of_time(predictor, twist), *_of_place(predictor, twist), *_of_wheel_angle(predictor), *_of_tilt(predictor, twist)]
+    table = np.column_stack([values for _, values in densities]) if densities else np.zeros((len(twist), 0))
+    columns = np.zeros((len(batch.ends), len(CHANNELS), len(densities)))
+    axes = [("vx", "vy", "wz").index(shape.component) for shape, _ in densities]
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
+        inside = slice(batch.first[owner] + batch.lead[owner], end)
+        moved = moved_by(twist[inside], batch.dt[inside], table[inside] * batch.dt[inside, None])
+        columns[i, :3] = moved[:, axes, np.arange(len(densities))]
+    return columns, [shape for shape, _ in densities]
+
+
+Densities = list[tuple[BoundShape, FloatArray]]
+"""Each shape with its density (N,) in every interval, in the unit of its component."""
+
+
+def _of_time(predictor: DrivePredictor, twist: FloatArray) -> Densities:
+    """What warms up, with a quarter of the drive as its time constant, or wears with the distance."""
+    v, wz, t = twist[:, 0], twist[:, 2], predictor.times_s
+    whole = float(t.max()) if len(t) else 0.0
+    if predictor.drive.kind != "log" or whole <= 0.0:
+        return []
+    warm = 1.0 - np.exp(-t / (_WARM_UP_SHARE * whole))
+    way = np.cumsum(np.abs(v) * predictor.batch.dt)
+    found: Densities = []
+    for name, component, motion in (("distance", "vx", v), ("turning", "wz", wz)):
+        found.append((BoundShape(component, f"{name}, growing as what warms up", "time", "1"), motion * warm))
+        found.append((BoundShape(component, f"{name} times the way driven", "time", "1/m"), motion * way))
+    return found
+
+
+def _places(predictor: DrivePredictor, twist: FloatArray) -> FloatArray:
+    """(N, 2) position in every interval, from where the drive began [m]: measured motions end to end, inside by ``twist`` (N, 3)."""
+    batch, drive = predictor.batch, predictor.drive
+    pose, found = np.zeros(3), np.zeros((len(batch.dt), 2))
+    for w, m in enumerate(drive.maneuvers):
+        a, b = batch.first[w], batch.first[w + 1]
+        inside = slice(a + batch.lead[w], b)
+        steps = twist[inside] * batch.dt[inside, None]
+        turned = predictor.headings[w] + np.cumsum(steps[:, 2]) - 0.5 * steps[:, 2]
+        c, s = np.cos(turned), np.sin(turned)
+        way = np.column_stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]])
+        found[a:b] = pose[:2]
+        found[inside] = pose[:2] + np.cumsum(way, axis=0)
+        pose = se2.compose(np.r_[pose[:2], predictor.headings[w]], np.nan_to_num(m.measured[-1]))
+    return found
+
+
+def _of_place(predictor: DrivePredictor, twist: FloatArray) -> Densities:
+    """Slip in patches of the area that was driven: a grid of cells, and its rows and columns."""
+    if predictor.drive.kind != "log" or not predictor.drive.has_positions or not predictor.drive.has_headings:
+        return []
+    at = _places(predictor, twist)
+    low, high = at.min(axis=0), at.max(axis=0)
+    if (high - low).max() < _MIN_SIDE_M:
+        return []
+    patches = [patch for cells in _CELLS for patch in _patches(at, low, high, cells)]
+    return [
+        (BoundShape(component, f"{name} in the floor's patch {text}", "place", "1"), motion * inside)
+        for text, inside in patches
+        for name, component, motion in (("distance", "vx", twist[:, 0]), ("turning", "wz", twist[:, 2]))
+    ]
+
+
+def _patches(at: FloatArray, low: FloatArray, high: FloatArray, cells: int) -> list[tuple[str, NDArray[np.bool_]]]:
+    """Which positions ``at`` (N, 2) are in which row, column and cell of a grid of so many ``cells`` along each side, with its bounds."""
+    cell = np.minimum(((at - low) / np.maximum(high - low, 1e-9) * cells).astype(int), cells - 1)
+    edges = low + (high - low) * np.arange(cells + 1)[:, None] / cells
+
+    def words(k: int, i: int) -> str:
+        return f"{'xy'[k]} = {edges[i, k]:.1f} to {edges[i + 1, k]:.1f} m"
+
+    found = [(words(k, i), cell[:, k] == i) for k in (0, 1) for i in range(cells)]
+    both = [(i, j) for i in range(cells) for j in range(cells)]
+    return found + [(f"{words(0, i)} and {words(1, j)}", (cell[:, 0] == i) & (cell[:, 1] == j)) for i, j in both]
+
+
+def _of_wheel_angle(predictor: DrivePredictor) -> Densities:
+    """An eccentric wheel: its radius varies by e cos(angle - phase), and the speed of its side with it."""
+    batch, drive = predictor.batch, predictor.drive
+    if drive.kind != "log":
+        return []
+    r, track = drive.robot.geometry.wheel_radius_m, drive.robot.geometry.track_width_m
+    found: Densities = []
+    for k, side in ((0, "left"), (1, "right")):
+        angles, total = np.zeros(len(batch.dt)), 0.0
+        for w in range(len(drive.maneuvers)):
+            inside = slice(batch.first[w] + batch.lead[w], batch.first[w + 1])
+            steps = batch.wheels[inside, k] * batch.dt[inside]
+            angles[inside] = total + np.cumsum(steps) - 0.5 * steps
+            total += float(steps[: int(drive.maneuvers[w].ends[-1])].sum())
+        if np.abs(np.diff(angles)).sum() < 2.0 * math.pi * _MIN_TURNS:
+            continue
+        speed = 0.5 * r * batch.wheels[:, k]
+        for name, wave in (("cosine", np.cos(angles)), ("sine", np.sin(angles))):
+            along = f"the {side} wheels' angle ({name})"
+            found.append((BoundShape("vx", along, "wheel angle", "1"), speed * wave))
+            found.append((BoundShape("wz", along, "wheel angle", "1"), (2 * k - 1) * 2.0 / track * speed * wave))
+    return found
+
+
+def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> Densities:
+    """Slip that follows how far the floor tilts the robot, by the accelerometers."""
+    drive, batch = predictor.drive, predictor.batch
+    if drive.forces is None or drive.kind != "log":
+        return []
+    left = (drive.forces - predictor.kinematic_forces) / _GRAVITY
+    left = left - np.median(left, axis=0)
+    owner = np.repeat(np.arange(len(batch.first) - 1), np.diff(batch.first))
+    found: Densities = []
+    speed = np.hypot(twist[:, 0], 0.5 * drive.robot.geometry.track_width_m * twist[:, 2])
+    for k, axis in ((0, "pitch"), (1, "roll")):
+        if _GRAVITY * left[:, k].std() < _MIN_TILT_M_S2:
+            continue
+        found.append((BoundShape(("vx", "vy")[k], f"speed times {axis}", "tilt", "1/rad"), speed * left[owner, k]))
+    return found
+
+
+def _sensor_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[FloatArray, list[BoundShape]]:
+    """Of gyro and accelerometers: g-sensitivity, scales that drift with time or differ by side, a lever arm."""
+    batch, drive = predictor.batch, predictor.drive
+    shapes: list[BoundShape] = []
+    columns: list[FloatArray] = []
+
+    def append(channel: str, along: str, unit: str, values: FloatArray) -> None:
+        column = np.zeros((len(batch.ends), len(CHANNELS)))
+        column[:, CHANNELS.index(channel)] = values
+        shapes.append(BoundShape(channel, along, "sensor", unit))
+        columns.append(column)
+
+    means = _means(predictor, twist)
+    seconds, turn = means["seconds"], means["wz"] * means["seconds"]
+    if drive.gyro is not None:
+        forces = drive.forces if drive.forces is not None else np.column_stack([means["dv"], means["vwz"]])
+        for k, axis in ((0, "ahead"), (1, "to the left")):
+            append("gyro", f"specific force {axis} (g-sensitivity)", "rad/s per m/s^2", forces[batch.owner, k] * seconds)
+        append("gyro", "turning times time (scale by temperature)", "1/s", turn * drive.starts_s[batch.owner])
+        append("gyro", "time times time (bias by temperature)", "rad/s^2", seconds * drive.starts_s[batch.owner])
+        append("gyro", "turning either way (scales of two sides)", "1", means["|wz|"] * seconds)
+        append("gyro", "wz |wz| (scale by rate)", "s", means["wz|wz|"] * seconds)
+    if drive.forces is not None:
+        append("force_x", "wz^2 (IMU ahead of the robot's middle)", "m", -means["wz^2"])
+        append("force_y", "wz^2 (IMU left of the robot's middle)", "m", -means["wz^2"])
+        append("force_x", "change of speed (scale)", "1", means["dv"])
+        append("force_y", "v wz (scale)", "1", means["vwz"])
+        for channel in ("force_x", "force_y"):
+            append(channel, "time (bias by temperature)", "m/s^3", drive.starts_s[batch.owner])
+            append(channel, "speed either way", "1/s", means["|v|"])
+    return (np.stack(columns, axis=-1) if columns else np.zeros((len(batch.ends), len(CHANNELS), 0))), shapes
+
+
+def _means(predictor: DrivePredictor, twist: FloatArray) -> dict[str, FloatArray]:
+    """(M,) length of each window [s], and means of the motion by ``twist`` (N, 3) in it."""
+    batch = predictor.batch
+    dt = series_of(batch).dt
+    v, wz = twist[:, 0], twist[:, 2]
+    change = np.divide(np.diff(v, prepend=v[:1]), dt, out=np.zeros_like(v), where=dt > 0.0)
+    parts = {"wz": wz, "dv": change, "vwz": v * wz, "|wz|": np.abs(wz), "wz|wz|": wz * np.abs(wz), "wz^2": wz**2, "|v|": np.abs(v)}
+    found = {name: np.zeros(len(batch.ends)) for name in (*parts, "seconds")}
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
+        inside = slice(batch.first[owner] + batch.lead[owner], end)
+        weights = batch.dt[inside]
+        found["seconds"][i] = weights.sum()
+        for name, values in parts.items():
+            found[name][i] = float(values[inside] @ weights / weights.sum())
+    return found
