@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
+from tests.helpers.compare import logs
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
@@ -23,22 +24,25 @@ DOCUMENTS = sorted(
     )
     if path.exists()
 )
-COMMANDS = [
-    pytest.param(line, marks=() if path.name == "README.md" else pytest.mark.extended)
-    for path in DOCUMENTS
-    for block in re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    for line in block.splitlines()
-    if line.startswith("skidloc ")
-]
+
+
+def commands_of(path: Path) -> list[str]:
+    """Commands in the shell blocks of a document."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.startswith("skidloc ")]
+
+
+README_COMMANDS = [command for path in DOCUMENTS if path.name == "README.md" for command in commands_of(path)]
+PAGES = [path for path in DOCUMENTS if path.name != "README.md" and commands_of(path)]
 
 
 def test_documents_have_commands() -> None:
-    assert len(COMMANDS) >= 5
+    assert len(README_COMMANDS) >= 5
+    assert len(PAGES) >= 7
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_command_of_a_document_runs(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The longest log is cut to its first fifth."""
+def enter_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Go to a folder with the data of this repository, its longest log cut to the first fifth."""
     data, long = Path("tests/data"), Path("tests/data/husky-outdoor-gps/test1.bag")
     (tmp_path / long.parent).mkdir(parents=True)
     (tmp_path / long).write_bytes((ROOT / long).read_bytes()[: (ROOT / long).stat().st_size // 5])
@@ -46,7 +50,26 @@ def test_command_of_a_document_runs(command: str, tmp_path: Path, monkeypatch: p
         if folder.name != long.parent.name:
             (tmp_path / data / folder.name).symlink_to(folder)
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("command", README_COMMANDS)
+def test_command_of_a_readme_runs(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    enter_checkout(tmp_path, monkeypatch)
     assert main(shlex.split(command, comments=True)[1:]) == 0
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_of_a_page_run_one_after_another(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With drives in place of a reader's own."""
+    enter_checkout(tmp_path, monkeypatch)
+    if page.stem == "compare":
+        Path("drives").mkdir()
+        for name, log in zip(("monday", "tuesday"), logs(2), strict=True):
+            Path(f"drives/{name}.mcap").symlink_to(log)
+        Path("logs.csv").write_text("log,robot,floor,day\ndrives/monday.mcap,vaultbot,hall,\ndrives/tuesday.mcap,vaultbot,hall,\n")
+    for command in commands_of(page):
+        assert main(shlex.split(command, comments=True)[1:]) == 0, command
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -66,7 +66,7 @@ class Calibrate:
     """Noise of the reference's poses [m, deg], as 0.002 0.1; by default its covariances, and 0.02 m and 0.57 deg without any."""
     antenna: tuple[float, float] | None = None
     """Where the antenna of positions alone sits in the body's frame [m]; by default where /tf_static has it, else it is estimated, and what
-    it cannot be told from (the centre of rotation) is held."""
+    it cannot be separated from (the centre of rotation) is held."""
     window_s: float = 2.0
     """Length of the maneuvers that logs are cut into [s]."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)

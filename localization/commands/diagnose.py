@@ -50,7 +50,7 @@ from motion_models.robot_file import load_robot, relocated, robot_toml
 
 NOT_BETTER = "the corrected robot is not better on the half held out beyond its scatter: robot.toml keeps the old values."
 _WHOLE_SHARE = 0.9
-"""Share of a correction that a model holds, below which that is said."""
+"""Share of a correction that a model holds, below which that is reported."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Diagnose:
     """Log of the same robot without a fault, about two minutes of arcs and turns: causes then count from how it moved there, and not from
     the robot file."""
     extend: bool = False
-    """Search terms that the model lacks: products of speed, yaw rate, accelerations, CG and time. What improves windows to which it was not
+    """Search terms missing in the model: products of speed, yaw rate, accelerations, CG and time. What improves windows to which it was not
     fitted is written to robot.toml as [models.NAME.terms]."""
     window_s: float = 2.0
     """Length of the windows that logs are cut into [s]."""

@@ -40,7 +40,7 @@ _CHANNEL_OF = {"vx": "x", "vy": "y", "wz": "yaw"}
 
 @dataclass(frozen=True)
 class Extension:
-    """Terms that a model lacks on a drive, and what a robot file with them gains."""
+    """Terms missing in a model on a drive, and what a robot file with them gains."""
 
     model: str
     terms: tuple[FoundTerm, ...]

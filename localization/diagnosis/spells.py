@@ -31,7 +31,7 @@ _OF_WHOLE_DRIVES = ("friction_change", "wheel_radius_drift", "encoder_dropout", 
 _FEWEST_WINDOWS = 24
 """Of a drive, as for changes of the floor."""
 _FEWEST_INSIDE = 6
-"""Windows of a part, and outside of it: of fewer a cause is not told from an outlier."""
+"""Windows of a part, and outside of it: of fewer, a cause cannot be distinguished from an outlier."""
 _MARGIN = 7.0
 """Twice the log-odds by which a part must be better than the whole drive: odds of 33."""
 _MOST = 3

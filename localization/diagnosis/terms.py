@@ -1,4 +1,4 @@
-"""Terms that a motion model lacks: sparse regression of what a drive leaves unexplained, through the integration of its windows.
+"""Terms missing in a motion model: sparse regression of what a drive leaves unexplained, through the integration of its windows.
 
 With y discrepancies of the drive, S signatures of causes within their tolerance, N nuisances and T what candidate terms of unit
 coefficient move at each measured pose, all whitened by the drive's noise,

@@ -39,7 +39,7 @@ GTSAM's Cholesky factors lose positive definiteness."""
 _NO_SIGMA = 1e-4
 """Prior sigma of the wheels' radius where it is not a variable of its own."""
 _OPEN_SHARE, _NO_INFORMATION = 0.5, 1e-3
-"""Variance of a keyframe's way over that by the wheels, above which scans know less of it than the wheels do: the scene leaves it open.
+"""Variance of a keyframe's way over that by the wheels, above which scans determine it less than the wheels do: the scene leaves it open.
 The information of scans along it then [1/m^2]: a sigma of 30 m."""
 _FOUND_SHARE = 0.5
 """Variance of the position over that at the last keyframe, below which a scan has found the place of a robot that was lost."""

@@ -141,7 +141,7 @@ class RecoveredSqlite:
         self._path = path
         try:
             with closing(_connect(path)) as database:
-                # SQLite refuses a file that is shorter than its header says, unless the schema is declared writable.
+                # SQLite refuses a file that is shorter than its header states, unless the schema is declared writable.
                 database.execute("PRAGMA writable_schema=ON")
                 self._topics, definitions = _describe(database)
         except (*_ERRORS, DamagedError) as error:

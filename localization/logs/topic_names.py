@@ -1,4 +1,4 @@
-"""What names of topics say about their origin: other estimates than the wheels', and namespaces of robots."""
+"""Origin of topics by their names: other estimates than the wheels', and namespaces of robots."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Excitation:
         self.is_turning = bool(abs(d[2]) * self._track_m >= self._min_track_over_radius * math.hypot(d[0], d[1]))
 
     def start_scan(self, state: State, R: Cov3) -> None:
-        """A scan with covariance ``R`` (3, 3) follows. The way is open where the scan knows less of it than ``state``, until the next
+        """A scan with covariance ``R`` (3, 3) follows. The way is open where the scan determines it less than ``state``, until the next
         scan."""
         P, pose, submap = state.P, state.layout.rows["pose"].start, state.layout.rows["map"].start
         self._is_way_open = bool(R[0, 0] > P[pose, pose] + P[submap, submap] - 2.0 * P[pose, submap])
