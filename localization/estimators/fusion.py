@@ -35,9 +35,6 @@ from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
-_MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
-"""Covariance of the pose of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2,
-rad^2]."""
 _MIN_CLOCK_OFFSET_S = 0.05
 """Smallest offset of the wheels' clock with a warning [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
 
@@ -134,7 +131,8 @@ class EkfFusion(Estimator):
         prior_cov = state.difference_cov("pose", "map")
         match = sensor.measure(step, state["pose"], prior_cov, self._slip.twist(step), self._slip.offset(step))
         if match is None:
-            return self._inflate(state, _MOVED_COV) if sensor.moved_at_s == step.end_ns * 1e-9 else state, None
+            moved = sensor.moved.cov(step)
+            return state if moved is None else self._inflate(state, moved), None
         match, R = self._slip.refine(sensor, step, state["start"], match)
         self.counts_by_name["matched"] += 1
         if match.outlier_cov.any():
@@ -207,7 +205,7 @@ class EkfFusion(Estimator):
         """Residuals of the last step."""
         motion, scan = self.wheels.motion, self._scan
         by_corrections = motion.d_params @ self.corrections.directions @ self.wheels.corrections
-        file_delta = se2.compose(motion.delta, se2.exp(-by_corrections))
+        file_delta = se2.retract(motion.delta, -by_corrections)
         turn = None if self._turn is None else self._turn.component(0)
         return Residuals(turn, file_delta, *((None, None) if scan is None else (scan.component(2), scan.component(0))))
 

@@ -2,18 +2,10 @@
 
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
-from localization.lidar.scan_checks import LostScans
-from localization.lidar.scan_matcher import (
-    FORGETTING,
-    MIN_POINTS,
-    OUTLIER_SIGMAS,
-    KeyScanError,
-    LidarConfig,
-    ScanMatch,
-    ScanMatcher,
-    choose_cell,
-)
-from localization.lidar.scan_matching import ScanMatchingSensor
+from localization.lidar.lost_scans import LostScans
+from localization.lidar.registration import OUTLIER_SIGMAS
+from localization.lidar.scan_matcher import FORGETTING, MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
+from localization.lidar.scan_sensor import ScanMatchingSensor
 
 __all__ = [
     "FORGETTING",

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.lidar.registration import CORRELATED_BEAMS, OUTLIER_SIGMAS
 from motion_models import se2
 from motion_models.compiled import kernel
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
@@ -20,11 +21,19 @@ _KEPT = (150, 1000)
 """Candidates of the middle and of the coarsest level that are refined: with 3,000 of the latter, 78 searches of ACES accept the same."""
 _MAX_CANDIDATES = 200_000
 """Poses that the coarsest level may score; a wider window gets a coarser level."""
-CORRELATED_BEAMS = 6.0
-"""Neighbouring beams that err together, where scores are compared: they hit one surface."""
 _APART_CELLS = 6
 """A pose is another one, and not the flank of the best, from so many cells away on."""
 _MIN_YAW_STEP_RAD = 2e-3
+OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
+"""-log of the odds that the prior is an outlier."""
+_SEARCH_FACTOR = 9.0
+SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
+"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
+_SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
+"""Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
+_MAX_RIVAL = 0.9
+"""A search is ambiguous where a pose elsewhere scores more than this share of the best; where the prior is wider than its window, where one
+is more probable than exp(-`OUTLIER_COST`) of the best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +107,26 @@ def search(image: LikelihoodImage, points: Points2, prior: Pose2, cov: Cov3, lim
     return _pick(
         prior, shifts, scores, len(points), np.asarray(np.linalg.inv(world), dtype=float), np.array([image.cell, image.cell, yaw_step])
     )
+
+
+def find_place(image: LikelihoodImage, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
+    """The best pose (3,) of ``points`` (N, 2) within 3 sigma of ``wide`` (3, 3) from the ``prior`` (3,), limited by `search_limit`; None
+    where it is ambiguous. ``cov`` (3, 3) of the prior itself."""
+    limit = search_limit(cov)
+    best = search(image, points, prior, wide, limit)
+    if (limit <= _SEARCH_LIMIT).all():
+        return best.pose if best.rival_score < _MAX_RIVAL * best.score else None
+    return best.pose if best.margin >= OUTLIER_COST else None  # the place is unknown
+
+
+def search_limit(cov: Cov3) -> FloatArray:
+    """(3,) half the window of a search at most [m, m, rad], for a prior with ``cov`` (3, 3)."""
+    return np.asarray(np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH))
+
+
+def prior_outlier_cov(cov: Cov3) -> Cov3:
+    """(3, 3) to be added to the covariance ``cov`` (3, 3) of a prior that may be an outlier."""
+    return np.asarray((_SEARCH_FACTOR - 1.0) * cov + SEARCH_FLOOR)
 
 
 def _count(half: FloatArray, yaws: int, step: float) -> float:

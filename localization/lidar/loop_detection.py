@@ -9,18 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from localization.lidar.correlative_search import draw_image
-from localization.lidar.scan_matcher import (
-    MIN_PLACE_OVERLAP,
-    SEARCH_FLOOR,
-    LidarConfig,
-    align_points,
-    find_place,
-    is_narrow,
-    mahalanobis,
-    prior_outlier_cov,
-    search_limit,
-)
+from localization.lidar.correlative_search import SEARCH_FLOOR, draw_image, find_place, prior_outlier_cov, search_limit
+from localization.lidar.registration import align_points, is_narrow, mahalanobis
+from localization.lidar.scan_matcher import MIN_PLACE_OVERLAP, LidarConfig
 from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.lidar.scan_checks import MAX_LOST_S, MAX_LOST_SHARE, MIN_LOST_S, LostScans
+from localization.lidar.lost_scans import MAX_LOST_S, MAX_LOST_SHARE, MIN_LOST_S, LostScans
 
 _CAUSES: Mapping[str, tuple[str, str]] = {
     "lost": (

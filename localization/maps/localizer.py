@@ -14,7 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from localization.lidar.scan_matcher import MIN_POINTS, OUTLIER_SIGMAS, is_narrow, mahalanobis
+from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanobis
+from localization.lidar.scan_matcher import MIN_POINTS
 from localization.lidar.submap import voxel_means
 from localization.maps.background_search import BackgroundSearch
 from localization.maps.grid import Grid

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.lidar.correlative_search import COARSE, draw_image, reduce_image
-from localization.lidar.scan_matcher import Fit, align_points
+from localization.lidar.registration import Fit, align_points
 from localization.lidar.submap import VoxelGrid, make_grid, voxel_means
 from localization.maps.grid import Grid, draw_grid
 from localization.maps.keyframe_map import KeyframeMap

@@ -16,6 +16,7 @@ from localization.estimators.base import Estimator
 from localization.estimators.fusion import EkfFusion
 from localization.events import Scan, Step, Turn
 from localization.lidar import LostScans, ScanMatch
+from localization.lidar.scan_policies import MovedRobot
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections, make_corrections
@@ -49,11 +50,10 @@ class PoseSensor:
 
     cell = 0.0  # no voxels, and so no loops
     sweep_s = 0.0  # poses at one instant
-    moved_at_s = None  # by its wheels alone
 
     def __init__(self) -> None:
         self.next: ScanMatch | None = None
-        self.lost = LostScans()
+        self.lost, self.moved = LostScans(), MovedRobot()
 
     def measure(self, step, prior, cov, twist, offset):
         return self.next

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from localization.lidar import LidarConfig, ScanMatch, ScanMatcher, scan_matcher, submap
-from localization.lidar.scan_matcher import _KERNEL, KeyScan, linearize
+from localization.lidar.registration import _KERNEL, linearize
+from localization.lidar.scan_matcher import KeyScan
 from localization.lidar.submap import make_grid
 from localization.simulation import world
 from motion_models import se2
@@ -242,7 +243,7 @@ def test_match_cov_along_bare_walls_is_open(walls: np.ndarray, start: tuple[floa
 
 def test_match_that_fits_far_from_the_prior_needs_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eight sigma off a narrow prior, Gauss-Newton finds the pose by itself: the prior is an outlier."""
-    monkeypatch.setattr(scan_matcher, "search", lambda *a: pytest.fail("searched"))
+    monkeypatch.setattr(scan_matcher, "find_place", lambda *a: pytest.fail("searched"))
     matcher, true = mapped(LAB, np.random.default_rng(0))
     cov = np.diag([0.003, 0.003, 0.002]) ** 2
     prior = se2.compose(true, np.array([0.024, -0.016, 0.01]))

@@ -31,7 +31,7 @@ for estimator, model in (("ekf", "skid_steer"), ("graph", "friction")):
     node.spin(transport.is_empty)
     node.finish()
     after = compiled()
-    assert before["localization.lidar.scan_matcher._align"] == 1, before
+    assert before["localization.lidar.registration._align"] == 1, before
     planar = [name for name in before if name.startswith("localization.lidar") and "cloud_map" not in name and "_in_space" not in name]
     print("not compiled:", [name for name in planar if before[name] == 0])
     print("compiled late:", {name: n for name, n in after.items() if n > before.get(name, 0)})

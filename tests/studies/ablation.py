@@ -39,10 +39,10 @@ from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
 from localization.events import Step
-from localization.lidar import scan_matcher
+from localization.lidar import correlative_search, registration, scan_matcher
 from localization.lidar.loop_detection import LoopDetector
 from localization.lidar.scan_matcher import ScanMatcher
-from localization.lidar.scan_matching import ScanMatchingSensor
+from localization.lidar.scan_sensor import ScanMatchingSensor
 from localization.lidar.submap import VoxelGrid, fill_surface, make_grid
 from localization.logs import open_log
 from localization.simulation.experiments import ExperimentConfig
@@ -50,7 +50,6 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
 from motion_models.robot_file import load_robot
-from motion_models.se2 import triple
 from tests.studies.buildings import BUILDINGS, Drive, errors_of, nees_at_instants
 
 JOURNAL = Path(__file__).parents[2] / "docs/lab/estimators.md"
@@ -58,6 +57,7 @@ CELLS = Path(tempfile.gettempdir()) / "skidloc_ablation.json"
 BEGIN, END = "<!-- ablation: begin -->", "<!-- ablation: end -->"
 _NO_PRIOR = 1e6 * np.eye(3)
 """Covariance of a prior that says nothing [m^2, m^2, rad^2]."""
+_align_points = registration.align_points
 _NO_LOSS = 1e6
 """Scale of a robust loss [sigma] that never acts."""
 _LAPS = 1
@@ -117,11 +117,10 @@ def _exact_normals(*arguments: Any) -> VoxelGrid:
     return grid
 
 
-def _align_freely(original: Callable[..., Any], self: ScanMatcher, points: Any, prior: Any, cov: Any, guess: Any, first: Any = None) -> Any:
+def _align_freely(grid: VoxelGrid, points: Any, prior: Any, cov: Any, guess: Any, first: Any = None) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    error = scan_matcher._prior_error_at_points(points, cov) if first is None else first
-    pose = np.array(scan_matcher._align(self._grid, points, triple(prior), np.linalg.inv(_NO_PRIOR), triple(guess), error))
-    return scan_matcher.linearize(self._grid, points, pose)
+    error = registration._prior_error_at_points(points, cov) if first is None else first
+    return _align_points(grid, points, prior, _NO_PRIOR, guess, error)
 
 
 def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
@@ -132,8 +131,8 @@ def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *r
 
 _NO_SEARCH = (
     _attribute(ScanMatcher, "_search", lambda *a: None),
-    _attribute(scan_matcher, "_BASIN_M", math.inf),
-    _attribute(scan_matcher, "_BASIN_RAD", math.inf),
+    _attribute(registration, "_BASIN_M", math.inf),
+    _attribute(registration, "_BASIN_RAD", math.inf),
 )
 _ASSUMED_NOISE = (_attribute(ScanMatcher, "_residual_variance", 1.0), _attribute(ScanMatcher, "_block_variance", 1.0))
 PATCHES: Mapping[str, Patch] = {
@@ -153,12 +152,14 @@ PATCHES: Mapping[str, Patch] = {
         "measure",
         lambda original, self, step, prior, cov, twist, offset: original(self, step, prior, cov, twist, np.zeros(3)),
     ),
-    "rival test of the search": _attribute(scan_matcher, "_MAX_RIVAL", math.inf),
+    "rival test of the search": _attribute(correlative_search, "_MAX_RIVAL", math.inf),
     "total cost (more points fit, instead)": _attribute(
         scan_matcher, "_is_better", lambda found, fit, prior, cov: found.overlap > fit.overlap
     ),
-    "prior as possible outlier": _attribute(scan_matcher, "_OUTLIER_COST", math.inf),
-    "prior in the least squares": _wrap(ScanMatcher, "_align", _align_freely),
+    "prior as possible outlier": lambda: _together(
+        _attribute(scan_matcher, "OUTLIER_COST", math.inf), _attribute(correlative_search, "OUTLIER_COST", math.inf)
+    ),
+    "prior in the least squares": _attribute(scan_matcher, "align_points", _align_freely),
     "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
     "size of the residuals": lambda: _together(*_ASSUMED_NOISE),
     "correlation of neighbouring residuals": _attribute(ScanMatcher, "_block_variance", property(lambda self: self._residual_variance)),

@@ -11,15 +11,14 @@ import numpy as np
 from localization.events import Step
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
-from localization.lidar.scan_checks import MAX_LOST_S, LostScans, StaleScans
-from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell, is_narrow
+from localization.lidar.lost_scans import LostScans
+from localization.lidar.registration import is_narrow
+from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
+from localization.lidar.scan_policies import MovedRobot, OpenPlace, StaleScans
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
 
-_MAPPED, _UNMAPPED, _MAX_MOTION = 0.8, 0.3, 0.3
-"""The scene changed at once where the mapped share of scans fell from above the first to below the second while the wheels moved by less
-than the third [m, rad]. It falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, and below 0.25 where a robot is carried."""
 _MIN_DISPLACEMENT_M = 1e-3
 """Points that another twist moves by less are not deskewed again [m]."""
 
@@ -51,61 +50,49 @@ class ScanMatchingSensor:
         self._frame = ""  # of the last scan
         self._prior, self._cov = np.zeros(3), np.eye(3)
         self._last_key: FloatArray | None = None
-        self._searching_since_s: float | None = None
-        self._is_searching = False  # the scan at hand was not found from a wide prior: a place is still to be found
-        self._stale, self.lost = StaleScans(), LostScans()
-        self._mapped_shares: dict[str, float] = {}  # of the last scan of each frame
-        self.moved_at_s: float | None = None
-        """Time at which the robot was last moved by other than its wheels [s]."""
+        self._stale, self._place = StaleScans(), OpenPlace()
+        self.moved, self.lost = MovedRobot(), LostScans()
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
 
         The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``offset`` (3,): see `ScanMatcher.match`.
         """
-        assert step.scan is not None
-        self._scan, self._prior, self._cov, self._frame = None, prior, cov, step.scan.frame_id
-        if self._stale.is_stale(step.scan, step.is_standing):
-            self.lost.add(step.end_ns, "stale")
-            return None
-        sweep = Sweep.from_scan(step.scan, self._mount(step.scan.frame_id)).within(self._config.min_range_m, self._config.max_range_m)
-        self._scan = self._deskew(sweep, twist)
-        if len(self._scan.planar) < MIN_POINTS:
-            self._scan = None
-            self.lost.add(step.end_ns, "sparse")
-            return None
-        if self._matcher is None:
-            self._begin(self._scan)
-            self._mapped_shares = {step.scan.frame_id: 1.0}
-            self.lost.add_matched(step.end_ns)
-            return None
-        found = self._match(self._matcher, self._scan, offset)
-        before = self._mapped_shares.get(step.scan.frame_id, 0.0)
-        self._mapped_shares[step.scan.frame_id] = self._matcher.mapped_share
-        if found is None and _is_moved(before, self._matcher.mapped_share, step):
-            self._scan, self.moved_at_s = None, step.end_ns * 1e-9
-            self._matcher.is_new_place = False
-            self.lost.add(step.end_ns, "moved")
-            return None
-        self._update_search_state(found is None and not is_narrow(cov), step.end_ns * 1e-9)
-        if found is None:
-            self.lost.add(step.end_ns, "lost")
+        self._scan, self._prior, self._cov = None, prior, cov
+        found, cause = self._measure(step, twist, offset)
+        if cause:
+            self.lost.add(step.end_ns, cause)
         else:
             self.lost.add_matched(step.end_ns)
         return found
+
+    def _measure(self, step: Step, twist: Twist2, offset: Tangent2) -> tuple[ScanMatch | None, str]:
+        """The match, and why the scan is lost; "" where it is not, also of the first scan."""
+        scan = step.scan
+        assert scan is not None
+        self._frame = scan.frame_id
+        if self._stale.is_stale(scan, step.is_standing):
+            return None, "stale"
+        sweep = Sweep.from_scan(scan, self._mount(scan.frame_id)).within(self._config.min_range_m, self._config.max_range_m)
+        deskewed = self._deskew(sweep, twist)
+        if len(deskewed.planar) < MIN_POINTS:
+            return None, "sparse"
+        self._scan = deskewed
+        if self._matcher is None:
+            self._begin(deskewed)
+            self.moved.begin(scan)
+            return None, ""
+        found = self._match(self._matcher, deskewed, offset)
+        if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
+            self._scan, self._matcher.is_new_place = None, False
+            return None, "moved"
+        self._place.update(step.end_ns * 1e-9, is_found=found is not None or is_narrow(self._cov))
+        return found, "lost" if found is None else ""
 
     def add_no_scan(self, stamp_ns: int, is_excluded: bool) -> None:
         """A step without a scan: none is at hand, and the LiDAR may be silent, or a check left the scan out."""
         self._scan = None
         self.lost.add(stamp_ns, "excluded") if is_excluded else self.lost.add_no_scan(stamp_ns)
-
-    def _update_search_state(self, is_searching: bool, now_s: float) -> None:
-        """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""
-        if not is_searching:
-            self._searching_since_s = None
-        elif self._searching_since_s is None:
-            self._searching_since_s = now_s
-        self._is_searching = self._searching_since_s is not None and now_s - self._searching_since_s < MAX_LOST_S
 
     def refine(self, match: ScanMatch, twist: Twist2) -> ScanMatch:
         """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
@@ -124,7 +111,7 @@ class ScanMatchingSensor:
 
     def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
-        if self._scan is None or self._is_searching:
+        if self._scan is None or self._place.is_open:
             return False
         if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
             return True
@@ -188,12 +175,6 @@ class ScanMatchingSensor:
         mount = self._mounts.get(frame)
         if mount is not None and not self._is_placed:
             self._matcher, self._kiss, self._last_key = None, None, None
-            self._searching_since_s, self._is_searching = None, False
+            self._place.restart()
         self._is_placed = mount is not None
         return mount or Mount()
-
-
-def _is_moved(before: float, now: float, step: Step) -> bool:
-    """Whether scans lose the map at once, from the mapped share ``before`` to that of ``now``, though the wheels hardly moved."""
-    x, y, yaw = step.predicted.delta
-    return before > _MAPPED and now < _UNMAPPED and math.hypot(x, y) < _MAX_MOTION and abs(yaw) < _MAX_MOTION

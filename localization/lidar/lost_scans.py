@@ -1,13 +1,8 @@
-"""Scans that cannot be used: of a frozen scanner, unmatched; and how long the LiDAR was lost."""
+"""How long the LiDAR was lost: scans that could not be matched, and times without any."""
 
 from __future__ import annotations
 
 from collections import deque
-
-import numpy as np
-
-from localization.events import Scan
-from motion_models.se2 import FloatArray
 
 _MAX_SCAN_GAP_S = 1.0
 """Time without a scan that counts as lost [s]: scanners give 5 to 40 scans a second, and in this time wheels alone err by the few
@@ -24,25 +19,6 @@ MAX_LOST_S = 5.0
 0.15 m in it, from where on Gauss-Newton alone may end in a wrong place."""
 MIN_LOST_S = 1.0
 """The share counts where one stretch at least is longer [s]: wheels carry the pose over single scans without a visible error (voxels)."""
-
-
-class StaleScans:
-    """Recognizes scanners that repeat their last scan."""
-
-    def __init__(self) -> None:
-        self._points: dict[str, FloatArray] = {}  # of the last scan in each frame
-        self._is_frozen: dict[str, bool] = {}
-
-    def is_stale(self, scan: Scan, is_standing: bool) -> bool:
-        """The very same ranges as last time although the wheels turn: noise alone would have changed them.
-
-        A scanner that froze while the robot drove stays stale until its ranges change, also where the robot stands.
-        """
-        last = self._points.get(scan.frame_id)
-        is_same = last is not None and len(last) > 0 and np.array_equal(last, scan.points)
-        is_frozen = is_same and (self._is_frozen.get(scan.frame_id, False) or not is_standing)
-        self._points[scan.frame_id], self._is_frozen[scan.frame_id] = scan.points, is_frozen
-        return is_frozen
 
 
 class LostScans:
@@ -81,7 +57,8 @@ class LostScans:
         than they are apart."""
         if self._first_ns is None:
             return
-        if stamp_ns - self._scan_ns <= max(_MAX_SCAN_GAP_S * 1e9, _MAX_SCAN_GAP_PERIODS * self._period_ns):
+        gap_ns = stamp_ns - self._scan_ns
+        if gap_ns <= _MAX_SCAN_GAP_S * 1e9 or gap_ns <= _MAX_SCAN_GAP_PERIODS * self._period_ns:
             return
         self.silences += not self._is_silent
         self._is_silent, self._last_ns = True, max(stamp_ns, self._last_ns)

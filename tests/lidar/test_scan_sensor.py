@@ -7,7 +7,7 @@ import pytest
 
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig, ScanMatchingSensor
-from localization.lidar.scan_checks import MAX_LOST_S
+from localization.lidar.lost_scans import MAX_LOST_S
 from localization.simulation import world
 from motion_models.base import Motion
 from motion_models.robot import Mount
@@ -80,6 +80,7 @@ def test_scene_that_changes_at_once_is_no_new_place(sensor: ScanMatchingSensor) 
     """The robot is carried to another room while its wheels stand: the scan is lost, and no key scan."""
     step = step_at(1.0, HALL, AHEAD, (0.0, 0.0, 0.0))
     assert sensor.measure(step, AHEAD, NARROW, np.zeros(3), np.zeros(3)) is None
-    assert sensor.moved_at_s == 1.0
+    assert sensor.moved.cov(step_at(1.0, HALL, AHEAD)) is not None
+    assert sensor.moved.cov(step_at(1.1, HALL, AHEAD)) is None
     assert sensor.lost.causes == {"moved": 1}
     assert not sensor.is_key(AHEAD)

@@ -1,44 +1,12 @@
-"""Scans that cannot be used, and for how long."""
+"""For how long the LiDAR was lost."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
-from localization.events import Scan
 from localization.lidar import LostScans
-from localization.lidar.scan_checks import StaleScans
 
 S = 1_000_000_000
-
-
-def scan(seed: int, n: int = 5) -> Scan:
-    return Scan(0, np.random.default_rng(seed).normal(size=(n, 3)))
-
-
-def test_is_stale_with_same_ranges_while_driving_is_true() -> None:
-    checks = StaleScans()
-    found = [checks.is_stale(scan(seed), False) for seed in (0, 1, 1, 1, 2, 1)]
-    assert found == [False, False, True, True, False, False]
-
-
-def test_is_stale_with_same_ranges_at_rest_is_false() -> None:
-    """As in a simulator without noise."""
-    checks = StaleScans()
-    assert not any(checks.is_stale(scan(0), True) for _ in range(5))
-
-
-def test_is_stale_after_freezing_on_the_way_stays_true_at_rest() -> None:
-    checks = StaleScans()
-    found = [
-        checks.is_stale(scan(seed), standing) for seed, standing in ((0, False), (0, False), (0, True), (0, True), (1, True), (1, True))
-    ]
-    assert found == [False, True, True, True, False, False]
-
-
-def test_is_stale_with_empty_scans_is_false() -> None:
-    checks = StaleScans()
-    assert not any(checks.is_stale(scan(0, 0), False) for _ in range(3))
 
 
 def test_lost_scans_time_is_between_matches_but_for_one_period() -> None:
@@ -94,13 +62,6 @@ def test_lost_scans_count_gap_without_steps_between() -> None:
     for t in (0, 1, 2, 3, 9, 10):
         lost.add(t * S, "lost") if t == 9 else lost.add_matched(t * S)
     assert (lost.silences, lost.longest) == (1, (6.0, 3.0))
-
-
-def test_is_stale_tells_scanners_apart() -> None:
-    """Both are frozen, and their scans alternate."""
-    checks = StaleScans()
-    scans = [Scan(0, scan(k % 2).points, frame_id="ab"[k % 2]) for k in range(6)]
-    assert [checks.is_stale(s, False) for s in scans] == [False, False, True, True, True, True]
 
 
 def test_lost_scans_after_silence_count_the_next_one_alike() -> None:

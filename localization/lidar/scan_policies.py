@@ -1,0 +1,86 @@
+"""What is not nominal about a scan, one policy each: a frozen scanner, a robot that was moved, a place that is still to be found."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from localization.events import Scan, Step
+from localization.lidar.lost_scans import MAX_LOST_S
+from motion_models.se2 import FloatArray
+
+_MAPPED, _UNMAPPED, _MAX_MOTION = 0.8, 0.3, 0.3
+"""The scene changed at once where the mapped share of scans fell from above the first to below the second while the wheels moved by less
+than the third [m, rad]. It falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, and below 0.25 where a robot is carried."""
+MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
+"""Covariance of the pose of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2,
+rad^2]."""
+
+
+class StaleScans:
+    """Recognizes scanners that repeat their last scan."""
+
+    def __init__(self) -> None:
+        self._points: dict[str, FloatArray] = {}  # of the last scan in each frame
+        self._is_frozen: dict[str, bool] = {}
+
+    def is_stale(self, scan: Scan, is_standing: bool) -> bool:
+        """The very same ranges as last time although the wheels turn: noise alone would have changed them.
+
+        A scanner that froze while the robot drove stays stale until its ranges change, also where the robot stands.
+        """
+        last = self._points.get(scan.frame_id)
+        is_same = last is not None and len(last) > 0 and np.array_equal(last, scan.points)
+        is_frozen = is_same and (self._is_frozen.get(scan.frame_id, False) or not is_standing)
+        self._points[scan.frame_id], self._is_frozen[scan.frame_id] = scan.points, is_frozen
+        return is_frozen
+
+
+class MovedRobot:
+    """Recognizes a robot that was moved by other than its wheels: its scans lose the map at once."""
+
+    def __init__(self) -> None:
+        self._mapped_shares: dict[str, float] = {}  # of the last scan in each frame
+        self._at_ns: int | None = None
+
+    def begin(self, scan: Scan) -> None:
+        """``scan`` begins a submap: all of it is mapped."""
+        self._mapped_shares = {scan.frame_id: 1.0}
+
+    def is_moved(self, step: Step, scan: Scan, mapped_share: float, *, is_matched: bool) -> bool:
+        """Whether the robot was moved in ``step``, by the ``mapped_share`` of the points of its ``scan`` now and before."""
+        before = self._mapped_shares.get(scan.frame_id, 0.0)
+        self._mapped_shares[scan.frame_id] = mapped_share
+        if is_matched or before <= _MAPPED or mapped_share >= _UNMAPPED:
+            return False
+        x, y, yaw = step.predicted.delta
+        if math.hypot(x, y) >= _MAX_MOTION or abs(yaw) >= _MAX_MOTION:
+            return False
+        self._at_ns = step.end_ns
+        return True
+
+    def cov(self, step: Step) -> FloatArray | None:
+        """(3, 3) by which the pose is off besides, where the robot was moved in ``step``."""
+        return MOVED_COV if self._at_ns == step.end_ns else None
+
+
+class OpenPlace:
+    """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""
+
+    def __init__(self) -> None:
+        self._since_s: float | None = None
+        self.is_open = False
+        """The scan at hand was not found from a wide prior: a place is still to be found."""
+
+    def update(self, now_s: float, *, is_found: bool) -> None:
+        """Whether the scan at ``now_s`` [s] was matched, or its prior leaves no doubt of its place."""
+        if is_found:
+            self._since_s = None
+        elif self._since_s is None:
+            self._since_s = now_s
+        self.is_open = self._since_s is not None and now_s - self._since_s < MAX_LOST_S
+
+    def restart(self) -> None:
+        """The submap begins anew."""
+        self._since_s, self.is_open = None, False
