@@ -104,14 +104,19 @@ def cut(
     for span in take(None):
         unmeasured += use(span)
     corrected = reference.correct([span for span, _ in found])
-    first = found[0][0].start_ns if found else 0
-    maneuvers = []
-    for (_, maneuver), span in zip(found, corrected, strict=True):
-        number = int((span.start_ns - first) * _NS / (config.window_s * config.per_group))
-        group = f"{name}, {number * config.window_s * config.per_group:g} s"
-        start_s = (span.start_ns - (first_wheel_ns or 0)) * _NS
-        maneuvers.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group, start_s=start_s))
+    group_s = config.window_s * config.per_group
+    maneuvers = _grouped([maneuver for _, maneuver in found], corrected, first_wheel_ns or 0, group_s, name)
     return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()))
+
+
+def _grouped(maneuvers: Sequence[Maneuver], spans: Sequence[Span], begin_ns: int, group_s: float, name: str) -> list[Maneuver]:
+    """The ``maneuvers`` with the measurements of their ``spans``, in groups of ``group_s`` [s] that begin with ``name``."""
+    found = []
+    for maneuver, span in zip(maneuvers, spans, strict=True):
+        number = int((span.start_ns - spans[0].start_ns) * _NS / group_s)
+        group, start_s = f"{name}, {number * group_s:g} s", (span.start_ns - begin_ns) * _NS
+        found.append(dataclasses.replace(maneuver, measured=span.measured[None], cov=span.cov, group=group, start_s=start_s))
+    return found
 
 
 def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int, int] | None:

@@ -46,7 +46,8 @@ from localization.pipeline import ReplayConfig, Run, Trial, replay, warnings_of
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
 from localization.report.scan_layer import ScanLayer
 from localization.trajectory import write_tum
-from motion_models.online_calibration import check_forms
+from motion_models.base import MotionModel
+from motion_models.online_calibration import Form, check_forms
 from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import make_model
 from motion_models.robot import Mount
@@ -115,15 +116,9 @@ class Replay:
         has_lidar = log.sources.lidar is not None
         yaw = None if wiring.is_ambiguous else check_lidar_yaw(log)
         mounts = corrected(log.mounts, yaw)
-        prior = self._prior()
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")
-        pairs = [
-            Trial(model, estimator, form, prior if estimator == LOCALIZER else None)
-            for estimator in self._estimators(log)
-            for model in models
-            for form in check_forms(forms)[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
-        ]
+        pairs = self._trials(log, models, check_forms(forms))
         self._check_map(has_lidar)
         if self.extend_map is not None and self.map is None:
             raise EstimatorError("--extend-map adds to a saved map. Name it by --map, or write a new one by --save-map.")
@@ -171,6 +166,16 @@ class Replay:
         if self.extend_map is not None:
             console.print(self._extend(self.extend_map, runs, head, mounts), markup=False, soft_wrap=True)
         self._print(console, head, results, reference)
+
+    def _trials(self, log: Log, models: Sequence[MotionModel], forms: Sequence[Form]) -> list[Trial]:
+        """Each estimator with each model, and, where it corrects that, each of the ``forms`` of corrections."""
+        prior = self._prior()
+        return [
+            Trial(model, estimator, form, prior if estimator == LOCALIZER else None)
+            for estimator in self._estimators(log)
+            for model in models
+            for form in forms[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
+        ]
 
     def _write(self, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         """The folder of results, and the copy of its metrics. Raises `OutputError`."""

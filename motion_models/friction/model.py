@@ -39,7 +39,7 @@ from motion_models.friction.equilibrium import (
 from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, Free, Param, Traits
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Triple
 from motion_models.slope import Slope, SlopeTwist
 
 GRAVITY = 9.81
@@ -393,14 +393,26 @@ def _solve_samples(
             d_params[i, k, 8] = by[k, 4] * speed
             d_params[i, k, 9] = by[k, 11] * speed
             if has_slope:
-                steeper = pulled * speed / (1.0 + a_x * a_x + a_y * a_y)
-                d_slope[i, k, 0] = by_xi * height + by[k, 15] * speed / mu + steeper * a_x
-                d_slope[i, k, 1] = by_eta * height + by[k, 16] * speed / mu + steeper * a_y
-                d_slope[i, k, 2] = by_xi * a_x + by_eta * a_y
+                _fill_by_slope(by[k], (by_xi, by_eta), (a_x, a_y, height), pulled * speed, (speed, mu), d_slope[i, k])
         _by_given_load(cg[i], (x, y, t), split, floor, d_cg[i], d_params[i])
 
 
 _twist = kernel(_solve_samples)
+
+
+@subroutine
+def _fill_by_slope(
+    by: FloatArray, by_load: tuple[float, float], slope: Triple, pulled: float, unit: tuple[float, float], out: FloatArray
+) -> None:
+    """Fill ``out`` (3,) with the derivative of one component of the twist by gravity along x and y over that across, and the CG's height.
+
+    ``by`` (17,) of the balance at unit speed, ``by_load`` of the load's centre along x and y [m], ``unit`` speed [m/s] and friction.
+    """
+    (by_xi, by_eta), (a_x, a_y, height), (speed, mu) = by_load, slope, unit
+    steeper = pulled / (1.0 + a_x * a_x + a_y * a_y)
+    out[0] = by_xi * height + by[15] * speed / mu + steeper * a_x
+    out[1] = by_eta * height + by[16] * speed / mu + steeper * a_y
+    out[2] = by_xi * a_x + by_eta * a_y
 
 
 @subroutine
