@@ -300,6 +300,26 @@ def between(world_T_a: ArrayLike, world_T_b: ArrayLike) -> FloatArray:
     return np.asarray(_between(world_T_a, world_T_b))
 
 
+@gufunc("(n),(n)->(n)")
+def _retract(p: FloatArray, v: FloatArray, out: FloatArray) -> None:
+    out[0], out[1], out[2] = scalar_compose(triple(p), scalar_exp(triple(v)))
+
+
+def retract(pose: ArrayLike, tangent: ArrayLike) -> FloatArray:
+    """``pose`` (..., 3) moved by a perturbation on the right: ``compose(pose, exp(tangent))`` (Solà, eq. 25)."""
+    return np.asarray(_retract(pose, tangent))
+
+
+@gufunc("(n),(n)->(n)")
+def _local(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    out[0], out[1], out[2] = scalar_log(scalar_between(triple(a), triple(b)))
+
+
+def local(a: ArrayLike, b: ArrayLike) -> FloatArray:
+    """Tangent (..., 3) that moves pose ``a`` to ``b``: ``log(between(a, b))``, the inverse of `retract` (Solà, eq. 26)."""
+    return np.asarray(_local(a, b))
+
+
 @gufunc("(n),(m)->(m)")
 def _transform(p: FloatArray, q: FloatArray, out: FloatArray) -> None:
     out[0], out[1] = scalar_transform(triple(p), q[0], q[1])

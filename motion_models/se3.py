@@ -84,6 +84,16 @@ def log(a: Transform3) -> Tangent3:
     return np.concatenate([np.linalg.solve(np.eye(3) + second * W + third * (W @ W), a[:3, 3]), v])
 
 
+def retract(a: Transform3, tangent: Tangent3) -> Transform3:
+    """``a`` moved by a perturbation (6,) on the right: a exp(tangent)."""
+    return compose(a, exp(tangent))
+
+
+def local(a: Transform3, b: Transform3) -> Tangent3:
+    """Tangent (6,) that moves ``a`` to ``b``: log(a^-1 b)."""
+    return log(compose(inverse(a), b))
+
+
 def adjoint(a: Transform3) -> FloatArray:
     """(6, 6) with a exp(t) = exp(adjoint(a) t) a."""
     R = a[:3, :3]

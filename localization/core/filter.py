@@ -127,7 +127,7 @@ def _retract(state: State, error: FloatArray, considered: Collection[str]) -> di
     means = dict(state.means)
     for name, group in state.layout.groups.items():
         if name not in considered:
-            means[name] = group.compose(means[name], group.exp(error[state.layout.rows[name]]))
+            means[name] = group.retract(means[name], error[state.layout.rows[name]])
     return means
 
 
@@ -136,7 +136,7 @@ def clone(state: State, source: str, name: str) -> State:
 
     An older variable ``name`` is marginalized, and the copy takes its place.
     """
-    if name not in state:
+    if name not in state.means:
         group = state.layout.groups[source]
         state = augment(state, name, group, state[source], np.zeros((group.dim, group.dim)))
     P, copy, original = state.P.copy(), state.layout.rows[name], state.layout.rows[source]

@@ -31,8 +31,8 @@ class PoseInSpace:
     dim = 6
     compose = staticmethod(se3.compose)
     inverse = staticmethod(se3.inverse)
-    exp = staticmethod(se3.exp)
-    log = staticmethod(se3.log)
+    retract = staticmethod(se3.retract)
+    local = staticmethod(se3.local)
     adjoint = staticmethod(se3.adjoint)
 
 

@@ -37,11 +37,11 @@ class Group(Protocol):
     def inverse(self, a: FloatArray, /) -> FloatArray:
         """The element with compose(a, inverse(a)) = identity."""
 
-    def exp(self, tangent: FloatArray, /) -> FloatArray:
-        """Element of a tangent vector (dim,)."""
+    def retract(self, a: FloatArray, tangent: FloatArray, /) -> FloatArray:
+        """``a`` moved by a perturbation (dim,) on the right: a * exp(tangent)."""
 
-    def log(self, a: FloatArray, /) -> FloatArray:
-        """Tangent vector (dim,) of an element."""
+    def local(self, a: FloatArray, b: FloatArray, /) -> FloatArray:
+        """Tangent vector (dim,) that moves a to b: log(a^-1 b)."""
 
     def adjoint(self, a: FloatArray, /) -> FloatArray:
         """Matrix (dim, dim) with a * exp(t) = exp(Ad t) * a."""
@@ -54,8 +54,8 @@ class PlanarPose:
     dim = 3
     compose = staticmethod(se2.compose)
     inverse = staticmethod(se2.inverse)
-    exp = staticmethod(se2.exp)
-    log = staticmethod(se2.log)
+    retract = staticmethod(se2.retract)
+    local = staticmethod(se2.local)
     adjoint = staticmethod(se2.adjoint)
 
 
@@ -73,13 +73,13 @@ class Vector:
         """The negative."""
         return -a
 
-    def exp(self, tangent: FloatArray, /) -> FloatArray:
-        """``tangent`` itself."""
-        return tangent
+    def retract(self, a: FloatArray, tangent: FloatArray, /) -> FloatArray:
+        """The sum."""
+        return a + tangent
 
-    def log(self, a: FloatArray, /) -> FloatArray:
-        """``a`` itself."""
-        return a
+    def local(self, a: FloatArray, b: FloatArray, /) -> FloatArray:
+        """The difference."""
+        return b - a
 
     def adjoint(self, a: FloatArray, /) -> FloatArray:
         """The identity."""

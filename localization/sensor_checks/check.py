@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 from localization.events import ImuSample, Step, turn_twist
 from localization.sensor_checks.window import Window
@@ -11,6 +12,9 @@ from motion_models.se2 import Cov3, FloatArray
 
 class Check:
     """A check overrides what it needs; `SensorChecks` calls these in the order in which they stand here."""
+
+    is_of_declared_faults: ClassVar[bool] = False
+    """`apply` changes nothing before a fault has been declared."""
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Take ``sample``."""

@@ -46,7 +46,9 @@ class SensorChecks:
             Standstill(faults, window, step_config),
             self._disagreement,
         )
-        self._preparing, self._comparing_estimates = self._that_override("prepare"), self._that_override("compare_estimate")
+        self._preparing, self._comparing = self._that_override("prepare"), self._that_override("compare")
+        self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
+        self._watching = tuple(check for check in self._applying if not check.is_of_declared_faults)
         self._consistency, self._places = Consistency(faults), KnownPlaces(faults)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
@@ -70,10 +72,10 @@ class SensorChecks:
             step = check.prepare(step)
         self._inflation.add_step(step)
         if self._window.add(step, self._faults.now_s):
-            agreements = [check.compare(self._window) for check in self._checks]
+            agreements = [check.compare(self._window) for check in self._comparing]
             if all(agreements):
                 self._inflation.restart()
-        for check in self._checks:
+        for check in self._applying if self._faults.declared else self._watching:
             step = check.apply(step)
         self._step = step
         return step

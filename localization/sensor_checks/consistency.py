@@ -158,7 +158,7 @@ class Consistency:
     def _difference(self, episode: _Episode) -> FloatArray:
         """(3,) of the dead reckoning from the estimate since the begin of ``episode``."""
         moved = se2.between(episode.poses, self._poses)
-        return se2.log(se2.between(moved[_ESTIMATED], moved[episode.reckoning]))
+        return se2.local(moved[_ESTIMATED], moved[episode.reckoning])
 
     def _compare(self, pair: Pair) -> None:
         """Report whether ``pair`` differs now, and begin or end an episode."""
@@ -198,7 +198,7 @@ class Consistency:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
         if not self._faults.declared:
             return False
-        found = [self._faults.found[other].at_s for other in named if other in self._faults]
+        found = [self._faults.found[other].at_s for other in named if other in self._faults.declared]
         if not found:
             return False
         episode = self._episodes.get(fault)

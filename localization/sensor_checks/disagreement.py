@@ -114,7 +114,7 @@ class MotionDistance:
     @property
     def difference(self) -> FloatArray | None:
         """Difference of the motion by the wheels from that by the estimate (3,), since they began to disagree; None where they agree."""
-        return None if self._motions is None else se2.log(se2.between(self._motions[1], self._motions[0]))
+        return None if self._motions is None else se2.local(self._motions[1], self._motions[0])
 
     def restart(self) -> None:
         """A difference that lasts is measured from here on."""
@@ -128,7 +128,7 @@ class MotionDistance:
             self._motions = se2.compose(self._motions[0], wheels), se2.compose(self._motions[1], delta)
         if step.scan is None or not step.has_wheels or step.is_standing:
             return
-        off = se2.log(se2.between(wheels, delta))
+        off = se2.local(wheels, delta)
         square = max(float(off @ np.linalg.solve(step.cov + _SCAN_NOISE, off)), nis or 0.0)
         self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), wheels, delta))
         while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:

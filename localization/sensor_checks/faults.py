@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -48,8 +48,9 @@ class FaultLog:
         self.inflation = inflation
         self.start_s = self.now_s = 0.0
         """Stamp of the first step's begin [s], and end of the present one after it [s]."""
+        self.declared: dict[Fault, DetectedFault] = {}
+        """Faults that were declared, and are not explained by later ones."""
         self._start_ns: int | None = None
-        self._declared: dict[Fault, DetectedFault] = {}
         self._revised: dict[Fault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
@@ -58,21 +59,13 @@ class FaultLog:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
         self.now_s = (step.end_ns - self._start_ns) * _NS
 
-    @property
-    def declared(self) -> Collection[Fault]:
-        """Faults that were declared."""
-        return self._declared.keys()
-
-    def __contains__(self, fault: Fault) -> bool:
-        return fault in self._declared
-
     def declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
-        if fault in self._declared or any(other.explains == fault for other in self._declared):
+        if fault in self.declared or any(other.explains == fault for other in self.declared):
             return
-        self._declared[fault] = DetectedFault(fault, max(at_s, 0.0), fault.message.format(**numbers))
+        self.declared[fault] = DetectedFault(fault, max(at_s, 0.0), fault.message.format(**numbers))
         if fault.explains is not None:
-            self._declared.pop(fault.explains, None)
+            self.declared.pop(fault.explains, None)
         if fault.reference is not None:
             self.inflation.add_distance_from(fault.reference)
 
@@ -87,7 +80,7 @@ class FaultLog:
     @property
     def found(self) -> dict[Fault, DetectedFault]:
         """All so far, those last whose numbers change."""
-        return {**self._declared, **self._revised}
+        return {**self.declared, **self._revised}
 
     @property
     def latest_s(self) -> float:

@@ -51,7 +51,7 @@ class CovarianceInflation:
         """Inflate by how far the estimate is from ``reference``."""
         if self.are_wheels_outvoted:
             return
-        self.add(se2.log(se2.between(self._estimated, self._by_wheels if reference == "wheels" else self._by_gyro)))
+        self.add(se2.local(self._estimated, self._by_wheels if reference == "wheels" else self._by_gyro))
 
     def add(self, difference: FloatArray) -> None:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from motion_models.se2 import FloatArray
 
-BIN_S = 0.25
+BIN_S = 0.5
 WINDOWS_S = (2.0, 10.0, 60.0)
 _MIN_FILLED = 0.9
 """Part of a window that must have been measured."""
@@ -41,7 +41,7 @@ Causes = Sequence[tuple[int, Callable[[float], str]]]
 
 
 class Bin(NamedTuple):
-    """Sums up to the end of a quarter of a second or more, since the first."""
+    """Sums up to the end of half a second or more, since the first."""
 
     end_s: float
     innovation: float

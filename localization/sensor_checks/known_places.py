@@ -90,7 +90,7 @@ class KnownPlaces:
         motion = None if profile is None else align_from(self._places[best].profile, profile, motions[best], _MIN_INLIERS)
         if motion is None or not motion.has_translation:
             return None
-        off, A = se2.log(se2.between(motions[best], motion.delta)), se2.adjoint(se2.inverse(motion.delta))
+        off, A = se2.local(motions[best], motion.delta), se2.adjoint(se2.inverse(motion.delta))
         return np.asarray(A @ self._places[best].spread @ A.T + np.outer(off, off))
 
 

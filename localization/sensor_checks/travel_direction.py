@@ -41,6 +41,8 @@ _MAX_CURVATURE_RAD_M = 0.6
 class TravelDirection(Check):
     """Leaves out scans while most comparisons show another direction than the wheels."""
 
+    is_of_declared_faults = True
+
     def __init__(self, faults: FaultLog) -> None:
         self._faults = faults
         self._off, self._far_off = Evidence(_MEMORY_S), Evidence()
@@ -60,7 +62,7 @@ class TravelDirection(Check):
 
     def apply(self, step: Step) -> Step:
         """``step`` without its scan."""
-        return without_scan(step) if LIDAR_DIRECTION in self._faults and self._is_contradicted else step
+        return without_scan(step) if LIDAR_DIRECTION in self._faults.declared and self._is_contradicted else step
 
     @property
     def _is_contradicted(self) -> bool:

@@ -74,6 +74,8 @@ Numbers = Mapping[str, float | str]
 class TurnRates(Check):
     """Leaves out what contradicts the other sensors in most comparisons of the last seconds."""
 
+    is_of_declared_faults = True
+
     def __init__(self, faults: FaultLog, config: StepConfig) -> None:
         self._faults, self._velocity = faults, UnknownVelocity(config)
         self._evidence = {
@@ -118,22 +120,16 @@ class TurnRates(Check):
 
 
 class _Relation(NamedTuple):
-    """How the turn rates of two sensors relate: correlation, and ratio of the second to the first."""
+    """How the turn rates of two sensors relate."""
 
-    correlation: float
-    ratio: float
-    is_excited: bool
-    """Both turn enough for a scale."""
+    is_equal: bool
+    """Both turn enough for a scale, and alike."""
     is_opposite: bool
     unit_ratio: float
     """Ratio of the second to the first that only a wrong unit explains; 0 where there is none."""
 
-    @property
-    def is_equal(self) -> bool:
-        return self.is_excited and self.correlation >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= self.ratio <= _MAX_EQUAL_RATIO
 
-
-_NO_RELATION = _Relation(0.0, 1.0, False, False, 0.0)
+_NO_RELATION = _Relation(False, False, 0.0)
 
 
 def _relate(a: FloatArray, b: FloatArray) -> _Relation:
@@ -150,7 +146,9 @@ def _relate(a: FloatArray, b: FloatArray) -> _Relation:
     r = float(a @ b) / len(a) / (size_a * size_b)
     is_opposite = _is_opposite(a, b) if abs(bias) > _MAX_BIAS_RAD_S else _is_opposite(a - a.mean(), b - b.mean())
     unit_ratio = _unit_ratio(a, b) or _unit_ratio(a - a.mean(), b - b.mean())
-    return _Relation(r, size_b / size_a, min(size_a, size_b) >= _MIN_EXCITED_RAD_S, is_opposite, unit_ratio)
+    is_excited, ratio = min(size_a, size_b) >= _MIN_EXCITED_RAD_S, size_b / size_a
+    is_equal = is_excited and r >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= ratio <= _MAX_EQUAL_RATIO
+    return _Relation(is_equal, is_opposite, unit_ratio)
 
 
 def _unit_ratio(a: FloatArray, b: FloatArray) -> float:

@@ -34,7 +34,7 @@ def state_at(pose=POSE):
 
 def moved(state, name, error):
     group = state.layout.groups[name]
-    return State(state.layout, {**state.means, name: group.compose(state[name], group.exp(error))}, state.P)
+    return State(state.layout, {**state.means, name: group.retract(state[name], error)}, state.P)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ def measure_scan(state: State, measured: FloatArray, R: FloatArray) -> Measureme
     "map" is the error of the submap around the robot, as a right perturbation of the pose: what a scan measures is the pose against it.
     """
     group = state.layout.groups["pose"]
-    residual = group.log(group.compose(group.inverse(state["pose"]), measured))
+    residual = group.local(state["pose"], measured)
     one = np.eye(group.dim)
     return Measurement(residual, {"pose": one, "map": -one}, R, relative=("pose", "map"), what="the pose by a scan")
 

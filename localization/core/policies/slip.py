@@ -28,14 +28,14 @@ class SweepSlip:
 
     def offset(self, step: Step) -> Tangent2:
         """(3,) from the wheels' motion to that with the last twist: where wheels stall and catch up, the robot goes on as before."""
-        return se2.log(se2.between(step.predicted.delta, se2.exp(step.duration * self._twist)))
+        return se2.local(step.predicted.delta, se2.exp(step.duration * self._twist))
 
     def refine(self, sensor: ScanMatchingSensor, step: Step, start: Pose2, match: ScanMatch) -> tuple[ScanMatch, Cov3]:
         """``match`` of the scan deskewed anew, with the slip since the pose ``start`` (3,), and its covariance (3, 3) with white slip."""
         if step.duration == 0.0:
             return match, match.cov
         if self._is_measured:  # else the pose at the start was not measured: its error would look like motion
-            slip = se2.log(se2.between(start, match.pose)) / step.duration - step.mean_twist
+            slip = se2.local(start, match.pose) / step.duration - step.mean_twist
             match = sensor.refine(match, step.twist + slip)
             self._changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
         return match, match.cov + sensor.intra_scan_slip_cov(match, self._changes.rate(step))
