@@ -27,6 +27,9 @@ from localization.calibration.wheel_fit import (
     read_motion,
     wheel_sides,
 )
+from localization.calibration.wheel_units import CORRECTED
+from localization.calibration.wheel_wiring import check_wiring
+from localization.logs import open_log
 from localization.logs.topic_names import is_measured_outside, is_other_estimate
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.drive_controllers import ControllerValues
@@ -302,6 +305,17 @@ def _mount(rotation: FloatArray, translation: FloatArray) -> Mount:
     x, y, z = (float(v) for v in translation)
     roll, pitch = math.atan2(rotation[2, 1], rotation[2, 2]), -math.asin(max(-1.0, min(1.0, float(rotation[2, 0]))))
     return Mount(x, y, z, roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0]))
+
+
+def finish_checked(draft: Draft, given: Given, path: Path, default_name: str) -> tuple[Robot, tuple[str, ...]]:
+    """The robot of a ``draft`` with what the log at ``path`` corrects of its signs, sides, units and clocks, and a sentence for each.
+
+    Where nothing in the log decides, the sentence names all causes and the robot stays as drafted. Raises what `open_log` does.
+    """
+    robot = finish_robot(draft, given, default_name)
+    found = check_wiring(open_log(path, robot))
+    texts = tuple(text.replace(CORRECTED, "Written to the robot file:") for text in found.findings)
+    return (robot if found.is_ambiguous else found.robot), texts
 
 
 def finish_robot(draft: Draft, given: Given, default_name: str) -> Robot:

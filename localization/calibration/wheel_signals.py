@@ -6,8 +6,10 @@ Nothing is clipped and no side is averaged: signs, units and sides are what is i
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +19,7 @@ from localization.lidar import LidarConfig, Sweep
 from localization.logs import Log
 from localization.logs.clouds import cloud_decoder
 from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry, scan_decoder
-from localization.logs.event_decoder import TopicDecoder, arc
+from localization.logs.event_decoder import TopicDecoder, arc, late_ns
 from localization.logs.topic_names import is_other_estimate
 from localization.logs.topic_roles import TYPES
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
@@ -38,6 +40,7 @@ _MAX_LIDAR_S = 60.0
 _GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2, _MAX_TILT_COSINE = 20, 8.0, 12.0, 0.87
 """Number of first samples, bounds of their mean specific force, and its cosine to the mount's vertical below which the mount is wrong, as
 in `localization.gyro`."""
+_DEG_PER_RAD = 180.0 / math.pi
 _JUMP_FACTOR = 8.0
 """Increment of a position over the 97th percentile of all, from which on it is a reset or a counter that wrapped."""
 
@@ -88,7 +91,8 @@ def read_signals(log: Log) -> WheelSignals | None:
     sources = _decoders(log)
     gathered: dict[str, list[Any]] = {}
     first_ns = moving_ns = first = None
-    for payload in log.readings({topic: TopicDecoder(0, _tag(topic, decode)) for topic, decode in sources.items()}):
+    late = {source.topic: late_ns(source.kind, log.robot.clock) for source in log.sources.used()}
+    for payload in log.readings({t: TopicDecoder(0, _tag(t, decode), late.get(t, 0)) for t, decode in sources.items()}):
         first_ns = payload.stamp_ns if first_ns is None else first_ns
         gathered.setdefault(payload.topic, []).append(payload.reading)
         if moving_ns is None and payload.topic == wheels.topic:
@@ -110,13 +114,18 @@ def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
         else:
             found[source.topic] = ODOMETRY_DECODERS[source.type]() if source.type else decode_odometry
     if log.sources.imu is not None:
-        unit = log.robot.imu.rate_unit_rad_s
-        found[log.sources.imu.topic] = lambda message, stamp: decode_imu(message, stamp, unit)
+        found[log.sources.imu.topic] = partial(_decode_fast_imu, unit=log.robot.imu.rate_unit_rad_s)
     reserved = {log.reference_topic, log.robot.topics.reference}
     for topic, kind in log.types.items():
         if kind == TYPES["odometry"] and topic not in reserved and not is_other_estimate(topic):
             found.setdefault(topic, decode_odometry)
     return found
+
+
+def _decode_fast_imu(message: Any, stamp: int, unit: float) -> ImuSample:
+    """As `decode_imu`, with rates that only another unit than rad/s explains."""
+    sample = decode_imu(message, stamp, unit / _DEG_PER_RAD)
+    return replace(sample, angular_velocity=_DEG_PER_RAD * sample.angular_velocity)
 
 
 def _tag(topic: str, decode: Callable[[Any, int], Any]) -> Callable[[Any, int], _Tagged | None]:
@@ -265,7 +274,7 @@ def _scan_steps(log: Log, first_ns: int, start_s: float) -> Iterator[FloatArray]
     assert source is not None
     decode = scan_decoder() if source.kind == "scan" else cloud_decoder(log.period_s.get(source.topic))
     odometry, config, last = ScanOdometry(), LidarConfig(), None
-    for scan in log.readings({source.topic: TopicDecoder(0, decode)}):
+    for scan in log.readings({source.topic: TopicDecoder(0, decode, late_ns(source.kind, log.robot.clock))}):
         assert isinstance(scan, Scan)
         at = (scan.middle_ns - first_ns) * 1e-9
         if at < start_s:

@@ -20,6 +20,8 @@ MAX_RATIO = 2.5
 _DEG = math.pi / 180.0
 _GYRO_IN_DEGREES = (25.0, 130.0)
 """Factor of a gyro in deg/s (57.3), with the factor of 2.3 by which wheels may be off on loose floor."""
+_SLOWEST_TURN_RAD_S = 0.05
+"""Largest yaw rate of a drive, at least: no robot stays below 3 deg/s in all of its turns."""
 _SIGMA_BY_SPEED, _SIGMA_BY_TURN, _SIGMA_BY_MESSAGE = 0.1, 0.3, 0.03
 """Sigma of the logarithm of a unit: by a measured speed (radius), by the gyro (k, track), by positions of the same messages."""
 _SIGMAS = 1.5
@@ -73,16 +75,43 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
         "positions": _measure(signals, signals.angle_rates, robot),
     }
     ratios = {f"{what} by {unit.source}": unit.value for what, unit in measured.items() if unit is not None}
-    wrong = {what: unit for what, unit in measured.items() if unit is not None and not 1 / MAX_RATIO <= unit.value <= MAX_RATIO}
     report = UnitReport(robot, ratios=ratios)
-    by_gyro = [unit for unit in wrong.values() if unit.by_gyro]
-    known = [unit for unit in measured.values() if unit is not None]
-    if by_gyro and len(by_gyro) == len(known) and all(is_in_degrees(u.value) for u in by_gyro):
-        return gyro_in_degrees(report, by_gyro[0].value)
+    by_gyro = _gyro_factor(signals, robot, measured)
+    if by_gyro is not None:
+        return gyro_in_degrees(report, by_gyro)
+    wrong = {what: unit for what, unit in measured.items() if unit is not None and not 1 / MAX_RATIO <= unit.value <= MAX_RATIO}
     right = next((what for what, unit in measured.items() if unit is not None and what not in wrong), None)
     for what, unit in wrong.items():
         report = _name_unit(report, signals, what, unit if right is None else _of_messages(signals, what) or unit)
     return _name_range(report, signals)
+
+
+def _gyro_factor(signals: WheelSignals, robot: Robot, measured: Mapping[str, _Unit | None]) -> float | None:
+    """Factor of a gyro that can only be in deg/s, given the units that were ``measured`` of the wheels; None for another.
+
+    A speed measures the wheels' unit, so that the gyro's follows. Without one, all wheels disagree with the gyro by one factor, and the
+    gyro is in deg/s unless the robot would hardly turn then: small wheels in metres have a like factor.
+    """
+    known = [unit for unit in measured.values() if unit is not None]
+    if not known or "gyro" not in signals.turns:
+        return None
+    if not known[0].by_gyro:
+        turned = _by_turns(signals, signals.rates if measured["velocities"] else signals.angle_rates, robot, "gyro")
+        factor = 0.0 if turned is None else turned / known[0].value
+        return factor if is_in_degrees(factor) else None
+    fastest = float(np.nanmax(np.abs(signals.turns["gyro"])))
+    is_fast = fastest * _DEG > _SLOWEST_TURN_RAD_S
+    return known[0].value if is_fast and all(is_in_degrees(unit.value) for unit in known) else None
+
+
+def _by_turns(signals: WheelSignals, rates: FloatArray, robot: Robot, source: str) -> float | None:
+    """Factor from the turns by ``rates`` (n, joints) to those of a ``source``; None where they do not follow each other."""
+    turn = signals.turns.get(source)
+    if turn is None:
+        return None
+    left, right = rates[:, : signals.left].mean(axis=1), rates[:, signals.left :].mean(axis=1)
+    scale = expected_scaling(robot) * robot.geometry.wheel_radius_m / robot.geometry.track_width_m
+    return _ratio(scale * (right - left), turn)
 
 
 def _measure(signals: WheelSignals, rates: FloatArray, robot: Robot) -> _Unit | None:
@@ -90,14 +119,13 @@ def _measure(signals: WheelSignals, rates: FloatArray, robot: Robot) -> _Unit | 
     if not np.isfinite(rates).any():
         return None
     left, right = rates[:, : signals.left].mean(axis=1), rates[:, signals.left :].mean(axis=1)
-    radius, track = robot.geometry.wheel_radius_m, robot.geometry.track_width_m
+    radius = robot.geometry.wheel_radius_m
     for name in sorted(signals.speeds, key=lambda source: source != "LiDAR"):
         ratio = _ratio(0.5 * radius * (left + right), signals.speeds[name])
         if ratio is not None:
             return _Unit(ratio, _SIGMA_BY_SPEED, f"the speed of {name}", by_gyro=False)
     for name in ("gyro", "LiDAR"):
-        turn = signals.turns.get(name)
-        ratio = None if turn is None else _ratio(expected_scaling(robot) * radius / track * (right - left), turn)
+        ratio = _by_turns(signals, rates, robot, name)
         if ratio is not None:
             return _Unit(ratio, _SIGMA_BY_TURN, f"the {name}'s turns", by_gyro=name == "gyro")
     return None

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.calibration.wheel_signals import WheelSignals, lidar_motion, read_signals
+from localization.calibration.wheel_signals import STEP_S, WheelSignals, lidar_motion, read_signals
 from localization.calibration.wheel_units import CORRECTED, UnitReport, check_units, expected_scaling, gyro_in_degrees, is_in_degrees
 from localization.logs import Log, TopicOverrides, open_log
 from motion_models.errors import CalibrationError
@@ -37,6 +37,10 @@ _UNKNOWN_YAW_RAD2_PER_RAD, _UNKNOWN_WAY_M2_PER_M = 4.0 * math.pi, 40.0
 (4 x^2)."""
 _SAME_TURN, _OTHER_TURN = 0.05, 0.3
 """A driver's turn is the gyro's, and is not what the robot file's multiplier has: relative differences."""
+_MAX_CLOCK_S = 10.0
+"""Largest offset between the clocks of wheels and gyro that is searched [s]; beyond, clocks are set by the times of recording."""
+_MAX_UNSHIFTED = 0.85
+"""Correlation without an offset below which one is searched: whole drives of healthy logs have 0.95 and more."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -103,19 +107,23 @@ def open_wired(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOve
     return log
 
 
-def check_wiring(log: Log) -> WiringReport:
-    """Compare wheels, gyro, LiDAR and the driver's odometry of ``log`` with its robot file."""
+def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
+    """Compare wheels, gyro, LiDAR and the driver's odometry of ``log`` with its robot file; the clock of the gyro unless it
+    ``is_clock_known``."""
     signals = read_signals(log)
     if signals is None:
         return WiringReport(log.robot)
     if not signals.joints:
-        return _check_odometry(log, signals)
-    signals, found = _wiring_of(log, signals)
+        return _check_odometry(log, signals, is_clock_known)
+    signals, found = _wiring_of(log, signals, is_clock_known)
     if found.is_ambiguous:
         return found
     # as the corrected robot has them
     if found.keys:
-        signals = read_signals(open_log(log.path, found.robot, log.overrides)) or signals
+        log = open_log(log.path, found.robot, log.overrides)
+        signals = read_signals(log) or signals
+    if any(key.startswith("clock.") for key in found.keys):
+        return _joined(found, check_wiring(log, is_clock_known=True))
     units = check_units(signals, found.robot)
     if units.is_ambiguous or (units.findings and log.sources.lidar is not None and "LiDAR" not in signals.speeds):
         signals = with_lidar(log, signals)
@@ -126,14 +134,72 @@ def check_wiring(log: Log) -> WiringReport:
     return WiringReport(robot, sentences, {**found.keys, **units.keys}, units.is_ambiguous, {**found.correlations}, units.ratios)
 
 
+def _joined(first: WiringReport, then: WiringReport) -> WiringReport:
+    return replace(then, findings=(*first.findings, *then.findings), keys={**first.keys, **then.keys})
+
+
+def _other_clock(log: Log, signals: WheelSignals, offset_s: float) -> WiringReport:
+    """A gyro whose stamps are later than the wheels' by ``offset_s``; the wheels' are wrong where a LiDAR has the gyro's."""
+    signals = with_lidar(log, signals)
+    by_lidar = None
+    if "LiDAR" in signals.turns:
+        by_lidar = correlation(signals.turns["gyro"], signals.turns["LiDAR"], _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    is_wheels = by_lidar is not None and abs(by_lidar) >= _SURE_CORRELATION
+    name, clock = ("wheel_time_offset_s" if is_wheels else "gyro_time_offset_s"), log.robot.clock
+    value = round(getattr(clock, name) + (-offset_s if is_wheels else offset_s), 2)
+    wheels = " and ".join(source.topic for source in log.sources.all_wheels)
+    imu = "the gyro" if log.sources.imu is None else log.sources.imu.topic
+    text = (
+        f"{imu} measures the turns of {wheels} {abs(offset_s):.1f} s {'later' if offset_s > 0.0 else 'earlier'} by its stamps"
+        f"{', and the LiDAR as the gyro does' if is_wheels else ''}: the clocks of two computers, or stamps of arrival. {CORRECTED}"
+        f" clock.{name} = {value:g}, or synchronize the clocks."
+    )
+    robot = replace(log.robot, clock=replace(clock, **{name: value}))
+    return WiringReport(robot, (text,), {f"clock.{name}": f"{value:g}"})
+
+
+def clock_offset(turn: FloatArray, other: FloatArray | None) -> float | None:
+    """By how much later [s] ``other`` (n,) has the turns of ``turn`` (n,), of either sign, on intervals of `STEP_S`.
+
+    None unless both differ without an offset and are alike with one that no other comes near.
+    """
+    if other is None:
+        return None
+    at_zero = correlation(turn, other, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    if at_zero is None or abs(at_zero) >= _MAX_UNSHIFTED:
+        return None
+    shifts = np.arange(-round(_MAX_CLOCK_S / STEP_S), round(_MAX_CLOCK_S / STEP_S) + 1)
+    found = np.array([abs(_correlation_shifted(turn, other, int(shift))) for shift in shifts])
+    best = int(found.argmax())
+    rivals = found[np.abs(shifts - shifts[best]) > 2]
+    if found[best] < _SURE_CORRELATION or 1.0 - rivals.max() < 2.0 * (1.0 - found[best]):
+        return None
+    before, at, after = found[max(best - 1, 0)], found[best], found[min(best + 1, len(found) - 1)]
+    bend = before - 2.0 * at + after
+    vertex = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    return float((shifts[best] + np.clip(vertex, -0.5, 0.5)) * STEP_S)
+
+
+def _correlation_shifted(turn: FloatArray, other: FloatArray, shift: int) -> float:
+    """Correlation of ``turn`` with what ``other`` has ``shift`` intervals later; 0 where too little is left."""
+    n = len(turn) - abs(shift)
+    if n < len(turn) // 2:
+        return 0.0
+    ours, theirs = (turn[:n], other[shift:]) if shift >= 0 else (turn[-shift:], other[:n])
+    return correlation(ours, theirs, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S) or 0.0
+
+
 def _with_unknown_signs(robot: Robot) -> Robot:
     noise = replace(robot.wheel_noise, yaw_rad2_per_rad=_UNKNOWN_YAW_RAD2_PER_RAD, longitudinal_m2_per_m=_UNKNOWN_WAY_M2_PER_M)
     return replace(robot, wheel_noise=noise)
 
 
-def _wiring_of(log: Log, signals: WheelSignals) -> tuple[WheelSignals, WiringReport]:
+def _wiring_of(log: Log, signals: WheelSignals, is_clock_known: bool) -> tuple[WheelSignals, WiringReport]:
     base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
     rates = signals.joint_rates
+    offset_s = None if is_clock_known else clock_offset(_signed(rates, base)[1], signals.turns.get("gyro"))
+    if offset_s is not None:
+        return signals, _other_clock(log, signals, offset_s)
     if not (signals.turns or signals.speeds) or not _is_accepted(signals, rates, base):
         signals = with_lidar(log, signals)
     measured = correlations(signals, rates, base)
@@ -147,7 +213,7 @@ def _wiring_of(log: Log, signals: WheelSignals) -> tuple[WheelSignals, WiringRep
     return signals, _certain(log, signals, found[0], measured)
 
 
-def _check_odometry(log: Log, signals: WheelSignals) -> WiringReport:
+def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
     """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's."""
     assert log.sources.wheels is not None
     topic = log.sources.wheels.topic
@@ -157,6 +223,10 @@ def _check_odometry(log: Log, signals: WheelSignals) -> WiringReport:
     r = correlation(turn, gyro, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
     if r is None:
         return WiringReport(log.robot)
+    offset_s = None if is_clock_known else clock_offset(turn, gyro)
+    if offset_s is not None:
+        found = _other_clock(log, signals, offset_s)
+        return _joined(found, check_wiring(open_log(log.path, found.robot, log.overrides), is_clock_known=True))
     measured = {f"turn of {topic} by the gyro": r}
     if r > -_SURE_CORRELATION:
         return _check_multiplier(log, float(np.nansum(turn * gyro) / max(np.nansum(turn**2), 1e-12)), measured)

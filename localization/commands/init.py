@@ -15,7 +15,7 @@ from rich.prompt import Confirm, Prompt
 
 from localization.calibration.log_survey import Survey, survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
-from localization.calibration.robot_setup import draft_robot, finish_robot
+from localization.calibration.robot_setup import draft_robot, finish_checked
 from localization.commands.calibrate import Calibrate
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from localization.logs import TopicOverrides
@@ -126,8 +126,11 @@ class Init:
         if absent:
             options = ", ".join("--" + name.replace("_", "-") for name in absent)
             raise RobotError(f"{survey.name} and the options have no {', '.join(absent)}; measure and give {options}, or name a --urdf.")
-        robot = finish_robot(draft, given, self.out.stem)
-        remarks = [f"Written by skidloc init from {survey.name}.", *draft.reasons, *(f"MISSING: {gap}" for gap in draft.missing)]
+        robot, wiring = finish_checked(draft, given, self.log, self.out.stem)
+        for text in wiring:
+            print_line(console, f"! {text}")
+        gaps = [*draft.missing, *wiring]
+        remarks = [f"Written by skidloc init from {survey.name}.", *draft.reasons, *(f"MISSING: {gap}" for gap in gaps)]
         remarks += [f"CONTRADICTION: {c.quantity} = {c.value} ({c.source}); the log: {c.by_log}" for c in draft.contradictions]
         text = robot_toml(robot, remarks="\n".join(remarks))
         parse_robot(text, str(self.out))  # refuses what no robot can have before it is written

@@ -104,7 +104,7 @@ class EventDecoder:
         cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
         self._check_cg = partial(check_tipping, geometry=robot.geometry, topic=cg_topic, oddity=Oddity.TIPPING_CG, stats=stats)
         self.decoders: Mapping[str, TopicDecoder] = {
-            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source), _late_ns(source.kind, robot.clock))
+            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source), late_ns(source.kind, robot.clock))
             for source in sources.used()
         }
         """By topic."""
@@ -161,7 +161,8 @@ def _with_true_ranges(points: FloatArray, lidar: Lidar) -> FloatArray:
     return np.asarray(points * (true / np.maximum(ranges, 1e-9))[:, None])
 
 
-def _late_ns(kind: str, clock: Clock) -> int:
+def late_ns(kind: str, clock: Clock) -> int:
+    """By how much the stamps of a topic in the role ``kind`` are late [ns]."""
     seconds = {
         "joint_states": clock.wheel_time_offset_s,
         "odometry": clock.wheel_time_offset_s,

@@ -21,10 +21,10 @@ from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
 from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
-from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item
+from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item, late_ns
 from localization.logs.references import reference_decoder
 from localization.logs.serialization import LogDeserializer
-from localization.logs.topic_names import find_in_namespace
+from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, odometry_edge
@@ -103,12 +103,16 @@ class Log:
 
     @property
     def reference_topic(self) -> str | None:
-        """The option's reference, else the robot file's, else GPS by its usual name; if the log has it and if it can be one."""
+        """The option's reference, else the robot file's, else GPS by its usual name, else the only topic that by its name is measured from
+        outside; if the log has it and if it can be one."""
         asked = self._overrides.reference
         names = (self.robot.topics.reference, _GPS) if asked is None else (asked,)
         there = self._chooser.of_type(*REFERENCE_TYPES)
         named = next((name for name in names if name in there), None)
-        return named if named is not None or asked is not None else find_in_namespace(self.robot.topics.reference, there)
+        if named is not None or asked is not None:
+            return named
+        outside = [topic for topic in there if is_measured_outside(topic)]
+        return find_in_namespace(self.robot.topics.reference, there) or (outside[0] if len(outside) == 1 else None)
 
     @property
     def no_wheels(self) -> str:
@@ -238,13 +242,14 @@ class Log:
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:
         first: dict[str, list[FirstMessage]] = {}
+        late = {source.topic: late_ns(source.kind, self.robot.clock) for source in self.sources.used()}
         for topic in topics:
             found = first[topic] = []
             for log_ns, message in self._first_messages(topic, 2 * FIRST_MESSAGES):
                 frame = frame_name(message.header.frame_id)
                 self.frames.setdefault(topic, frame)
                 if stamp_ns(message):
-                    found.append(FirstMessage(log_ns, stamp_ns(message), frame))
+                    found.append(FirstMessage(log_ns, stamp_ns(message) - late.get(topic, 0), frame))
                 if len(found) >= FIRST_MESSAGES or (len(found) > 2 and log_ns - found[0].log_ns > _FIRST_READ_NS):
                     break
         return plan_clocks(first)
