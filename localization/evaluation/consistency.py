@@ -4,8 +4,9 @@ A consistent estimator's normalised squared errors ``e^T P^-1 e`` follow chi-squ
 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 5.4). NEES takes errors against the
 truth, NIS innovations against their predicted covariance. Both are needed: innovations can be consistent while the state is not.
 
-The bands are for independent samples. Innovations of a consistent filter are independent; pose errors along one run are not (this
-second's error is the last one's plus a little), so one run counts as one sample however long it is.
+The bands are for independent samples. Innovations of a consistent filter are independent; pose errors along one run are not: this second's
+error is the last one's plus a little. How many independent samples they are worth follows from their own autocorrelation
+(`independent_samples`): one for an offset that stays, two for a random walk, hundreds for a robot that localizes itself in a map.
 
 Singular covariances: a direction of zero variance has no information. Where the error is zero too, it is not counted (one degree of
 freedom less); where it is not, the square is infinite (a plain pseudo-inverse would take it as zero). Zero is to rounding: each component
@@ -31,6 +32,8 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _MAX_ZERO_EIGENVALUE = 1e-12  # of the largest
+_MIN_STEP_M, _MIN_STEP_RAD = 0.01, 0.01
+"""Steps from where on a robot has moved: below, its error is the one that it had."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Consistency:
 
     n: int
     """Samples that count (those with at least one degree of freedom)."""
-    n_independent: int
+    n_independent: float
     """How many of them the band takes as independent."""
     dof: float
     """Mean degrees of freedom per sample: what the mean should be."""
@@ -65,6 +68,12 @@ class Consistency:
     """Part of the samples below the 95 % quantile of their own chi-square distribution; 0.95 if consistent."""
     probability: float
     whiteness: Whiteness | None = None
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a mean at least as far from the expected one, on either side, if the covariances are consistent."""
+        below = float(chi2.cdf(self.mean * self.n_independent, self.n_independent * self.dof))
+        return 2.0 * min(below, 1.0 - below)
 
     @property
     def verdict(self) -> Literal["consistent", "overconfident", "conservative"]:
@@ -93,10 +102,10 @@ def degrees_of_freedom(covariances: ArrayLike) -> NDArray[np.int64]:
     return normalize(np.zeros(p.shape[:-1]), p)[1]
 
 
-def mean_band(n: int, dof: float, probability: float = 0.95) -> tuple[float, float]:
+def mean_band(n: float, dof: float, probability: float = 0.95) -> tuple[float, float]:
     """Two-sided band of the mean of ``n`` independent chi-square variables of ``dof`` degrees of freedom each."""
     if n < 1 or dof <= 0.0 or not 0.0 < probability < 1.0:
-        raise EvaluationError(f"no band for {n} samples of {dof:g} degrees of freedom at probability {probability:g}.")
+        raise EvaluationError(f"no band for {n:g} samples of {dof:g} degrees of freedom at probability {probability:g}.")
     tail = 0.5 * (1.0 - probability)
     low, high = chi2.ppf([tail, 1.0 - tail], n * dof) / n
     return float(low), float(high)
@@ -106,7 +115,7 @@ def consistency(
     errors: ArrayLike,
     covariances: ArrayLike,
     probability: float = 0.95,
-    n_independent: int | None = None,
+    n_independent: float | None = None,
     whiteness: bool = False,
 ) -> Consistency:
     """Test errors (N, d), or (R, N, d) of R runs, against their covariances of shape (..., d, d).
@@ -134,6 +143,31 @@ def consistency(
         probability=probability,
         whiteness=lag1_whiteness(e, p, probability) if whiteness else None,
     )
+
+
+def independent_samples(whitened: FloatArray, weights: FloatArray | None = None) -> float:
+    """Number of independent samples whose mean square varies as that of these errors (N, d) of unit covariance along one run.
+
+    Squares of Gaussians with the correlation rho have the correlation rho^2, so that the mean over samples with ``weights`` w (N,) has the
+    variance 2 d sum_ij w_i w_j rho_ij^2 / (sum w)^2, which independent ones have in the number of 1 over that without 2 d (Bartlett 1946;
+    Satterthwaite 1946 for the band). The autocorrelation is estimated about zero, by lag, up to its first zero (Geyer 1992).
+    It does not depend on the size of the covariances. At least 1.
+    """
+    n = len(whitened)
+    w = np.ones(n) if weights is None else weights
+    lagged = _autocovariance(whitened).sum(axis=1)
+    if n < 2 or lagged[0] <= 0.0:
+        return 1.0
+    rho = np.minimum(lagged / lagged[0] * n / (n - np.arange(n)), 1.0)
+    rho[int(np.argmax(rho <= 0.0)) if (rho <= 0.0).any() else n :] = 0.0
+    pairs = _autocovariance(w[:, None])[:, 0]
+    return float(w.sum() ** 2 / (pairs[0] + 2.0 * np.sum(pairs[1:] * rho[1:] ** 2)))
+
+
+def _autocovariance(values: FloatArray) -> FloatArray:
+    """(N, d) sums over i of ``values[i] * values[i + k]`` by lag k, of values (N, d)."""
+    n = len(values)
+    return np.asarray(np.fft.irfft(np.abs(np.fft.rfft(values, 2 * n, axis=0)) ** 2, 2 * n, axis=0)[:n])
 
 
 def mean_over_runs(values: ArrayLike, dof: float, probability: float = 0.95) -> tuple[FloatArray, tuple[float, float]]:
@@ -174,6 +208,8 @@ class PoseErrors:
     """(N, 3, 3) covariances of the estimator, or None if it has none."""
     n_left_out: int = 0
     """Matches left out: before the first motion, and where the growth of the covariance since the first match is no covariance."""
+    motions: FloatArray | None = None
+    """(N, 3) estimated motion since the first match [m, m, rad]."""
 
 
 def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float = 1.0) -> PoseErrors:
@@ -196,7 +232,7 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
     errors, stamps = se2.log(se2.between(d, r)), part.stamps_ns[1:]
     known = trajectory.covariances_at(part.stamps_ns)
     if known is None:
-        return PoseErrors(stamps, errors, None)
+        return PoseErrors(stamps, errors, None, motions=d)
     grown = known[1:] - _moved(known[0], d)
     stands = (np.abs(d).max(axis=1) < 1e-9) & (np.abs(grown).max(axis=(1, 2)) < 1e-15)
     use = is_covariance(grown) & ~stands
@@ -204,19 +240,86 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
     if part.covariances is not None:
         noise = covariances_in_body(part.covariances, truth[:, 2])
         grown = grown + noise[1:] + _moved(noise[0], r)
-    return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)))
+    return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)), d[use])
+
+
+def _is_moved(poses: FloatArray) -> NDArray[np.bool_]:
+    """(N,) whether the robot has moved since the last of ``poses`` (N, 3) of which this is true: while it stands, its error stays."""
+    found = np.zeros(len(poses), dtype=bool)
+    last = None
+    for i, pose in enumerate(poses):
+        if last is None or np.abs(pose[:2] - last[:2]).max() > _MIN_STEP_M or abs(pose[2] - last[2]) > _MIN_STEP_RAD:
+            found[i], last = True, pose
+    return found
 
 
 def pose_consistency(
     trajectory: Trajectory, reference: ReferenceTrack, probability: float = 0.95, max_gap_s: float = 1.0
 ) -> Consistency | None:
-    """NEES of a trajectory along one run, which counts as one independent sample; None without covariances, headings or motion to test."""
+    """NEES of a trajectory along one run, 3 expected; None without covariances, headings or motion to test.
+
+    The band is that of as many independent samples as the errors are worth (`independent_samples`).
+    """
     if trajectory.covariances is None or reference.yaws is None:
         return None
     found = pose_errors(trajectory, reference, max_gap_s)
     if found.covariances is None or not found.covariances.any():
         return None
-    return consistency(found.errors, found.covariances, probability, n_independent=1)
+    return _along_one_run(found, probability)
+
+
+def _along_one_run(found: PoseErrors, probability: float) -> Consistency:
+    assert found.covariances is not None
+    assert found.motions is not None
+    errors, covariances = found.errors, found.covariances
+    if errors.shape[1] == 3:  # an offset in the plane stays, while its components in the body turn with the robot
+        c, s, o = np.cos(found.motions[:, 2]), np.sin(found.motions[:, 2]), np.zeros(len(errors))
+        start_R_body = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)
+        errors = np.einsum("nij,nj->ni", start_R_body, errors)
+        covariances = start_R_body @ covariances @ np.swapaxes(start_R_body, 1, 2)
+    _, dof, whitened = normalize(errors, covariances)
+    use = dof > 0
+    starts = np.flatnonzero(_is_moved(found.motions) & use)
+    weights = np.diff(np.append(np.searchsorted(np.flatnonzero(use), starts), np.count_nonzero(use))).astype(float)
+    n = independent_samples(whitened[starts], weights) if len(starts) else 1.0
+    return consistency(found.errors, found.covariances, probability, n_independent=n)
+
+
+def position_consistency(
+    trajectory: Trajectory, reference: ReferenceTrack, lever_sigma_m: float = 0.0, probability: float = 0.95, max_gap_s: float = 1.0
+) -> Consistency | None:
+    """NEES of a trajectory by positions without headings: of its distances from the first match, 1 expected.
+
+    Where the start lies and which way the robot faced there is unknown, and distances do not depend on it. With the estimated displacement
+    d and the positions' displacement r the error is ``|r| - |d|``, of variance ``u^T (P_d + R_k + R_0) u`` along u = d / |d|, plus
+    ``2 (1 - cos dyaw) lever_sigma_m^2`` for an antenna that is somewhere around the body frame's origin. Displacements shorter than five
+    sigma of the positions have no direction and are left out. None without covariances of both, or without motion.
+    """
+    if trajectory.covariances is None or reference.covariances is None:
+        return None
+    estimate, part = match(trajectory, reference, max_gap_s)
+    known = trajectory.covariances_at(part.stamps_ns)
+    assert known is not None
+    assert part.covariances is not None
+    d = se2.between(estimate[0], estimate[1:])
+    grown = known[1:] - _moved(known[0], d)
+    c, s = np.cos(d[:, 2]), np.sin(d[:, 2])
+    start_R_body = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
+    in_start = start_R_body @ grown[:, :2, :2] @ np.swapaxes(start_R_body, 1, 2)
+    noise = np.trace(part.covariances[:, :2, :2], axis1=1, axis2=2) / 2.0
+    length = np.hypot(d[:, 0], d[:, 1])
+    of_positions = noise[1:] + noise[0]
+    along = d[:, :2] / np.maximum(length, 1e-12)[:, None]
+    variance = np.einsum("ni,nij,nj->n", along, in_start, along) + of_positions + 2.0 * (1.0 - c) * lever_sigma_m**2
+    variance += trajectory.interpolation_errors_at(part.stamps_ns[1:])[:, 0] ** 2
+    use = is_covariance(grown) & np.isfinite(variance) & (length > 5.0 * np.sqrt(of_positions)) & (length > _MIN_STEP_M) & (variance > 0.0)
+    if not use.any():
+        return None
+    # noise across a displacement makes it longer by sigma^2 / (2 l) in the mean
+    measured = np.hypot(*(part.positions[1:] - part.positions[0]).T)
+    errors = measured - length - of_positions / (2.0 * np.maximum(length, _MIN_STEP_M))
+    found = PoseErrors(part.stamps_ns[1:][use], errors[use, None], variance[use, None, None], int(np.count_nonzero(~use)), d[use])
+    return _along_one_run(found, probability)
 
 
 def _moved(covariance: FloatArray, motions: FloatArray) -> FloatArray:

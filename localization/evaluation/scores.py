@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from localization.evaluation.consistency import pose_consistency
+from localization.evaluation.consistency import Consistency, pose_consistency, position_consistency
 from localization.evaluation.metrics import Accuracy, evaluate
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.pipeline import Run
+
+_LEVER_SIGMA_M = 0.3
+"""Sigma of where on the robot a reference without headings measures: antennas are within half a metre of the middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,10 @@ class Result:
     Of the filtered poses, where the trajectory is smoothed."""
     filtered: Accuracy | None = None
     """Accuracy of the filtered poses, where the run's trajectory is smoothed."""
+    nees_band: tuple[float, float] | None = None
+    """Where `nees_mean` is in 95 % of drives of consistent covariances, for as many independent samples as this drive has."""
+    position_nees: Consistency | None = None
+    """NEES of distances from the start, 1 expected, where the reference has positions and their covariances, but no headings."""
     contradictions: tuple[str, ...] = ()
     """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
 
@@ -55,6 +62,9 @@ class Result:
             "corrections": self.run.corrections,
             **{name: numbers.pop(name) for name in first},
             "nees_mean": self.nees_mean,
+            "nees_band": None if self.nees_band is None else list(self.nees_band),
+            "position_nees_mean": None if self.position_nees is None else self.position_nees.mean,
+            "position_nees_band": None if self.position_nees is None else list(self.position_nees.band),
             "nis_mean": self.nis_mean,
             "moments": None if self.filtered is None else self.filtered.numbers(),
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
@@ -90,6 +100,11 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None, contradiction
         return Result(run, None, None)
     accuracy = evaluate(run.trajectory, reference)
     filtered = run.trajectory if run.filtered is None else run.filtered  # their errors grow by increments, as the NEES here assumes
-    found = None if isinstance(reference, Relations) or contradictions else pose_consistency(filtered, reference)
     published = None if run.filtered is None else evaluate(run.filtered, reference)
-    return Result(run, accuracy, None if found is None else found.mean, published, contradictions)
+    if isinstance(reference, Relations) or contradictions:
+        return Result(run, accuracy, None, published, contradictions=contradictions)
+    found = pose_consistency(filtered, reference)
+    by_distances = position_consistency(filtered, reference, _LEVER_SIGMA_M) if reference.yaws is None else None
+    if found is None:
+        return Result(run, accuracy, None, published, position_nees=by_distances)
+    return Result(run, accuracy, found.mean, published, found.band, by_distances)

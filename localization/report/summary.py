@@ -230,7 +230,10 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
             text += f" in the mean, but most fit (median {middle:.1f}, {expected:.1f} expected), so some outliers make it"
         results_.append((verdict_, text))
     if nees is not None and not math.isnan(nees):
-        results_.append(_test("NEES", nees, mean_band(1, _DOF), "errors"))
+        results_.append(_test("NEES", nees, _nees_band(line.result), "errors"))
+        by_pose = results_[-1][0]
+    elif (distances := line.result.position_nees) is not None:
+        results_.append(_test("NEES of distances", distances.mean, distances.band, "errors", dof=1))
         by_pose = results_[-1][0]
     found = {word: [text for verdict_, text in results_ if verdict_ == word] for word in ("over", "under", "fits")}
     if found["over"] and by_pose in ("fits", "under"):
@@ -249,15 +252,20 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
         return [f"{whose} are not too small: {allowed}{unknown}."]
     if found["fits"]:
         return [f"{whose} are consistent: {join_words(found['fits'])}."]
-    return [f"{whose} could not be tested: that takes scans, or a reference with headings."]
+    return [f"{whose} could not be tested: that takes scans, or a reference with headings or with covariances of its positions."]
 
 
 def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
     """That large NEES may be the reference's noise, where that is unknown."""
     nees = best.result.nees_mean
-    if not isinstance(reference, ReferenceTrack) or reference.covariances is not None or nees is None or nees <= mean_band(1, _DOF)[1]:
+    if not isinstance(reference, ReferenceTrack) or reference.covariances is not None or nees is None or nees <= _nees_band(best.result)[1]:
         return []
     return ["NEES takes this reference as exact, because it has no covariances: pass its noise with --reference-sigma."]
+
+
+def _nees_band(result: Result) -> tuple[float, float]:
+    """Band of the mean NEES; of one sample where the number of independent ones is not known."""
+    return mean_band(1, _DOF) if result.nees_band is None else result.nees_band
 
 
 def _visibility(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
@@ -269,11 +277,11 @@ def _visibility(best: PlottedRun, reference: ReferenceTrack | Relations) -> list
     return [f"Errors below {metres(floor)} cannot be seen with {reference.source}, by its own covariances{noise}."]
 
 
-def _test(name: str, mean: float, band: tuple[float, float], what: str) -> tuple[str, str]:
+def _test(name: str, mean: float, band: tuple[float, float], what: str, dof: int = _DOF) -> tuple[str, str]:
     """("over" | "under" | "fits", words). Beyond the band it must be by a factor in sigma that matters, too."""
-    factor = math.sqrt(mean / _DOF)
+    factor = math.sqrt(mean / dof)
     value = "infinite" if math.isinf(mean) else f"{mean:.3g}" if mean < 99.5 else f"{mean:,.0f}"
-    text = f"mean {name} {value}, where {_DOF} is expected"
+    text = f"mean {name} {value}, where {dof} is expected"
     if mean > band[1] and factor > _MIN_SIGMA_FACTOR:
         return "over", text if math.isinf(mean) else f"{text}, {what} {factor:.1f} times their sigma"
     if mean < band[0] and factor < 1.0 / _MIN_SIGMA_FACTOR:

@@ -13,6 +13,7 @@ from localization.errors import EvaluationError
 from localization.evaluation.consistency import (
     consistency,
     degrees_of_freedom,
+    independent_samples,
     lag1_whiteness,
     mean_band,
     mean_over_runs,
@@ -20,6 +21,7 @@ from localization.evaluation.consistency import (
     nis,
     pose_consistency,
     pose_errors,
+    position_consistency,
 )
 from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.trajectory import Trajectory
@@ -267,15 +269,68 @@ def test_pose_nees_of_half_the_variance_fails_over_runs():
     assert np.all(means > high)
 
 
-def test_pose_nees_of_one_run_counts_as_one_sample():
-    verdicts = []
-    truths, estimate, p = odometry_runs(16, runs=200)
+def test_pose_nees_of_one_odometry_run_counts_as_two_samples():
+    """A random walk's normalised errors have the correlation sqrt(s / t): in the mean of their squares that is two samples."""
+    truths, estimate, p = odometry_runs(16, runs=150)
+    found = [pose_consistency(as_trajectory(estimate, p), as_track(truth)) for truth in truths]
+    assert 1.7 < np.median([one.n_independent for one in found]) < 3.0
+    assert [one.verdict for one in found].count("consistent") >= 0.85 * 150
+    halved = [pose_consistency(as_trajectory(estimate, 0.25 * p), as_track(truth)).verdict for truth in truths]
+    assert halved.count("overconfident") > 0.7 * 150
+
+
+def correlated(rng, n, d, samples):
+    """(n, d) standard normal errors that stay alike for so many ``samples``; for infinitely many they are one offset."""
+    if math.isinf(samples):
+        return np.repeat(rng.normal(size=(1, d)), n, axis=0)
+    phi, noise, z = math.exp(-1.0 / samples), rng.normal(size=(n, d)), np.empty((n, d))
+    z[0] = noise[0]
+    for i in range(1, n):
+        z[i] = phi * z[i - 1] + math.sqrt(1.0 - phi**2) * noise[i]
+    return z
+
+
+@pytest.mark.parametrize(("samples", "n_expected"), [(1e-3, 400.0), (8.0, 50.0), (40.0, 10.0), (math.inf, 1.0)])
+def test_p_value_of_correlated_errors_is_uniform(samples, n_expected):
+    """Of consistent errors 95 % are called so, whatever their correlation; of half the sigma nearly all are called overconfident."""
+    rng, p = np.random.default_rng(20), np.tile(np.eye(3), (400, 1, 1))
+    runs = [correlated(rng, 400, 3, samples) for _ in range(250)]
+    found = [consistency(e, p, n_independent=independent_samples(e)) for e in runs]
+    assert np.median([one.n_independent for one in found]) == pytest.approx(n_expected, rel=0.2)
+    assert kstest([one.p_value for one in found], "uniform").pvalue > 1e-3
+    assert [one.verdict for one in found].count("consistent") >= binom.ppf(1e-3, 250, 0.93)
+    halved = [consistency(e, 0.25 * p, n_independent=independent_samples(e)).verdict for e in runs]
+    assert halved.count("overconfident") >= (0.95 if n_expected > 2.0 else 0.4) * 250
+
+
+def test_independent_samples_of_a_robot_that_stands_are_those_of_its_drive():
+    """An error that stays while the robot stands is one sample, however many messages have it."""
+    z = correlated(np.random.default_rng(21), 100, 3, 1e-3)
+    assert independent_samples(z, np.append(np.ones(99), 400.0)) == pytest.approx(499.0**2 / (99.0 + 400.0**2), rel=0.05)
+    assert independent_samples(z[:1]) == 1.0
+
+
+@pytest.mark.parametrize(("scale", "share"), [(1.0, ("consistent", 0.83)), (1.0 / 16.0, ("overconfident", 0.7))])
+def test_position_nees_of_odometry_without_headings_follows_its_covariance(scale, share):
+    """The frame of the positions is turned: right covariances are consistent, a quarter of the sigma is not."""
+    truths, estimate, p = odometry_runs(22, runs=200)
+    rng, noise, verdicts, means = np.random.default_rng(23), np.diag([4e-4, 4e-4, 0.0]), [], []
     for truth in truths:
-        found = pose_consistency(as_trajectory(estimate, p), as_track(truth))
-        assert (found.n, found.n_independent, found.band) == (60, 1, mean_band(1, 3))
+        seen = se2.compose([3.0, -2.0, 1.1], truth)[:, :2] + 0.02 * rng.normal(size=(len(truth), 2))
+        track = ReferenceTrack(np.arange(len(truth)) * SECOND, seen, None, np.tile(noise, (len(truth), 1, 1)))
+        found = position_consistency(as_trajectory(estimate, scale * p), track)
         verdicts.append(found.verdict)
-    # the mean of sixty correlated samples spreads less than one sample, so consistent runs pass at least as often
-    assert verdicts.count("consistent") >= binom.ppf(1e-6, 200, 0.95)
+        means.append(found.mean)
+    assert verdicts.count(share[0]) >= share[1] * 200
+    assert np.mean(means) == pytest.approx(1.0, abs=0.25) if scale == 1.0 else np.mean(means) > 2.0
+
+
+def test_position_nees_without_covariances_or_motion_is_none():
+    truth, estimate, p = odometry_run(24)
+    positions = ReferenceTrack(np.arange(61) * SECOND, truth[:, :2])
+    assert position_consistency(as_trajectory(estimate, p), positions) is None
+    parked = ReferenceTrack(np.arange(61) * SECOND, np.zeros((61, 2)), None, np.tile(np.eye(3), (61, 1, 1)))
+    assert position_consistency(as_trajectory(np.zeros((61, 3)), p), parked) is None
 
 
 def test_pose_nees_with_reference_noise_counts_it_where_given():
