@@ -146,9 +146,20 @@ def _run(name: str, options: Sequence[str]) -> None:
     import tyro
 
     command = getattr(importlib.import_module(f"localization.commands.{name}"), COMMANDS[name][0])
-    options = ["--help" if option == "--help-all" else option for option in options]
+    options = _expand(options)
     tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,)).run(PlainConsole(highlight=False))
 
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+def _expand(options: Sequence[str]) -> list[str]:
+    """``options`` as tyro takes them: a flag of three states, on, off and not given, is a name with a value."""
+    found: list[str] = []
+    for option, following in zip(options, [*options[1:], ""], strict=False):  # one more where there is none
+        if option.endswith((".planar", ".no-planar")) and following not in ("True", "False", "None"):
+            found += [option.replace(".no-planar", ".planar"), str(not option.endswith(".no-planar"))]
+        else:
+            found.append("--help" if option == "--help-all" else option)
+    return found

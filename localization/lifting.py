@@ -162,6 +162,10 @@ class AttitudeTable:
     def __init__(self) -> None:
         self._stamps, self._numbers = array("q"), array("d")
 
+    def __len__(self) -> int:
+        """Verticals so far."""
+        return len(self._stamps)
+
     def add(self, stamp_ns: int, attitude: AttitudeFilter) -> None:
         """Append the vertical as it is."""
         if self._stamps and stamp_ns <= self._stamps[-1]:
@@ -198,9 +202,15 @@ class SpaceTable:
         self._stamps.append(stamp_ns)
         self._numbers.frombytes(_row_of(pose).tobytes())
 
-    def trajectory(self) -> Trajectory3:
-        """All poses so far."""
-        return _trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._numbers), is_lifted=False)
+    def trajectory(self, before: Trajectory3 | None = None) -> Trajectory3:
+        """All poses so far, after those of ``before``."""
+        own = _trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._numbers), is_lifted=False)
+        if before is None:
+            return own
+        stamps, positions, quaternions, covariances = (
+            np.concatenate([getattr(before, name), getattr(own, name)]) for name in ("stamps_ns", "positions", "quaternions", "covariances")
+        )
+        return Trajectory3(stamps, positions, quaternions, covariances, is_lifted=False)
 
 
 def _row_of(pose: Pose3) -> FloatArray:

@@ -24,11 +24,12 @@ from localization.estimators import (
     Estimator,
     EstimatorConfig,
     MapFusion,
+    Plane,
     PriorMap,
     SpaceFusion,
     make_estimator,
 )
-from localization.events import Event, ImuSample, PositionSample, Step
+from localization.events import Event, ImuSample, PositionSample, Scan, Step
 from localization.lidar.losses import LidarLosses
 from localization.lifting import AttitudeTable, SpaceTable, Trajectory3
 from localization.maps import KeyframeMap
@@ -79,7 +80,7 @@ class Pipeline:
         self.is_localizing = trial.estimator in ESTIMATORS_WITH_MAP
         self.mounts = dict(mounts)
         """Known mounts by frame, shared with the synchronizer and the estimator."""
-        is_in_space = trial.estimator == "ekf" and not config.step.planar
+        is_in_space = trial.estimator == "ekf" and config.step.planar is False
         has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not is_in_space
         model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
@@ -91,6 +92,10 @@ class Pipeline:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
             self.estimator = MapFusion(self.estimator, trial.prior, is_recording=is_smoothing)
+        self.plane: Plane | None = None
+        """The choice between plane and space; None where there is none."""
+        if trial.estimator == "ekf" and config.step.planar is None and has_lidar:
+            self.plane = Plane(robot, self.mounts, config.estimator.lidar, config.estimator.space)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""
@@ -116,6 +121,9 @@ class Pipeline:
             return
         if isinstance(event, ImuSample):
             self.checks.insert_imu(event)
+        if self.plane is not None and isinstance(event, Scan) and not event.is_planar:
+            self.plane.has_clouds = True
+            self.synchronizer.measure_in_space()
         self.synchronizer.insert(event)
         yield from self._estimates(is_last=False)
 
@@ -124,7 +132,11 @@ class Pipeline:
             self._calibrate()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
+            if self.plane is not None and self.plane.has_clouds:
+                self.estimator = self.plane.choose(self.estimator, self.attitude, step.start_ns)
             estimate = self.estimator.step(step)  # predict, match, update
+            if self.plane is not None and self.plane.has_clouds:
+                self.plane.add(estimate, self.attitude)
             self.checks.compare_residuals(self.estimator)
             estimate = self.checks.inflate(estimate)
             self._feed_back(step, is_scan_matched=estimate.nis is not None)
@@ -214,6 +226,13 @@ class Run:
     """``trajectory`` in space, with height, roll and pitch: of an estimator in space, or where an IMU shows that the ground tilts."""
     parameter_history: Mapping[str, FloatArray] = field(default_factory=dict)
     """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
+    left_plane_ns: int | None = None
+    """Stamp after which poses are in space because the IMU shows that the ground tilts; None where that was not found, or not asked."""
+
+    @property
+    def in_space_from_s(self) -> float | None:
+        """Time after the first pose from which on poses are in space by choice [s]; None where there was none."""
+        return None if self.left_plane_ns is None else float(self.left_plane_ns - self.trajectory.stamps_ns[0]) * 1e-9
 
     def __repr__(self) -> str:
         return f"<Run {self.model} {self.estimator}: {self.trajectory!r}, {len(self.warnings)} warnings>"
@@ -303,8 +322,9 @@ class _Replay:
         smoothed = estimator.finish(filtered)
         smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)
         attitude, final = self._pipeline.attitude, filtered if smoothed is None else smoothed
-        in_space = self._attitudes.lift(final) if attitude is not None and attitude.is_tilting else None
-        in_space = self._in_space.trajectory() if len(self._in_space) else in_space
+        in_space = self._attitudes.lift(final) if attitude is not None and attitude.is_tilting and len(self._attitudes) else None
+        in_space = self._in_space.trajectory(in_space) if len(self._in_space) else in_space
+        plane = self._pipeline.plane
         self._seconds += time.perf_counter() - begin
         return Run(
             self._trial.model.name,
@@ -325,4 +345,5 @@ class _Replay:
             estimator.localization(),
             in_space,
             {name: np.array(rows) for name, rows in self._parameters.items()},
+            None if plane is None else plane.left_ns,
         )

@@ -54,8 +54,9 @@ class StepConfig(Settings):
     """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
     slopes: bool = True
     """Model gravity on slopes where the IMU's accelerometer shows that the ground tilts; false takes all ground as level."""
-    planar: bool = True
-    """Estimate poses in the plane; false: in space, which takes an IMU with an accelerometer and a 3D LiDAR."""
+    planar: bool | None = None
+    """Estimate poses in the plane; false: in space, which takes an IMU with an accelerometer and a 3D LiDAR. None: in the plane, until the
+    IMU shows that the ground tilts while there are clouds of a 3D LiDAR."""
 
 
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
@@ -109,9 +110,12 @@ class Synchronizer:
         """The vertical; None for models of robots that do not skid, and where `StepConfig.slopes` is off."""
         has_slopes = self.config.slopes and model.traits.is_level
         self._slope_effect = SlopeEffect.from_robot(robot) if has_slopes else None
-        self._body_rates = None if self.config.planar else BodyRates(robot.gyro_noise, mounts)
-        if self._slope_effect is not None or self._body_rates is not None:
-            self.attitude = AttitudeFilter(robot.gyro_noise, mounts, robot.geometry.wheel_radius_m)
+        self._robot, self._mounts = robot, mounts
+        self._body_rates: BodyRates | None = None
+        if has_slopes:
+            self._measure_attitude()
+        if self.config.planar is False:
+            self.measure_in_space()
         self.frames = LidarFrames(mounts)
         """Frames of the scans, with their mounts."""
         self._has_lidar = has_lidar
@@ -133,6 +137,16 @@ class Synchronizer:
         if params is not None:
             self.params = params
         self._clock_offset_ns = _ns(clock_offset_s)
+
+    def measure_in_space(self) -> None:
+        """Measure attitude and turns about all three axes from here on, as poses in space need them."""
+        if self._body_rates is None:
+            self._body_rates = BodyRates(self._robot.gyro_noise, self._mounts)
+        if self.attitude is None:
+            self._measure_attitude()
+
+    def _measure_attitude(self) -> None:
+        self.attitude = AttitudeFilter(self._robot.gyro_noise, self._mounts, self._robot.geometry.wheel_radius_m)
 
     def restart_gap(self) -> None:
         """Restart the gap in the wheel data: a matched scan measured the pose, so the unknown velocity acts only from here on."""

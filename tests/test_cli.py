@@ -57,3 +57,13 @@ def test_help_of_a_command_imports_no_numerical_library() -> None:
 def test_version_is_that_of_the_distribution(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"skidloc {importlib.metadata.version('skidloc')}\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "planar"), [([], None), (["--config.step.planar"], True), (["--config.step.no-planar"], False)], ids=["auto", "on", "off"]
+)
+def test_planar_option_has_three_states(monkeypatch, tmp_path, options, planar):
+    seen = []
+    monkeypatch.setattr("localization.commands.replay.Replay.run", lambda self, console: seen.append(self.config.step.planar))
+    assert main(["replay", "some.bag", "--robot", "husky_a200", *options, "--out", str(tmp_path / "out")]) == 0
+    assert seen == [planar]

@@ -151,6 +151,7 @@ class Replay:
                         *([] if yaw is None else [yaw.text]),
                         *log.warnings(),
                         *warnings_of(found),
+                        *_in_space_notes(found),
                     ]
                 )
             ],
@@ -359,7 +360,10 @@ def _distance(results: Sequence[Result]) -> float | None:
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
     t = run.trajectory if run.filtered is None else run.filtered  # what would have been published
-    in_space = None if run.in_space is None or run.in_space.is_lifted else run.in_space.poses()
+    in_space = (
+        {} if run.in_space is None or run.in_space.is_lifted else dict(zip(run.in_space.stamps_ns, run.in_space.poses(), strict=True))
+    )
+    left_ns = run.left_plane_ns
     parent = MAP_FRAME if run.estimator in ESTIMATORS_WITH_MAP else PARENT_FRAME
     for i in range(len(t)):
         twist_cov = run.twist_covariances[i]
@@ -370,8 +374,18 @@ def _estimates(run: Run) -> Iterator[FusedEstimate]:
             None if t.covariances is None else t.covariances[i],
             twist_cov if np.isfinite(twist_cov).all() else None,
             parent,
-            None if in_space is None else next(in_space),
+            in_space.get(t.stamps_ns[i]) if left_ns is None or t.stamps_ns[i] > left_ns else None,
         )
+
+
+def _in_space_notes(runs: Sequence[Run]) -> list[str]:
+    """Which of the ``runs`` have left the plane, when, and why."""
+    return [
+        f"{run.estimator} ({run.model}): the IMU shows that the ground tilts, so from {run.in_space_from_s:.1f} s on poses are in space, "
+        "with clouds registered in 3D. --config.step.planar keeps them in the plane."
+        for run in runs
+        if run.in_space_from_s is not None
+    ]
 
 
 @contextlib.contextmanager

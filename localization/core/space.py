@@ -73,6 +73,20 @@ def initial_space_state(gyro: GyroNoise, bias_sigma: float, config: SpaceConfig)
     return State(layout, means, P)
 
 
+def start_at(state: State, position: FloatArray, rotation: FloatArray, cov: FloatArray) -> State:
+    """``state`` at a pose (3,), (3, 3) of an estimator in the plane, with its covariance (6, 6) in the world's axes.
+
+    Roll and pitch keep their first variance: gravity measures them anew.
+    """
+    pose, P, world = np.eye(4), state.P.copy(), np.kron(np.eye(2), rotation)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    rows, tilt = state.layout.rows["pose"], np.diag(state.cov("pose"))[3:5]
+    P[rows, rows] = world.T @ cov @ world
+    P[rows, rows][3:5], P[rows, rows][:, 3:5] = 0.0, 0.0
+    P[rows, rows][3:5, 3:5] = np.diag(tilt)
+    return State(state.layout, {**state.means, "pose": pose}, P)
+
+
 def lift(planar: FloatArray) -> Transform3:
     """(4, 4) of a planar motion (3,)."""
     x, y, yaw = planar.tolist()

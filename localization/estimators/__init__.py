@@ -13,7 +13,7 @@ from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap
-from localization.estimators.space_fusion import SpaceFusion
+from localization.estimators.space_fusion import Plane, SpaceFusion
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
@@ -29,6 +29,7 @@ __all__ = [
     "EstimatorConfig",
     "LearnedParameter",
     "MapFusion",
+    "Plane",
     "PriorMap",
     "Residuals",
     "SpaceFusion",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
-from localization.core.filter import clone, propagate, update
+from localization.attitude import AttitudeFilter
+from localization.core.filter import Transition, clone, propagate, update
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.space import (
     SpaceConfig,
@@ -15,13 +17,14 @@ from localization.core.space import (
     lifted_transition,
     measure_body_turn,
     measure_gravity,
+    start_at,
 )
 from localization.core.state import State
 from localization.estimators.base import NO_POINTS, Estimate, Estimator, twist_at_end
 from localization.events import Gravity, Step
-from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size
+from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size, key_scan_noise
 from localization.lidar.cloud_map import CloudMap, thin
-from localization.lifting import Pose3, aligning
+from localization.lifting import Lifting, Pose3, aligning
 from motion_models import se3
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray, Points2
@@ -32,6 +35,11 @@ _BIAS_SIGMA = 0.01
 """Sigma of the biases of a gyro's axes that are not zeroed [rad/s]."""
 _MIN_POINTS_MAPPED = 50
 """Points with a surface in the submap, below which a cloud is lost. The first cloud of a standing robot has surfaces for a sixth of it."""
+
+_SYSTEMATIC_COV = np.diag([1.5e-3, 1.5e-3, 1.5e-3, 2e-4, 2e-4, 2e-4]) ** 2
+"""Of errors that all points of a cloud have in common, which no residual shows: ground that is not plane within the pooled voxels, and
+motion that changes within a sweep. Clouds matched to maps of true poses err by .5 to 1.4 mm and .04 to .35 mrad beyond their noise
+[m^2, rad^2]."""
 
 
 class SpaceFusion(Estimator):
@@ -47,9 +55,22 @@ class SpaceFusion(Estimator):
         self._map: CloudMap | None = None
         self._odom_T_map = np.eye(4)
         self._cloud: FloatArray | None = None  # of the last step, deskewed, in the body frame
+        self._cloud_cov: FloatArray | None = None  # (6, 6) of the last match; None before the first one
         self._last_key: Transform3 | None = None
-        self._lost = LostScans()
+        self._lost, self._clock_offset_s = LostScans(), 0.0
         self._counts = dict.fromkeys(("scans", "matched", "standing", "planar"), 0)
+
+    @classmethod
+    def continuing(
+        cls, planar: Estimator, pose: Pose3, robot: Robot, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig
+    ) -> SpaceFusion:
+        """In space from ``pose`` on, to which the estimator ``planar`` has come in the plane."""
+        made = cls(robot, mounts, lidar, config)
+        made.state = start_at(made.state, pose.position, pose.rotation, pose.covariance)
+        made._counts = {**planar.counts(), **{name: planar.counts().get(name, 0) for name in made._counts}}
+        made._lost = planar.lost or made._lost
+        made._clock_offset_s = planar.clock_offset_s
+        return made
 
     def step(self, step: Step) -> Estimate:
         """Predict, update by gyro and gravity, update by the cloud."""
@@ -83,8 +104,9 @@ class SpaceFusion(Estimator):
             if math.hypot(*moved[:3]) < c.key_distance_m and math.hypot(*moved[3:]) < c.key_angle_rad:
                 return
         self._last_key = pose
-        share = self._map.insert(se3.inverse(self._odom_T_map) @ pose, cloud)
-        self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(share, np.zeros((6, 6)))))
+        share, new = self._map.insert(se3.inverse(self._odom_T_map) @ pose, cloud)
+        noise = np.zeros((6, 6)) if self._cloud_cov is None else key_scan_noise(self._cloud_cov, new)
+        self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(share, noise)))
 
     def _update_cloud(self, step: Step) -> float | None:
         """Match the cloud of ``step`` and update by it; its NIS (6 degrees of freedom), or None where there is no cloud or no match."""
@@ -113,8 +135,12 @@ class SpaceFusion(Estimator):
             return None
         self._lost.add_matched(step.end_ns)
         self._counts["matched"] += 1
+        cov = match.cov + _SYSTEMATIC_COV
+        if self._cloud_cov is None:  # the first cloud errs as this one does
+            self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(0.0, key_scan_noise(cov, 1.0))))
+        self._cloud_cov = cov
         measured = self._odom_T_map @ match.measured
-        self.state, innovation = update(self.state, measure_scan(self.state, measured, match.cov), ("map",))
+        self.state, innovation = update(self.state, measure_scan(self.state, measured, cov), ("map",))
         return innovation.nis
 
     def _twist_of(self, step: Step) -> FloatArray:
@@ -142,6 +168,11 @@ class SpaceFusion(Estimator):
             twist, twist_cov = twist_at_end(mean, mean_cov, step.twist_change, measured_over)
         planar, in_space = np.array([pose[0, 3], pose[1, 3], yaw]), Pose3(pose[:3, 3], pose[:3, :3], covariance)
         return Estimate(step.end_ns, planar, planar_cov, twist, twist_cov, nis, in_space=in_space)
+
+    @property
+    def clock_offset_s(self) -> float:
+        """Of the wheels' stamps [s]: what the estimator in the plane has found."""
+        return self._clock_offset_s
 
     @property
     def lost(self) -> LostScans:
@@ -179,13 +210,49 @@ class SpaceFusion(Estimator):
         return NO_POINTS if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
 
 
+class Plane:
+    """Poses of an estimator in the plane, until the IMU shows that the ground tilts: from there on they are in space.
+
+    Without a 3D LiDAR they stay in the plane, whatever the ground does: planar scans are not matched in space.
+    """
+
+    def __init__(self, robot: Robot, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
+        """As `SpaceFusion`."""
+        self._of_space, self._lifting = (robot, mounts, lidar, config), Lifting()
+        self._pose: Pose3 | None = None
+        self.has_clouds = False
+        """A 3D LiDAR has measured: from the first cloud on there is a choice."""
+        self.left_ns: int | None = None
+        """Stamp of the last estimate in the plane; None while it is not left."""
+
+    def choose(self, estimator: Estimator, attitude: AttitudeFilter | None, start_ns: int) -> Estimator:
+        """``estimator``, or from now on, where the ground has been found to tilt, one in space."""
+        if self._pose is None or self.left_ns is not None or attitude is None or not attitude.is_tilting:
+            return estimator
+        self.left_ns = start_ns
+        return SpaceFusion.continuing(estimator, self._pose, *self._of_space)
+
+    def add(self, estimate: Estimate, attitude: AttitudeFilter | None) -> None:
+        """Lift the ``estimate`` of the estimator in the plane."""
+        if self.left_ns is not None or attitude is None or estimate.covariance is None:
+            return
+        lifted = self._lifting.add(estimate.pose, estimate.covariance, attitude.ground_up, attitude.tilt_variances)
+        self._pose = replace(lifted, position=np.array([estimate.pose[0], estimate.pose[1], lifted.position[2]]))
+
+
 def _align(state: State, gravity: Gravity) -> State:
-    """The pose turned about a level axis, so that ``gravity`` is vertical; its heading and covariance stay."""
+    """The pose turned about a level axis, so that ``gravity`` is vertical; its heading, that of the body's x axis, stays.
+
+    Errors of the vertical leave that heading: x' = R exp(e) e_x has none where e_z = e_y R_12 / R_11, for R of heading zero.
+    """
     pose = state["pose"].copy()
     yaw = math.atan2(pose[1, 0], pose[0, 0])
     upright = aligning(gravity.force / np.linalg.norm(gravity.force), np.array([0.0, 0.0, 1.0]))
-    pose[:3, :3] = _turn(yaw - math.atan2(upright[1, 0], upright[0, 0])) @ upright
-    return State(state.layout, {**state.means, "pose": pose}, state.P)
+    level = _turn(-math.atan2(upright[1, 0], upright[0, 0])) @ upright
+    pose[:3, :3] = _turn(yaw) @ level
+    keeping = np.eye(6)
+    keeping[5, 4] = level[1, 2] / level[1, 1]
+    return propagate(state, Transition({"pose": pose}, {("pose", "pose"): keeping}, what="the first vertical"))
 
 
 def _turn(yaw: float) -> FloatArray:

@@ -71,6 +71,7 @@ class Result:
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
             "counts": dict(self.run.counts),
             "lidar": None if self.run.lidar is None else self.run.lidar.numbers(),
+            **({} if self.run.in_space_from_s is None else {"in_space_from_s": self.run.in_space_from_s}),
             **({"reference_contradictions": list(self.contradictions)} if self.contradictions else {}),
             **({} if self.run.localization is None else {"localization": dict(self.run.localization)}),
             **{name: number for name, number in numbers.items() if self.accuracy or not name.startswith("n_")},

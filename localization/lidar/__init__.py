@@ -4,7 +4,16 @@ from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
 from localization.lidar.registration import OUTLIER_SIGMAS
-from localization.lidar.scan_matcher import FORGETTING, MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
+from localization.lidar.scan_matcher import (
+    FORGETTING,
+    MIN_POINTS,
+    KeyScanError,
+    LidarConfig,
+    ScanMatch,
+    ScanMatcher,
+    choose_cell,
+    key_scan_noise,
+)
 from localization.lidar.scan_sensor import ScanMatchingSensor
 
 __all__ = [
@@ -21,4 +30,5 @@ __all__ = [
     "Sweep",
     "choose_cell",
     "choose_voxel_size",
+    "key_scan_noise",
 ]

@@ -92,12 +92,13 @@ class CloudMap:
         self._n = 0
         self._grid = _make_grid(cell, noise_m**2, _FIRST_VOXELS)
 
-    def insert(self, pose: Transform3, points: FloatArray) -> float:
-        """Add ``points``, measured from ``pose``; the mean share that they have of all points around them, 0 to 1."""
+    def insert(self, pose: Transform3, points: FloatArray) -> tuple[float, float]:
+        """Add ``points``, measured from ``pose``; the mean share that they have of all points in their voxels, and that of those whose
+        voxels were empty, 0 to 1."""
         while len(self._grid.cells) - self._n < len(points):
             self._grow()
-        self._n, share = _insert(self._grid, self._n, se3.transform(pose, points))
-        return share
+        self._n, share, new = _insert(self._grid, self._n, se3.transform(pose, points))
+        return share, new
 
     @property
     def cell(self) -> float:
@@ -181,8 +182,9 @@ def _index(grid: CloudGrid, n: int) -> None:
 
 
 @kernel
-def _insert(grid: CloudGrid, n: int, points: FloatArray) -> tuple[int, float]:
-    """Add ``points`` (N, 3) of the world; the number of voxels then, and the mean share of the points in their voxels."""
+def _insert(grid: CloudGrid, n: int, points: FloatArray) -> tuple[int, float, float]:
+    """Add ``points`` (N, 3) of the world; the number of voxels then, the mean share of the points in their voxels, and that of those whose
+    voxels were empty."""
     rows, counts = np.empty(points.shape[0], np.int64), np.zeros(len(grid.cells))
     for p in range(points.shape[0]):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
@@ -207,13 +209,14 @@ def _insert(grid: CloudGrid, n: int, points: FloatArray) -> tuple[int, float]:
         s[7] += y * y
         s[8] += y * z
         s[9] += z * z
-    share = 0.0
+    share, new = 0.0, 0.0
     for p in range(points.shape[0]):
         v = rows[p]
         share += counts[v] / grid.sums[v, 0]
+        new += counts[v] == grid.sums[v, 0]
         if counts[v] > 0.0:
             _forget_surfaces(grid, v)
-    return n, share / max(points.shape[0], 1)
+    return n, share / max(points.shape[0], 1), new / max(points.shape[0], 1)
 
 
 @subroutine

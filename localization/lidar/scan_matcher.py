@@ -31,8 +31,8 @@ _MAX_OLD_SUBMAPS = 3
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
 """Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad, times that of the residuals
 [1/m^2, 1/m^2, 1/rad^2]."""
-_MAPPED_INFORMATION = np.diag([1e2, 1e2, 1e2])
-"""Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/m^2, 1/rad^2]."""
+_MAPPED_INFORMATION = 1e2
+"""Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/rad^2]."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,13 @@ class KeyScanError:
     """s, 0 to 1: the scan's share of its surroundings in the submap."""
     new_cov: Cov3
     """(3, 3) of m: places that were not mapped before have this scan alone."""
+
+
+def key_scan_noise(cov: FloatArray, new: float) -> FloatArray:
+    """(k, k) by which the noise of a scan, whose match has covariance ``cov`` (k, k), moves the submap, of which it draws the share ``new``
+    anew: not along directions that the scene leaves open."""
+    W = np.linalg.inv(np.eye(len(cov)) + cov * _MAPPED_INFORMATION)
+    return np.asarray(new * W @ cov @ W.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +198,7 @@ class ScanMatcher:
         if len(self._keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
             self._residuals += np.array([fit.sum_squares, fit.sum_squares, fit.n_inliers])
         noise = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION) * self._block_variance, dtype=float)
-        W = np.linalg.inv(np.eye(3) + noise @ _MAPPED_INFORMATION)  # not along directions that the scene leaves open
-        return KeyScanError(share, new * W @ noise @ W.T)
+        return KeyScanError(share, key_scan_noise(noise, new))
 
     def _fitting_keys(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> list[KeyScan]:
         """The key scans that stay beside a new one: the last ones, and older ones from which the drift is below the noise of a range.

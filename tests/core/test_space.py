@@ -15,6 +15,7 @@ from localization.core.space import (
     lifted_transition,
     measure_body_turn,
     measure_gravity,
+    start_at,
 )
 from localization.core.state import State
 from localization.events import BodyTurn, Gravity, Step
@@ -85,3 +86,13 @@ def test_lifted_motion_whose_turn_is_measured_knows_its_arc():
 def test_gravity_that_the_pose_predicts_has_no_residual():
     state = state_at()
     np.testing.assert_allclose(measure_gravity(state, Gravity(GRAVITY * POSE[2, :3], 0.01)).residual, 0.0, atol=1e-12)
+
+
+def test_start_in_space_has_the_planar_covariance_and_the_first_tilt():
+    state = initial_space_state(GyroNoise(), 0.01, SpaceConfig())
+    world = np.diag([1e-4, 4e-4, 9e-4, 1e-6, 1e-6, 1e-4])
+    after = start_at(state, POSE[:3, 3], POSE[:3, :3], world)
+    P, R = after.cov("pose"), POSE[:3, :3]
+    np.testing.assert_allclose(R @ P[:3, :3] @ R.T, world[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(P[3:5, 3:5], state.cov("pose")[3:5, 3:5], atol=1e-12)
+    np.testing.assert_array_equal(after["pose"], POSE)

@@ -8,10 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from localization.pipeline import Trial, replay
+from localization.pipeline import ReplayConfig, Trial, replay
+from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from tests.helpers.hill_scans import MOUNT, make_scene, scans
-from tests.helpers.hills import rolling_drive
+from tests.helpers.hills import rolling_drive, with_accelerometer_bias
 from tests.helpers.in_space import IN_SPACE, in_order, run_in_space
 
 pytestmark = pytest.mark.xdist_group("among_trees")
@@ -48,6 +49,18 @@ def test_space_fusion_without_matches_is_by_wheels_gyro_and_gravity(rolled, amon
 
 
 @pytest.mark.extended
+def test_space_fusion_over_seeds_has_the_nees_of_its_six_dimensions():
+    """Biases of accelerometer and gyro, noise, scene and way differ. At the end of eight drives: chi-square with 48 degrees of freedom is
+    between 26 and 79 in 99 %."""
+    nees = []
+    for seed in range(11, 19):
+        drive = with_accelerometer_bias(rolling_drive(6.0, turn_rate=0.5 - 0.1 * (seed - 11), seed=seed), seed)
+        found, _ = run_in_space(drive, list(scans(drive, make_scene(drive, seed), seed=seed)), "diff_drive")
+        nees.append(found.nees[-1])
+    assert 26.0 < sum(nees) < 79.0
+
+
+@pytest.mark.extended
 def test_space_fusion_survives_a_cloud_of_200000_points_and_nan_rings(rolled, among_trees):
     last = among_trees[-1]
     rng = np.random.default_rng(0)
@@ -79,6 +92,34 @@ def test_space_fusion_without_an_imus_mount_is_named(rolled, among_trees):
     _, pipeline = run_in_space(unknown, among_trees[:8], "diff_drive")
     assert pipeline.estimator.counts()["matched"] == 0
     assert any("no IMU with an accelerometer and a known mount" in warning for warning in pipeline.warnings())
+
+
+def test_replay_where_the_ground_tilts_goes_on_in_space_by_itself(rolled, among_trees):
+    """In the plane until the IMU shows the slope, then within centimetres of the truth in height, roll and pitch, too."""
+    mounts = {**rolled.mounts, "lidar_link": MOUNT}
+    trial = Trial(make_model("diff_drive", rolled.robot), "ekf")
+    (run,) = replay(in_order(rolled, among_trees), [trial], rolled.robot, mounts, True)
+    (flat,) = replay(in_order(rolled, among_trees), [trial], rolled.robot, mounts, True, ReplayConfig(step=StepConfig(planar=True)))
+    is_before = run.trajectory.stamps_ns <= run.left_plane_ns
+    np.testing.assert_array_equal(run.trajectory.poses[is_before], flat.trajectory.poses[is_before])
+    assert 0.0 < run.in_space_from_s < 3.5
+    assert not run.in_space.is_lifted
+    assert run.in_space.stamps_ns[-1] == run.trajectory.stamps_ns[-1]
+    assert (np.diff(run.in_space.stamps_ns) > 0).all()
+    assert np.linalg.norm(np.diff(run.in_space.positions, axis=0), axis=1).max() < 0.12  # at .7 m/s, 10 Hz: no jump
+    found, _ = run_in_space(rolled, among_trees, "diff_drive", ReplayConfig())
+    assert found.ate < 0.02
+
+
+def test_replay_of_clouds_on_level_ground_stays_in_the_plane_to_the_last_bit():
+    level = rolling_drive(4.0, is_flat=True)
+    clouds, trial = list(scans(level, make_scene(level, 3, is_flat=True))), Trial(make_model("diff_drive", level.robot), "ekf")
+    args = in_order(level, clouds), [trial], level.robot, {**level.mounts, "lidar_link": MOUNT}, True
+    (run,), (flat,) = replay(*args), replay(*args, ReplayConfig(step=StepConfig(planar=True)))
+    np.testing.assert_array_equal(run.trajectory.poses, flat.trajectory.poses)
+    np.testing.assert_array_equal(run.trajectory.covariances, flat.trajectory.covariances)
+    assert run.left_plane_ns is None
+    assert run.in_space is None
 
 
 def test_space_fusion_of_planar_scans_is_named(rolled, among_trees):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,13 @@ class HillDrive:
     """(N, 3, 3) true ``world_R_body``."""
 
 
+def with_accelerometer_bias(drive: HillDrive, seed: int, sigma: float = 0.2) -> HillDrive:
+    """``drive`` whose accelerometer has a constant bias by chance, as of a mount that is off, with ``sigma`` on each axis [m/s^2]."""
+    bias = np.random.default_rng(1000 + seed).normal(0.0, sigma, 3)
+    events = [replace(e, linear_acceleration=e.linear_acceleration + bias) if isinstance(e, ImuSample) else e for e in drive.events]
+    return replace(drive, events=events)
+
+
 def terrain(x: FloatArray, y: FloatArray) -> FloatArray:
     """Height of the hills [m]."""
     total = np.zeros(np.broadcast(x, y).shape)
@@ -54,11 +61,13 @@ def gradient(x: float, y: float) -> tuple[float, float]:
     return dx, dy
 
 
-def rolling_drive(seconds: float, speed: float = 0.7, turn_rate: float = 0.3, seed: int = 1) -> HillDrive:
-    """A Husky that stands for 2 s, then drives along an arc and back, tangent to the ground, without slip; IMU at 100 Hz, wheels at 50."""
+def rolling_drive(seconds: float, speed: float = 0.7, turn_rate: float = 0.3, seed: int = 1, is_flat: bool = False) -> HillDrive:
+    """A Husky that stands for 2 s, then drives along an arc and back, tangent to the ground, without slip; IMU at 100 Hz, wheels at 50.
+
+    ``is_flat``: on the plane z = 0 instead of hills."""
     robot, rng, h = load_robot("husky_a200"), np.random.default_rng(seed), 0.01
     mount = Mount(0.1, 0.0, 0.2)
-    poses = _roll(round(seconds / h) + 2, h, speed, turn_rate)
+    poses = _roll(round(seconds / h) + 2, h, speed, turn_rate, is_flat)
     places = poses[:, :3, 3] + poses[:, :3, :3] @ [mount.x, mount.y, mount.z]
     events: list[Event] = []
     angles, half_track, radius = np.zeros(2), 0.5 * robot.geometry.track_width_m, robot.geometry.wheel_radius_m
@@ -78,17 +87,17 @@ def rolling_drive(seconds: float, speed: float = 0.7, turn_rate: float = 0.3, se
     return HillDrive(robot, {"base_link": Mount(), "imu_link": mount}, events, stamps, poses[:, :3, 3], poses[:, :3, :3])
 
 
-def _roll(n: int, h: float, speed: float, turn_rate: float) -> FloatArray:
+def _roll(n: int, h: float, speed: float, turn_rate: float, is_flat: bool) -> FloatArray:
     """(n, 4, 4) poses, ``h`` [s] apart."""
     x = y = yaw = 0.0
     poses = np.tile(np.eye(4), (n, 1, 1))
     for pose, t in zip(poses, np.arange(n) * h, strict=True):
-        dx, dy = gradient(x, y)
+        dx, dy = (0.0, 0.0) if is_flat else gradient(x, y)
         up = np.array([-dx, -dy, 1.0]) / math.sqrt(1.0 + dx * dx + dy * dy)
         ahead = np.array([math.cos(yaw), math.sin(yaw), dx * math.cos(yaw) + dy * math.sin(yaw)])
         ahead /= np.linalg.norm(ahead)
         pose[:3, :3] = np.column_stack([ahead, np.cross(up, ahead), up])
-        pose[:3, 3] = x, y, float(terrain(np.array([x]), np.array([y]))[0])
+        pose[:3, 3] = x, y, 0.0 if is_flat else float(terrain(np.array([x]), np.array([y]))[0])
         ramp = min(max(t - 2.0, 0.0), 1.0)
         x, y, yaw = x + h * ramp * speed * ahead[0], y + h * ramp * speed * ahead[1], yaw + h * ramp * turn_rate
     return poses

@@ -69,11 +69,13 @@ def in_order(drive: HillDrive, scans: list[Scan]) -> list[Event]:
     return sorted([*drive.events, *scans], key=lambda e: e.stamp_ns + (SWEEP_NS if isinstance(e, Scan) else 0))
 
 
-def run_in_space(drive: HillDrive, scans: list[Scan], model: str = "skid_steer") -> tuple[SpaceErrors, Pipeline]:
-    """Replay with the filter in space; the pipeline as it is at the end."""
+def run_in_space(
+    drive: HillDrive, scans: list[Scan], model: str = "skid_steer", config: ReplayConfig = IN_SPACE
+) -> tuple[SpaceErrors, Pipeline]:
+    """Replay with the filter in space, from where it is in space; the pipeline as it is at the end."""
     trial = Trial(make_model(model, drive.robot), "ekf")
-    pipeline = Pipeline(trial, drive.robot, {**drive.mounts, "lidar_link": MOUNT}, bool(scans), IN_SPACE)
-    found = [e for event in in_order(drive, scans) for e in pipeline.process(event)]
+    pipeline = Pipeline(trial, drive.robot, {**drive.mounts, "lidar_link": MOUNT}, bool(scans), config)
+    found = [e for event in in_order(drive, scans) for e in pipeline.process(event) if e.in_space is not None]
     poses, spread = np.tile(np.eye(4), (len(found), 1, 1)), []
     for pose, estimate in zip(poses, found, strict=True):
         made = estimate.in_space
