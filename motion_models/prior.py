@@ -186,6 +186,13 @@ def scaling_prior(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> Scal
     return ScalingPrior(k, sigma, sigma * measured / math.hypot(sigma, measured), prior.source)
 
 
+def unused_terms_notes(robot: Robot, models: Sequence[str]) -> list[str]:
+    """A sentence where the robot's learned terms belong to none of ``models``; else none."""
+    if not robot.terms or set(robot.terms) & set(models):
+        return []
+    return [f"{robot.name}: the learned terms of its file are of {', '.join(robot.terms)}, and {', '.join(models)} runs without them."]
+
+
 def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[str]:
     """A sentence for the user where `scaling_prior` is not None, and one where the robot's learned terms belong to none of ``models``.
 
@@ -193,9 +200,7 @@ def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[s
     >>> prior_notes(load_robot("vaultbot"))
     []
     """
-    others = [name for name in robot.terms if name not in models] if not set(robot.terms) & set(models) else []
-    unused = f"{robot.name}: the learned terms of its file are of {', '.join(others)}, and {', '.join(models)} runs without them."
-    notes = [unused] if others else []
+    notes = unused_terms_notes(robot, models)
     found = scaling_prior(robot, models)
     if found is None:
         return notes

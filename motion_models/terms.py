@@ -58,6 +58,18 @@ VARIABLES: Mapping[str, Variable] = {
 """Variables of terms. Changes and time need samples in order of time (`in_series`); without, changes and time are 0."""
 
 _NAMES = tuple(VARIABLES)
+_SYNONYMS = {
+    **dict.fromkeys(("vx", "speed", "velocity", "linear"), "v"),
+    **dict.fromkeys(("omega", "w", "yaw_rate", "yawrate", "rate", "angular", "vyaw"), "wz"),
+    **dict.fromkeys(("ax", "a", "acceleration", "accel"), "dv"),
+    **dict.fromkeys(("alpha", "angular_acceleration", "dw", "domega"), "dwz"),
+    **dict.fromkeys(("wl", "omega_l", "left_wheel"), "left"),
+    **dict.fromkeys(("wr", "omega_r", "right_wheel"), "right"),
+    **dict.fromkeys(("x_cg", "cgx", "com_x"), "cg_x"),
+    **dict.fromkeys(("y_cg", "cgy", "com_y"), "cg_y"),
+    "time": "t",
+}
+"""Other names of the variables, for errors that name the nearest one."""
 _FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
 
 
@@ -134,7 +146,7 @@ def parse_expression(text: str, where: str = "term") -> Expression:
             )
         form, name, power = found[1] or "", found[2] or found[3], int(found[4] or 1)
         if name not in VARIABLES:
-            near = difflib.get_close_matches(name, _NAMES, n=1, cutoff=0.4)
+            near = [_SYNONYMS[name]] if name in _SYNONYMS else difflib.get_close_matches(name, _NAMES, n=1, cutoff=0.4)
             meant = f" (did you mean {near[0]}?)" if near else ""
             raise RobotError(f"{where}: unknown variable {name[:40]!r} in {text[:60]!r}{meant}; there are {', '.join(_NAMES)}.")
         powers[name, form] = powers.get((name, form), 0) + power

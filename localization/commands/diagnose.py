@@ -44,6 +44,7 @@ from motion_models.calibration.cross_validation import Interval
 from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.errors import CalibrationError, SkidlocError
+from motion_models.prior import unused_terms_notes
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
@@ -107,6 +108,8 @@ class Diagnose:
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
             found = self._with_suited_model(found, drive)
+            notes = (*unused_terms_notes(robot, [model.name]), *found.diagnosis.warnings)
+            found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
         extended = None
         if self.extend:
             with console.status("searching for terms"):

@@ -154,7 +154,7 @@ def extend(
         return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
     whole = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))[0]
     left = _without(drive, predictor, search.removed) if search.effects else drive
-    again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config)
+    again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config, predictor.baseline)
     return ExtendedResult(_with_extension(again, extension), extension, whole.robot)
 
 

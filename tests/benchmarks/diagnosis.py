@@ -7,6 +7,9 @@ is given: to diagnose them again takes a third of the time.
 A case is determined by its number. No robot is exactly as its file: beside what is hidden, geometry, mounts, clocks, floor and gyro of each
 deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCE`), and intervals are to hold the hidden size.
 Tables come from the rows: `--report` prints them without running anything.
+
+`--public [--quick] [--sources simulator,mujoco,windows] [--out FILE.jsonl] [--drives FOLDER]` runs the public benchmark instead
+(`tests.helpers.diagnosis_public`): effects of 30 kinds, most in no list, and other methods beside the diagnosis.
 """
 
 from __future__ import annotations
@@ -34,6 +37,20 @@ from localization.logs import open_log
 from localization.simulation.faults import FAULTS
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
+from tests.helpers.diagnosis_public import (
+    EFFECTS,
+    FLAT_K,
+    METHODS,
+    QUICK,
+    SOURCES,
+    baseline_of,
+    cases,
+    flat_k,
+    is_installed,
+    score,
+    simulate,
+    table,
+)
 from tests.helpers.diagnosis_rivals import oracle, rivals
 from tests.helpers.diagnosis_scores import report
 
@@ -194,6 +211,32 @@ def _is_true(effect: Cause, state: Linearization) -> bool:
     return effect.id != "slope" or effect.at_s is None
 
 
+def run_public(sources: tuple[str, ...], names: tuple[str, ...], out: Path, folder: Path | None) -> None:
+    """Run the cases that the file ``out`` does not have, append a row for each method, and print the table."""
+    folder = folder or Path(tempfile.mkdtemp())
+    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    done = {(row["source"], row["effect"], row["method"]) for row in rows}
+    methods = [method for method in METHODS if is_installed(method)]
+    for source in sources:
+        k = flat_k(simulate(source, "train", "", 0.0, folder)) if source == "mujoco" else FLAT_K[0]
+        if not FLAT_K[0] <= k <= FLAT_K[1]:
+            raise SystemExit(f"{source}: k of turns in place is {k:.3f}, and {FLAT_K[0]} to {FLAT_K[1]} on real floors.")
+        if source == "mujoco":
+            print(f"mujoco: k of turns in place on flat ground {k:.3f}")
+        baseline = baseline_of(source, folder)
+        for _, name, *drives in cases((source,), names, folder):
+            for method in methods:
+                if (source, name, method) in done:
+                    continue
+                row = {"source": source, **score(method, name, (drives[0], drives[1], drives[2]), baseline)}
+                rows.append(row)
+                with out.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+                shown = f"{row['removed']:+.2f} removed" if row["removed"] == row["removed"] else ""
+                print(f"{source:10s} {name:36s} {method:28s} {', '.join(row['names'][:2]) or '-':60s} {shown}", flush=True)
+    print(table([row for row in rows if row["source"] in sources and row["effect"] in names]))
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", default=f"0:{CASES}", metavar="A:B[:STEP]")
@@ -201,7 +244,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--drives", type=Path, default=None, metavar="FOLDER")
     parser.add_argument("--rivals", action="store_true", help="other methods on the same signatures as well")
     parser.add_argument("--report", action="store_true")
+    parser.add_argument("--public", action="store_true", help="effects of all kinds, and other methods beside the diagnosis")
+    parser.add_argument("--quick", action="store_true", help="with --public: five effects, in minutes")
+    parser.add_argument("--sources", default=",".join(SOURCES), help="with --public: generators of drives")
     options = parser.parse_args(arguments if arguments is not None else ([] if __name__ != "__main__" else None))
+    if options.public:
+        run_public(tuple(options.sources.split(",")), QUICK if options.quick else tuple(EFFECTS), options.out, options.drives)
+        return
     numbers = range(*(int(number) for number in options.cases.split(":")))
     rows = [json.loads(line) for line in options.out.read_text().splitlines()] if options.out.exists() else []
     done = {row["number"] for row in rows}

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy.stats import chi2
 
 from localization.commands.diagnose import Diagnose
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.extension import extend
+from localization.diagnosis.terms import find_terms
 from motion_models.calibration.maneuvers import Maneuver, windows_text
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
@@ -92,3 +94,23 @@ def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> N
     assert extension.check.windows == 20  # of the second half, windows 4 to 7, 12 to 15, ...
     assert set(extension.check.before) >= {"x", "y", "yaw"}
     assert extension.check.replays["odometry"].after_m < extension.check.replays["odometry"].before_m
+
+
+@pytest.mark.parametrize("drawn", [pytest.param(range(12), marks=pytest.mark.extended), pytest.param(range(40), marks=pytest.mark.slow)])
+def test_find_terms_sigmas_are_those_of_their_errors(drawn: range) -> None:
+    """The root mean square of errors over sigmas is within the 99 % interval of chi squared; the selection of terms among candidates is
+    part of it."""
+    name = "pioneer_3dx"
+    plain, model = load_robot(name), ROBOTS[name]
+    errors_over_sigma = []
+    for seed in drawn:
+        hidden = random_term(seed)
+        drive = windows([dataclasses.replace(plain, terms={model: (hidden,)})] * 40, model, seed)
+        search = find_terms(
+            examine(drive_of_table("drive.csv", plain, drive, "windows"), make_model(model, plain)), np.random.default_rng(0)
+        )
+        assert search is not None
+        errors_over_sigma += [(t.term.value - hidden.value) / t.term.sigma for t in search.terms if t.term.name == hidden.name]
+    assert len(errors_over_sigma) >= 0.9 * len(drawn)
+    low, high = np.sqrt(chi2.ppf([0.005, 0.995], len(errors_over_sigma)) / len(errors_over_sigma))
+    assert low < np.sqrt(np.mean(np.square(errors_over_sigma))) < high

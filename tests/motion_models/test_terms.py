@@ -146,3 +146,9 @@ def test_ekf_estimates_terms_with_an_honest_covariance() -> None:
         inside.append(within[-2:])
     assert 0.5 < np.mean(nees) < 1.6  # 12 runs of 7 numbers: 1 +- .15, and correlated walks
     assert np.mean(inside) > 0.7  # of 90 %; 24 numbers
+
+
+@pytest.mark.parametrize(("written", "meant"), [("omega", "wz"), ("speed", "v"), ("w", "wz"), ("yaw_rate", "wz"), ("acceleration", "dv")])
+def test_parse_expression_other_name_of_a_variable_names_ours(written: str, meant: str) -> None:
+    with pytest.raises(RobotError, match=rf"unknown variable '{written}'.*did you mean {meant}\?"):
+        parse_expression(f"{written}*abs({written})")
