@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from localization.lidar.correlative_search import prior_outlier_cov
 from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanobis
 from localization.lidar.scan_matcher import MIN_POINTS
 from localization.lidar.submap import voxel_means
@@ -45,6 +46,9 @@ _MAX_MARGIN, _POINTS = 0.5, 200.0
 _TRACK_GAIN, _CONTRADICTION = 3.0, 5.0
 """Log-odds of a keyframe that is tracked: the first times (share on walls - the second times share in free space). Right places have 0.86
 and 0.04 in the median, 0.69 and 0.13 at the ends of 90 %; the best of wrong ones 0.6 and 0.12."""
+_FITTING = 1.0
+"""Log-odds of a keyframe that contradicts the place, from which on a pose farther from the odometry's is taken instead: nine of ten right
+places have more, the best of wrong ones 0."""
 _KNOWN_SHARE, _CONTRADICTING_SHARE = 0.5, 0.2
 """Share of points in mapped space, below which a scan is no evidence for or against the place, unless the second share is in free space."""
 _MAX_SEARCH_ODDS, _MAX_LOG_ODDS = 5.0, 8.0
@@ -54,6 +58,18 @@ _PATIENCE, _MAX_WAIT = 6, 3
 _TRACKED_M, _TRACKED_RAD, _LEAST_MARGIN = 0.5, 0.3, 0.1
 """Sigma of a pose that is tracked, at most, through places that the map does not have; margin of the score over the next place, by which
 it is found again where the map goes on."""
+_NEAR_M, _NEAR_RAD = 3.0, 0.8
+"""Sigma of a pose by odometry alone since it was tracked, up to which it is searched about that: 3 sigma are a building."""
+_PRIOR_SQUARE = 9.0
+"""A search agrees with an earlier place within 3 sigma of the odometry since, and of `_SAME_COV`."""
+_SAME_COV = np.diag([0.1, 0.1, 0.033]) ** 2
+"""Covariance of a searched pose against another of the same place [m^2, m^2, rad^2]."""
+_RECKONED_SHARE = 0.2
+"""Sigma of a pose by odometry since it was tracked, over the extent of the map, up to which that pose confirms a search."""
+_INDEPENDENT_M = 1.0
+"""Way between the first and the last of the scans that are searched, from which on they are more than the same view again [m]."""
+_NEW_VIEW_M = 2.0 / math.pi
+"""Way that a turn counts for, where the LiDAR does not measure all around: after 90 degrees half of a view of 180 is new [m/rad]."""
 _INITIAL_KEYFRAMES = 10
 """Keyframes after which a given pose that no scan confirms is dropped."""
 INITIAL_COV = np.diag([0.5, 0.5, 0.26]) ** 2
@@ -73,6 +89,10 @@ class Hypothesis:
 class _Keyframe:
     odometry: Pose2
     points: Points2
+    cov: Cov3
+    """(3, 3) of the motion since."""
+    way_m: float
+    """Way that the robot had driven there, turns to new views included [m]."""
 
 
 class Localizer:
@@ -91,6 +111,8 @@ class Localizer:
         self.hypotheses: Sequence[Hypothesis] = ()
         """Places that a search found, the most probable first."""
         self._initial_left = 0
+        self._is_reckoned = False  # the pose is by odometry since it was tracked, and was not refuted
+        self._travelled_m, self._searched_m, self._since_search = 0.0, 0.0, np.zeros((3, 3))
         self._failures, self._wait = 0, 0
         self._running: BackgroundSearch | None = None
         if initial is not None:
@@ -98,7 +120,7 @@ class Localizer:
 
     def set_pose(self, pose: Pose2, cov: Cov3 = INITIAL_COV) -> None:
         """Search near ``pose`` (3,) with covariance ``cov`` (3, 3), as a person gives it."""
-        self.state, self._is_tracking, self.hypotheses = "searching", False, ()
+        self.state, self._is_tracking, self._is_reckoned, self.hypotheses = "searching", False, False, ()
         self.pose, self._cov, self._search_odds = np.asarray(pose, dtype=float), cov, 0.0
         self._initial_left, self._failures, self._wait = _INITIAL_KEYFRAMES, 0, 0
         self._recent.clear()
@@ -119,6 +141,8 @@ class Localizer:
         """(3, 3) of the right perturbation of `pose`, with the map's own; of a place that is not known, with the extent of the map."""
         if self.state == "localized":
             return np.asarray(self._cov + self.places.map_cov(self.pose))
+        if self.state == "searching" and self._is_reckoned:
+            return np.asarray(self._cov + self.places.map_cov(self.pose))
         return self._cov if self._initial_left else np.asarray(self._cov + self.places.extent_cov)
 
     def add(self, odometry: Pose2, points: Points2, delta: Pose2, cov: Cov3) -> None:
@@ -126,19 +150,23 @@ class Localizer:
         ``cov`` (3, 3) since the one before."""
         if not is_narrow(cov):  # carried, or driven blind: scans before and after do not belong together
             self._recent.clear()
-            self._running = None
+            self._running, self.hypotheses = None, ()
         A = se2.adjoint(se2.inverse(delta))
         self.pose, self._cov = se2.compose(self.pose, delta), A @ self._cov @ A.T + cov
-        self.hypotheses = [Hypothesis(se2.compose(place.pose, delta), place.probability) for place in self.hypotheses]
+        self._travelled_m += math.hypot(delta[0], delta[1]) + (_NEW_VIEW_M * abs(delta[2]) if _is_partial(points) else 0.0)
+        self._since_search = A @ self._since_search @ A.T + cov
+        self.hypotheses = [replace(place, pose=se2.compose(place.pose, delta)) for place in self.hypotheses]
+        moved = [replace(key, cov=A @ key.cov @ A.T + cov) for key in self._recent]
+        self._recent = deque((key for key in moved if is_narrow(key.cov)), _SEARCH_KEYFRAMES)
         if self._running is not None:
             self._running.move(delta, cov)
         if len(points) < MIN_POINTS:
             return
-        self._recent.append(_Keyframe(odometry, points))
+        self._recent.append(_Keyframe(odometry, points, np.zeros((3, 3)), self._travelled_m))
         if self._is_tracking and _is_trackable(self._cov):
             self._track(points)
-        elif self._is_tracking:
-            self._is_tracking, self.state = False, "lost"
+        elif self._is_tracking or self._is_reckoned:
+            self._reckon()
         if self.state == "localized":
             self._running = None
         elif self._running is None:
@@ -168,23 +196,36 @@ class Localizer:
 
     def _track(self, points: Points2) -> None:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
-        place = self._align(points)
+        place, cov = self._align(points), self._cov
         if place is None or (place.on_walls + place.contradicting < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE):
             return
-        R = np.asarray(np.linalg.inv(place.fit.information + _OPEN)) * max(place.residual_variance, 1.0) + _BEND
-        measured = se2.compose(place.pose, se2.exp(-np.linalg.solve(place.fit.information + _OPEN, place.fit.gradient)))
-        is_outlier = mahalanobis(self.pose, measured, self._cov + R) > OUTLIER_SIGMAS**2
-        evidence = _TRACK_GAIN * (place.on_walls - _CONTRADICTION * place.contradicting)
-        self._track_odds = min(self._track_odds + (-_TRACK_GAIN if is_outlier else evidence), _MAX_LOG_ODDS)
+        evidence = self._evidence(place, cov)
+        if evidence < -_TRACK_GAIN:  # the odometry may be an outlier, as by slip in a turn
+            wide = cov + prior_outlier_cov(cov)
+            again = self.places.align(points, self.pose, wide)
+            if self._evidence(again, wide) >= _FITTING:
+                place, cov, evidence = again, wide, self._evidence(again, wide)
+        self._track_odds = min(self._track_odds + evidence, _MAX_LOG_ODDS)
         self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
         if self.state == "localized" and _sigmoid(self._track_odds) < _LOST:
             self._lose()
         elif self.state == "lost" and _sigmoid(self._track_odds) >= LIKELY:
             self.state = "localized"
-        if not is_outlier:
-            K = np.linalg.solve(self._cov + R, self._cov).T
+        measured, R = _measurement(place)
+        if not self._is_outlier(measured, cov + R):
+            K = np.linalg.solve(cov + R, cov).T
             self.pose = se2.compose(self.pose, se2.exp(K @ se2.log(se2.between(self.pose, measured))))
-            self._cov = np.asarray((np.eye(3) - K) @ self._cov @ (np.eye(3) - K).T + K @ R @ K.T)
+            self._cov = np.asarray((np.eye(3) - K) @ cov @ (np.eye(3) - K).T + K @ R @ K.T)
+
+    def _evidence(self, place: Place, cov: Cov3) -> float:
+        """Log-odds that ``place`` adds to the one that is tracked, whose pose has covariance ``cov`` (3, 3)."""
+        measured, R = _measurement(place)
+        if self._is_outlier(measured, cov + R):
+            return -_TRACK_GAIN
+        return _TRACK_GAIN * (place.on_walls - _CONTRADICTION * place.contradicting)
+
+    def _is_outlier(self, measured: Pose2, cov: Cov3) -> bool:
+        return mahalanobis(self.pose, measured, cov) > OUTLIER_SIGMAS**2
 
     def _align(self, points: Points2) -> Place | None:
         """Near the pose; searched within 3 sigma where that is wider than the basin of an alignment, and None where that is ambiguous."""
@@ -193,9 +234,15 @@ class Localizer:
         found = self.places.search(points, self.pose, _three_sigma(self._cov))
         return found[0] if found and (len(found) == 1 or found[0].score - found[1].score > _LEAST_MARGIN) else None
 
+    def _reckon(self) -> None:
+        """The pose is too wide to align scans: search about it, or everywhere where it is wider than that."""
+        self._is_tracking, self._is_reckoned = False, True
+        is_near = np.trace(self._cov[:2, :2]) < _NEAR_M**2 and self._cov[2, 2] < _NEAR_RAD**2
+        self.state = "searching" if is_near else "lost"
+
     def _lose(self) -> None:
         """The place was wrong, or the map is: search anywhere, by the scans from now on."""
-        self.state, self.hypotheses, self._search_odds = "lost", (), -_MAX_SEARCH_ODDS
+        self.state, self._is_reckoned, self.hypotheses, self._search_odds = "lost", False, (), -_MAX_SEARCH_ODDS
         self._failures = self._wait = 0
         last = self._recent[-1]
         self._recent.clear()
@@ -210,11 +257,12 @@ class Localizer:
         self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
         here = self._recent[-1].odometry
         merged = np.vstack([se2.transform(se2.between(here, key.odometry), key.points) for key in self._recent])
-        near = (self.pose, _three_sigma(self._cov)) if self._initial_left else None
+        is_near = self._initial_left > 0 or (self._is_reckoned and self.state == "searching")
+        near = (self.pose, _three_sigma(self._cov)) if is_near else None
         if self._initial_left:
             self._initial_left -= 1
             self._cov = self._cov if self._initial_left else np.zeros((3, 3))
-        points = voxel_means(merged, 0.8 * CELL_M)
+        points, self._searched_m = voxel_means(merged, 0.8 * CELL_M), self._travelled_m - self._recent[0].way_m
         if self._is_background:
             self._running = BackgroundSearch(self.places, points, near)
         else:
@@ -223,25 +271,51 @@ class Localizer:
     def _conclude(self, places: Sequence[Place], n_points: int, moved: Pose2, moved_cov: Cov3) -> None:
         """Take the best of ``places``, which ``n_points`` have found before the robot ``moved`` (3,), if it is probable and the search
         before agrees."""
-        before = self.hypotheses
-        self.hypotheses = [Hypothesis(se2.compose(place.pose, moved), place.probability) for place in _weigh(places, n_points)]
-        self._search_odds = _log_odds(self.hypotheses[0].probability) if places else -_MAX_SEARCH_ODDS
-        if self.probability < LIKELY or not self._is_continued(before):
+        before, since_cov = self.hypotheses, self._since_search
+        self._since_search = moved_cov
+        self.hypotheses = [replace(place, pose=se2.compose(place.pose, moved)) for place in _weigh(places, n_points)]
+        self._search_odds = -_MAX_SEARCH_ODDS
+        if not places:
             return
+        best = self.hypotheses[0]
+        is_repeated = self._searched_m >= _INDEPENDENT_M and any(_agree(place.pose, best.pose, since_cov) for place in before)
+        is_confirmed = is_repeated or self._is_reckoned_at(best.pose)
+        probability = best.probability if is_confirmed else min(best.probability, LIKELY)
+        self.hypotheses = [replace(best, probability=probability), *self.hypotheses[1:]]
+        self._search_odds = _log_odds(probability)
         cov = np.asarray(np.linalg.inv(places[0].fit.information + _OPEN)) * max(places[0].residual_variance, 1.0)
-        if not is_narrow(cov):
-            return
-        A = se2.adjoint(se2.inverse(moved))
-        self.pose, self._cov = self.hypotheses[0].pose, A @ (cov + _BEND) @ A.T + moved_cov
-        self._is_tracking, self.state = True, "localized"
-        self._track_odds, self._initial_left, self._failures, self._wait = self._search_odds, 0, 0, 0
+        if is_confirmed and probability >= LIKELY and is_narrow(cov):
+            A = se2.adjoint(se2.inverse(moved))
+            self._begin_tracking(best.pose, A @ (cov + _BEND) @ A.T + moved_cov)
 
-    def _is_continued(self, before: Sequence[Hypothesis]) -> bool:
-        """Whether the best place is where the odometry leads to from one of the search ``before``."""
-        if len(self._recent) < 2:
-            return False
-        off = [se2.between(place.pose, self.hypotheses[0].pose) for place in before]
-        return any(math.hypot(x, y) < 0.3 and abs(yaw) < 0.1 for x, y, yaw in off)
+    def _is_reckoned_at(self, pose: Pose2) -> bool:
+        """Whether the odometry leads to ``pose`` (3,) from where the robot was tracked, and to few other places of the map."""
+        variance, whole = np.trace(self._cov[:2, :2]), np.trace(self.places.extent_cov[:2, :2])
+        return self._is_reckoned and variance < _RECKONED_SHARE**2 * whole and _agree(self.pose, pose, self._cov)
+
+    def _begin_tracking(self, pose: Pose2, cov: Cov3) -> None:
+        """The robot is at ``pose`` (3,) with covariance ``cov`` (3, 3)."""
+        self.pose, self._cov, self._track_odds = pose, np.asarray(cov), self._search_odds
+        self._is_tracking, self._is_reckoned, self.state = True, False, "localized"
+        self._initial_left, self._failures, self._wait = 0, 0, 0
+
+
+def _is_partial(points: Points2) -> bool:
+    """Whether the bearings of ``points`` (N, 2) leave a quarter of a turn open."""
+    bearings = np.sort(np.arctan2(points[:, 1], points[:, 0]))
+    return len(points) < 2 or float(np.diff(bearings, append=bearings[0] + 2.0 * math.pi).max()) > 0.5 * math.pi
+
+
+def _measurement(place: Place) -> tuple[Pose2, Cov3]:
+    """Pose (3,) that the scan alone gives in the map, and its covariance (3, 3)."""
+    information = place.fit.information + _OPEN
+    measured = se2.compose(place.pose, se2.exp(-np.linalg.solve(information, place.fit.gradient)))
+    return measured, np.asarray(np.linalg.inv(information)) * max(place.residual_variance, 1.0) + _BEND
+
+
+def _agree(earlier: Pose2, pose: Pose2, cov: Cov3) -> bool:
+    """Whether ``pose`` (3,) is where the odometry leads to from an ``earlier`` one, with covariance ``cov`` (3, 3)."""
+    return mahalanobis(earlier, pose, cov + _SAME_COV) < _PRIOR_SQUARE
 
 
 def _weigh(places: Sequence[Place], n_points: int) -> list[Hypothesis]:

@@ -41,6 +41,17 @@ def make_walls(rng: np.random.Generator, width: float = 24.0, height: float = 14
     return np.array(walls)
 
 
+def make_equal_rooms(rng: np.random.Generator, n: int = 7, width: float = 4.0, depth: float = 4.0) -> np.ndarray:
+    """(W, 4) walls of a corridor with ``n`` rooms that are equal to the last piece of furniture [m]: from the middle no end is in reach."""
+    door, (x, y) = rng.uniform(0.4, width - 0.4 - _DOOR_M), rng.uniform([0.5, 2.8], [width - 1.4, 2.0 + depth - 1.2])
+    walls: list[tuple[float, float, float, float]] = list(box(0.0, 0.0, n * width, 2.0 + depth))
+    for left in width * np.arange(n):
+        right = left + width
+        walls += [(left, 2.0, left + door, 2.0), (left + door + _DOOR_M, 2.0, right, 2.0), (right, 2.0, right, 2.0 + depth)]
+        walls += box(left + x, y, left + x + 0.7, y + 0.6)
+    return np.array(walls)
+
+
 def change(walls: np.ndarray, rng: np.random.Generator, share: float = 0.1) -> np.ndarray:
     """``walls`` (W, 4), of whose inner ones the ``share`` is changed: a third each moved by 0.3 to 1 m, removed, and added as boxes."""
     inner, rest = walls[4:].copy(), rng.permutation(len(walls) - 4)[: max(round(share * (len(walls) - 4)), 3)]

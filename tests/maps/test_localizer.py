@@ -12,7 +12,7 @@ from localization.errors import MapError
 from localization.maps.localizer import LIKELY, Localizer
 from localization.maps.place_search import PlaceMap
 from motion_models import se2
-from tests.helpers import floor_plan
+from tests.helpers import floor_plan, office_floor
 from tests.helpers.floor_plan import HALL, OFFICE, path
 
 COV = np.diag([0.01, 0.01, 0.005]) ** 2
@@ -133,3 +133,37 @@ def test_localizer_with_a_sensor_of_another_height_is_never_wrong(office: PlaceM
     tops = np.vstack([floor_plan.box(10.5, 5.0, 11.5, 5.8), floor_plan.box(1.5, 6.0, 3.5, 7.0)])
     found = drive(Localizer(office), np.vstack([OFFICE[:7], OFFICE[11:12], OFFICE[-5:-4], tops]), WAY)
     assert all(error < 0.3 for state, error in found if state == "localized")
+
+
+def test_localizer_by_one_view_again_and_again_is_not_certain(office: PlaceMap) -> None:
+    localizer = Localizer(office)
+    for k in range(6):
+        localizer.add(np.zeros(3), floor_plan.scan(OFFICE, WAY[0], seed=k), np.zeros(3), COV)
+        assert localizer.state == "searching"
+        assert localizer.probability < LIKELY + 1e-9
+    assert math.hypot(*(localizer.hypotheses[0].pose[:2] - WAY[0, :2])) < 0.05
+
+
+def test_localizer_beyond_the_map_keeps_its_pose_and_is_found_near_it(office: PlaceMap) -> None:
+    """Odometry alone: searched about its pose, with its covariance and not that of the whole map, and never lost."""
+    localizer = Localizer(office)
+    assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"
+    nothing, grown = np.column_stack([np.linspace(3.0, 5.0, 50), np.full(50, 40.0)]), np.diag([0.1, 0.1, 0.12]) ** 2
+    for _ in range(9):
+        localizer.add(np.zeros(3), nothing, np.zeros(3), grown)
+    assert localizer.state == "searching"
+    assert 0.3 < math.sqrt(localizer.covariance[2, 2]) < 0.5
+    found = drive(localizer, OFFICE, WAY[8:12], grown)
+    assert found[0][0] == "localized"
+    assert found[0][1] < 0.1
+
+
+def test_localizer_among_equal_rooms_lists_them_and_is_never_wrong() -> None:
+    rng = np.random.default_rng(1)
+    walls = office_floor.make_equal_rooms(rng)
+    localizer = Localizer(PlaceMap(floor_plan.make_map(walls, office_floor.drive(walls, rng, 150)), 0.02))
+    room = path((14.0, 1.0), (13.0, 1.0), (13.0, 1.0), (14.5, 1.0), step=0.5)
+    assert {state for state, _ in drive(localizer, walls, room)} == {"searching"}
+    rooms = {round((place.pose[0] - room[-1, 0]) / 4.0) for place in localizer.hypotheses}
+    assert {-1, 0, 1} <= rooms
+    assert localizer.hypotheses[0].probability < 0.5
