@@ -31,11 +31,9 @@ class Option:
 
 
 def short_help(command: str, class_name: str) -> str | None:
-    """Text for ``skidloc command --help``; None where the command has subcommands or inherits its options."""
-    tree = ast.parse((files("localization.commands") / f"{command}.py").read_text(encoding="utf-8"))
-    found = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == class_name)
-    options = _options(found)
-    if found.bases or any(option.name == "action" for option in options):
+    """Text for ``skidloc command --help``; None where the command has subcommands."""
+    found, options = _class(f"localization.commands.{command}", class_name)
+    if any(option.name == "action" for option in options):
         return None
     required = [o.flag if o.is_positional else f"{o.flag} {o.name.upper()}" for o in options if o.is_required]
     lines = [f"usage: skidloc {command} {' '.join(required)} [OPTIONS]", "", ast.get_docstring(found) or "", ""]
@@ -48,6 +46,19 @@ def short_help(command: str, class_name: str) -> str | None:
     if groups:
         lines += ["", f"{' and '.join(groups)}: settings, each with its default; `skidloc {command} --help-all` lists them."]
     return "\n".join(lines)
+
+
+def _class(module: str, name: str) -> tuple[ast.ClassDef, list[Option]]:
+    """Class ``name`` of ``module``, and its options after those that it inherits."""
+    package, *folders, file = module.split(".")
+    tree = ast.parse(files(package).joinpath(*folders, f"{file}.py").read_text(encoding="utf-8"))  # no folder's __init__ is run
+    found = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+    inherited: list[Option] = []
+    for base in (base.id for base in found.bases if isinstance(base, ast.Name)):
+        source = next((node for node in tree.body if isinstance(node, ast.ImportFrom) and base in (a.name for a in node.names)), None)
+        if source is not None and source.module is not None:
+            inherited += _class(source.module, base)[1]
+    return found, [*inherited, *_options(found)]
 
 
 def _options(node: ast.ClassDef) -> list[Option]:

@@ -30,7 +30,7 @@
     const path = {x: column(rows, X), y: column(rows, Y), customdata: rows.map(row => [row[T], row[SIGMA]]), name: "path", mode: "lines",
       line: {color: colour("blue"), width: 2}, hovertemplate: "%{customdata[0]:.1f} s<br>%{x:.2f}, %{y:.2f} m<br>sigma %{customdata[1]:.3g} m<extra></extra>"};
     const traces = [dots(state.map, "map", "grey", 2), dots(state.scan, "scan", "red", 3), path, line(ellipse(), "2 sigma", "orange", 2), line(outline(), "robot", "ink", 2)];
-    const size = Math.min(Math.max(box("map").clientWidth * .62, 300), 560);
+    const width = box("map").clientWidth, size = width < 500 ? width + 40 : Math.min(Math.max(width * .62, 300), 560);
     Plotly.react(box("map"), traces, layout({height: size, dragmode: "pan", uirevision: "map", xaxis: axis("x [m]"),
       yaxis: axis("y [m]", {scaleanchor: "x", scaleratio: 1})}), config);
   };
@@ -54,7 +54,7 @@
       more["yaxis" + (i ? i + 1 : "")] = axis("", {domain: [Math.max(top - height, 0), top], ...(i < 2 ? {type: "log", ...logTicks} : {}), automargin: true});
       more.annotations.push({text: titles[i], xref: "paper", yref: "paper", x: 0, y: top, showarrow: false, xanchor: "left", yanchor: "bottom", font: {size: 12, color: colour("soft")}});
     }
-    Plotly.react(box("time"), traces, layout(more), {...config, scrollZoom: false});
+    Plotly.react(box("time"), traces, layout({...more, showlegend: box("time").clientWidth >= 500}), {...config, scrollZoom: false});
   };
   const drawTexts = () => {
     const last = state.samples[state.samples.length - 1], list = box("parameter"), found = state.warnings;
