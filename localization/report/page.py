@@ -210,6 +210,11 @@ class Section:
     is_static: bool = False
     """For paper and browsers without scripts: an `Explorer` shows the same."""
 
+    @property
+    def style(self) -> str:
+        """Class of the element: "drawn" where there is nothing on paper."""
+        return "static" if self.is_static else "drawn" if all(block.kind in _SCRIPTS for block in self.blocks) else ""
+
 
 @dataclass(frozen=True)
 class Page:
