@@ -176,6 +176,25 @@ def _signals(log: Log, gathered: Mapping[str, Sequence[Any]], first_ns: int, mov
     return WheelSignals(joints, left, rates, angle_rates, turns, speeds, is_upright, jumps, first_ns, float(edges[0]))
 
 
+def signals_of_readings(
+    wheels: Sequence[JointReading], gyro: Sequence[ImuSample], mounts: Mapping[str, Mount], joints: tuple[tuple[str, ...], tuple[str, ...]]
+) -> WheelSignals | None:
+    """Signals of live readings of the ``joints`` (left, right) and the gyro; None for too short a time."""
+    first_ns = wheels[0].stamp_ns
+    t = _seconds(wheels, first_ns)
+    edges = np.arange(0.0, t[-1], STEP_S)
+    if len(edges) < 3:
+        return None
+    rates = _mean_rates(t, np.array([reading.velocity for reading in wheels]), edges)
+    angles, _ = _continuous(np.array([reading.position for reading in wheels]))
+    turns: dict[str, FloatArray] = {}
+    is_upright = True
+    if gyro:
+        turns["gyro"], is_upright = _gyro(gyro, mounts, edges, first_ns)
+    of_angles = _differences(t, angles, edges)
+    return WheelSignals((*joints[0], *joints[1]), len(joints[0]), rates, of_angles, turns, {}, is_upright, first_ns=first_ns)
+
+
 def _seconds(readings: Sequence[Any], first_ns: int) -> FloatArray:
     return np.array([reading.stamp_ns - first_ns for reading in readings], dtype=float) * 1e-9
 

@@ -19,6 +19,7 @@ import numpy as np
 from localization.calibration.wheel_signals import STEP_S, WheelSignals, lidar_motion, read_signals
 from localization.calibration.wheel_units import CORRECTED, UnitReport, check_units, expected_scaling, gyro_in_degrees, is_in_degrees
 from localization.logs import Log, TopicOverrides, open_log
+from localization.logs.topic_roles import Sources
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -132,6 +133,28 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     sentences = (*found.findings, *(text if text.startswith("the gyro") else f"{wheels}: {text}" for text in units.findings))
     robot = _with_unknown_signs(units.robot) if units.is_ambiguous else units.robot
     return WiringReport(robot, sentences, {**found.keys, **units.keys}, units.is_ambiguous, {**found.correlations}, units.ratios)
+
+
+@dataclass(frozen=True)
+class LiveSensors:
+    """A robot and its topics, where no log is."""
+
+    robot: Robot
+    sources: Sources
+
+
+def check_live(sensors: LiveSensors, signals: WheelSignals) -> WiringReport:
+    """Signs, sides and units of live wheels against the gyro; `WiringReport.robot` is what to write."""
+    base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
+    rates = signals.joint_rates
+    measured = correlations(signals, rates, base)
+    if not _is_accepted(signals, rates, base):
+        found = _best(signals, rates, _alternatives(signals, base))
+        if len({wiring.signature for wiring in found}) > 1:
+            return _ambiguous(sensors, [wiring.text for wiring in found], measured)
+        return _certain(sensors, signals, found[0], measured) if found else WiringReport(sensors.robot, correlations=measured)
+    units = check_units(signals, sensors.robot)
+    return WiringReport(units.robot, units.findings, units.keys, units.is_ambiguous, measured, units.ratios)
 
 
 def _joined(first: WiringReport, then: WiringReport) -> WiringReport:
@@ -383,7 +406,7 @@ def _numbers(measured: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:+.2f}" for name, value in measured.items())
 
 
-def _ambiguous(log: Log, ways: Sequence[str], measured: Mapping[str, float]) -> WiringReport:
+def _ambiguous(log: Log | LiveSensors, ways: Sequence[str], measured: Mapping[str, float]) -> WiringReport:
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     used = {
         "a gyro": log.sources.imu is not None,
@@ -401,7 +424,7 @@ def _ambiguous(log: Log, ways: Sequence[str], measured: Mapping[str, float]) -> 
     return WiringReport(_with_unknown_signs(log.robot), (text,), is_ambiguous=True, correlations=measured)
 
 
-def _certain(log: Log, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
+def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
     """Report with the robot corrected. A LiDAR's mount is left to the sensor checks, which measure its angle."""
     if wiring.lidar != (1.0, 1.0):
         return WiringReport(log.robot, correlations=measured)

@@ -6,7 +6,7 @@ that may still come: an event goes to the pipeline when it is here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -50,6 +50,8 @@ class LiveStream:
         self._decoders = {source.topic: decoder(source.type or TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}
         self.payloads = Payloads(robot, parts.arms, discovered.mounts)
+        self.on_reading: Callable[[Any], None] | None = None
+        """Called with each reading as its driver published it, before anything is left out."""
 
     @property
     def wheel_angles(self) -> WheelAngles:
@@ -73,6 +75,8 @@ class LiveStream:
         if item is None:
             return
         for reading in self._merger.insert(item):
+            if self.on_reading is not None:
+                self.on_reading(reading)
             if isinstance(reading, ArmReading):
                 self.payloads.insert_joints(reading)
             for event in self._event_decoder.events(reading):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from localization.calibration.lidar_yaw import LidarYawCheck, corrected
+from localization.calibration.wheel_wiring import LiveSensors
 from localization.errors import CheckpointError
 from localization.estimators import Estimate, MapFusion, PriorMap
 from localization.events import Event, Scan
@@ -28,6 +29,7 @@ from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics,
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.lidar_entrance import LidarEntrance
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
+from localization.ros.live_wiring import LiveWiring
 from localization.ros.operator_commands import OperatorCommands
 from localization.ros.payloads import Payloads
 from localization.ros.publisher import EstimatePublisher, Predictor
@@ -71,6 +73,7 @@ class Node:
         self._commands = OperatorCommands(self, transport, names, report)
         self._problems: set[str] = set()  # that were reported
         self._entrance: LidarEntrance | None = None
+        self._wiring_notes: list[str] = []
         self._next_status = self._next_path = self._next_map = -float("inf")
         self._newest_ns = 0
         self._begin_ns: int | None = None
@@ -136,6 +139,9 @@ class Node:
                 self._continue_from(self.session.head, discovered.start_ns)
             elif self._sources.lidar is not None and self._sources.wheels is not None:
                 self._entrance = LidarEntrance(LidarYawCheck(mounts, self._run.robot, self._sources.lidar.topic))
+            if not self.session.head and self._sources.wheels is not None and self._sources.wheels.kind == "joint_states":
+                wiring = LiveWiring(LiveSensors(self._run.robot, self._sources), mounts, discovered.parts.joints)
+                self._stream.on_reading = partial(self._check_wiring, wiring)
             for received in discovered.backlog:
                 self._receive(received)
             self._caught_up_ns = self._transport.now_ns()
@@ -248,7 +254,7 @@ class Node:
 
     def warnings(self) -> list[str]:
         """Everything that was lost or corrected, as sentences."""
-        return list(dict.fromkeys([*self._stream.dropped(), *self.session.pipeline.warnings()]))
+        return list(dict.fromkeys([*self._wiring_notes, *self._stream.dropped(), *self.session.pipeline.warnings()]))
 
     @property
     def seconds(self) -> float:
@@ -311,6 +317,14 @@ class Node:
             self._predictor.stop()
         if self.session.view is not None:
             self.session.view.begin(self._run.robot, mounts)
+
+    def _check_wiring(self, wiring: LiveWiring, reading: Any) -> None:
+        """Report signs, sides and units that contradict the robot file; they stay among the warnings."""
+        for text in wiring.add(reading):
+            self._wiring_notes.append(text)
+            self._report(text)
+        if wiring.is_done:
+            self._stream.on_reading = None
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""
