@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from localization.evaluation.scores import Result, score
     from localization.logs import Log, TopicOverrides, open_log
     from localization.pipeline import ReplayConfig, Run, Trial, replay
+    from localization.synchronizer import StepConfig
     from localization.trajectory import Trajectory, read_tum, write_tum
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "ReplayConfig",
     "Result",
     "Run",
+    "StepConfig",
     "TopicOverrides",
     "Trajectory",
     "Trial",
@@ -43,6 +45,7 @@ _MODULES = {
     "localization.evaluation.scores": "Result score",
     "localization.logs": "Log TopicOverrides open_log",
     "localization.pipeline": "ReplayConfig Run Trial replay",
+    "localization.synchronizer": "StepConfig",
     "localization.trajectory": "Trajectory read_tum write_tum",
 }
 __getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names.split()})

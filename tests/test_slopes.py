@@ -13,7 +13,7 @@ from localization.logs import open_log
 from localization.pipeline import ReplayConfig, Trial, replay
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.sensors import SensorConfig
-from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
+from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
 from localization.synchronizer import StepConfig
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.registry import make_model
@@ -108,3 +108,17 @@ def test_slope_effect_beyond_the_limits_is_level_and_named():
     found, is_limited = effect.twist(skid, np.ones((3, 2)), np.zeros((3, 2)), skid.nominal, np.array([[0.0, 0.0], [1.2, 0.0], [0.0, 3.0]]))
     assert is_limited.tolist() == [False, True, True]
     np.testing.assert_allclose(found.twist.value, np.tile(skid.twist(np.ones(2), np.zeros(2), skid.nominal).value, (3, 1)), atol=1e-12)
+
+
+@pytest.mark.extended
+def test_simulated_ramp_is_measured_by_its_imu(tmp_path):
+    """`skidloc simulate ramp`: the robot slides downhill, and odometry with the tilt follows it."""
+    config = SimulationConfig(sensors=dataclasses.replace(SensorConfig(), lidar="none"), experiment=ExperimentConfig(laps=1))
+    write_simulation(tmp_path / "ramp.mcap", simulate("ramp", ROBOT, config=config), lambda _: None)
+    log = open_log(tmp_path / "ramp.mcap", ROBOT)
+    flat, _ = final_error(log, run_of(log, "friction", config=FLAT))
+    run = run_of(log, "friction")
+    tilted, _ = final_error(log, run)
+    assert flat > 1.0
+    assert tilted < flat / 5.0
+    assert np.degrees(2.0 * np.arcsin(np.hypot(*run.in_space.quaternions[-1, :2]))) == pytest.approx(8.0, abs=1.0)

@@ -71,6 +71,8 @@ class LogInfo:
     """What is missing or suspect, as sentences."""
     warnings: list[str]
     """What was chosen, corrected or lost, as sentences."""
+    tilt: str
+    """Whether the ground's tilt can be measured, and what that brings."""
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -178,6 +180,21 @@ def inspect_log(log: Log) -> LogInfo:
         {frame: dataclasses.asdict(mount) for frame, mount in sorted(mounts.items())},
         _find_problems(log, topics),
         log.warnings(),
+        _describe_tilt(log),
+    )
+
+
+def _describe_tilt(log: Log) -> str:
+    """Whether an IMU can measure how the ground tilts, and what that brings."""
+    imu, lidar = log.sources.imu, log.sources.lidar
+    frame = None if imu is None else log.frames.get(imu.topic)
+    if imu is None or frame not in log.mounts:
+        missing = "no IMU" if imu is None else f"no mount of the IMU's frame '{frame}'"
+        return f"not available: there is {missing}, and the ground is taken as level."
+    in_3d = f" `ekf` then registers the clouds of {lidar.topic} in 3D." if lidar is not None and lidar.kind == "points" else ""
+    return (
+        f"by the accelerometer of {imu.topic}. Where the ground tilts by over 3 deg, models take gravity on the slope into account, and "
+        f"poses have height, roll and pitch.{in_3d}"
     )
 
 

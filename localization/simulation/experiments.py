@@ -164,7 +164,7 @@ class ExperimentConfig(Settings):
     """How much of an experiment is driven."""
 
     laps: Count = 3
-    """Laps of `laps`, `corridor` (to and fro), `slippery_patch` and `payload_pickup` (before and after)."""
+    """Laps of `laps`, `corridor` (to and fro), `slippery_patch`, `ramp` and `payload_pickup` (before and after)."""
     hours: Positive = 10.0
     """Length of `soak` [h]."""
     payload_kg: float = 8.0
@@ -184,6 +184,8 @@ class Experiment:
     """Pose of the body in the world."""
     phases: Callable[[Robot, ExperimentConfig], Iterator[Phase]]
     with_gps: bool = False
+    slope_deg: float = 0.0
+    """By which the floor rises towards the world's +x [deg]."""
 
     def make_world(self) -> World:
         """The world by its name."""
@@ -327,6 +329,16 @@ def _payload_pickup(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
     yield Rest(2.0)
 
 
+def _ramp(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
+    yield Rest(3.0)
+    for lap in range(config.laps):
+        yield OpenLoop(f"turn_{lap + 1}", constant(0.0, 0.6), 20.0)
+        yield OpenLoop(f"arc_{lap + 1}", constant(0.4, 0.4), 8.0)
+        yield OpenLoop(f"turn_back_{lap + 1}", constant(0.0, -0.6), 20.0)
+        yield Route(np.array([[3.0, 0.0]]), config.speed_m_s, name=f"up_{lap + 1}")
+    yield Rest(3.0)
+
+
 def _soak(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
     """Never ends by itself: the simulation ends it after `ExperimentConfig.hours`."""
     postures = _postures(robot) if robot.arms is not None else None
@@ -348,6 +360,9 @@ _ALL = (
     Experiment("corridor", "a bare corridor of 60 m, there and back", "corridor", (0.0, 0.0, 0.0), _corridor),
     Experiment("slippery_patch", "laps over a wet patch, and turns on it", "slippery", (-3.0, -1.5, 0.0), _slippery_patch),
     Experiment("payload_pickup", "the same laps without and with a payload", "hall", (-3.0, -1.5, 0.0), _payload_pickup),
+    Experiment(
+        "ramp", "turns in place and arcs on a ramp of 8 degrees, which the IMU measures", "hall", (3.0, 0.0, 0.5), _ramp, slope_deg=8.0
+    ),
     Experiment("soak", "laps for hours, with GPS", "rooms", (0.0, -4.0, 0.0), _soak, with_gps=True),
 )
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in _ALL}

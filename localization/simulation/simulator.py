@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,8 @@ class Simulation:
         """Named phases that are over."""
         self.lidar_mount = nominal_mounts(robot)[self.config.sensors.lidar_frame]
         """The LiDAR's mount in the log's /tf_static."""
-        self.reality = apply_faults(TrueRobot(Body.from_robot(robot), self.lidar_mount), effects)
+        body = replace(Body.from_robot(robot), slope=math.radians(experiment.slope_deg))
+        self.reality = apply_faults(TrueRobot(body, self.lidar_mount), effects)
         self._body = self.reality.body
         self._masses = MassDistribution(robot)
         self._masses.pick_up(self.reality.payload_kg)

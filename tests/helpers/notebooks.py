@@ -20,7 +20,7 @@ _HEADER = {"kernelspec": {"display_name": "Python 3", "language": "python", "nam
 
 def sources() -> list[Path]:
     """The .py files in the order in which they are read."""
-    return sorted(FOLDER.glob("[0-9]_*.py"))
+    return sorted(FOLDER.glob("[0-9]*_*.py"), key=lambda path: int(path.name.split("_")[0]))
 
 
 def read(source: Path, changes: dict[str, str] | None = None) -> nbformat.NotebookNode:

@@ -11,7 +11,7 @@ import pytest
 from localization.errors import TopicError
 from localization.events import Scan, WheelSample
 from localization.logs import Log, TopicOverrides, inspect_log, open_log
-from motion_models.robot import Joints, Topics
+from motion_models.robot import Joints, Mount, Topics
 from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
@@ -259,3 +259,15 @@ def test_topic_ground_truth_in_a_namespace_is_the_reference(tmp_path: Path) -> N
 
 def test_topic_wheels_left_out_by_option_need_no_reason(tmp_path: Path) -> None:
     assert log_of(tmp_path, {"/scan": "scan"}, TopicOverrides(joint_states="")).no_wheels == ""
+
+
+def test_tilt_in_info_is_by_the_imu_and_takes_clouds_to_space(tmp_path: Path) -> None:
+    with_imu = log_of(tmp_path, {"/joint_states": "joints", "/points": "points", "/imu/data": "imu"})
+    placed = dataclasses.replace(ROBOT, mounts={**ROBOT.mounts, with_imu.frames["/imu/data"]: Mount()})
+    tilt = inspect_log(open_log(with_imu.path, placed)).tilt
+    assert tilt.startswith("by the accelerometer of /imu/data.")
+    assert "`ekf` then registers the clouds of /points in 3D" in tilt
+
+
+def test_tilt_in_info_without_an_imu_says_what_is_missing(tmp_path: Path) -> None:
+    assert inspect_log(log_of(tmp_path, {"/joint_states": "joints", "/scan": "scan"})).tilt.startswith("not available: there is no IMU")
