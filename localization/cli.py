@@ -150,10 +150,6 @@ def _run(name: str, options: Sequence[str]) -> None:
     tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,)).run(PlainConsole(highlight=False))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 def _expand(options: Sequence[str]) -> list[str]:
     """``options`` as tyro takes them: a flag of three states, on, off and not given, is a name with a value."""
     found: list[str] = []
@@ -163,3 +159,7 @@ def _expand(options: Sequence[str]) -> list[str]:
         else:
             found.append("--help" if option == "--help-all" else option)
     return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from localization.commands.common import write_json
+from localization.commands.common import print_table, write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.output import check_outputs
 from motion_models.prior import prior_notes
@@ -54,7 +54,7 @@ def _print(console: Console, info: LogInfo) -> None:
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.1f}"
         cells = (topic.topic, topic.type, str(topic.count), rate, topic.used_as or "", topic.frame_id or "", gaps + more)
         table.add_row(*map(escape, cells))
-    console.print(table)
+    print_table(console, table)
     for part, used in info.parts.items():
         topic_text = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
         console.print(f"{part.replace('_', ' ')}: {topic_text}", markup=False)
