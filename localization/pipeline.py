@@ -334,7 +334,7 @@ class _Replay:
             table[:, TWIST_COV].reshape(-1, 3, 3),
             table[:, NIS],
             estimator.parameters(),
-            estimator.counts(),
+            {**estimator.counts(), **self._pipeline.checks.counts()},
             estimator.map_points(),
             self._pipeline.warnings(),
             self._seconds,

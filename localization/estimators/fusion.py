@@ -35,6 +35,8 @@ from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
+_REPEATED_S = 0.5
+"""Scans from one place have the same errors: those of a robot at rest count no more from about this time on [s]."""
 _MIN_CLOCK_OFFSET_S = 0.05
 """Smallest offset of the wheels' clock with a warning [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
 
@@ -130,10 +132,11 @@ class EkfFusion(Estimator):
         self._is_scan_pending = True
         prior_cov = state.difference_cov("pose", "map")
         match = sensor.measure(step, state["pose"], prior_cov, self._slip.twist(step), self._slip.offset(step))
-        if match is None:
-            moved = sensor.moved.cov(step)
+        if match is None or (step.rested_s and match.outlier_cov.any()):
+            moved = None if step.rested_s else sensor.moved.cov(step)
             return state if moved is None else self._inflate(state, moved), None
         match, R = self._slip.refine(sensor, step, state["start"], match)
+        R = R * (1.0 + step.rested_s / _REPEATED_S) ** 4
         self.counts_by_name["matched"] += 1
         if match.outlier_cov.any():
             self.counts_by_name["prior_outliers"] += 1

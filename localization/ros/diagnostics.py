@@ -171,7 +171,8 @@ class Health:
         return [(level, f"estimates come {late:.2f} s after their scans: {advice}.")]
 
     def _of_lidar(self, pipeline: Pipeline) -> Status:
-        values, losses = {name: str(count) for name, count in pipeline.estimator.counts().items()}, pipeline.lidar
+        counts, losses = {**pipeline.estimator.counts(), **pipeline.checks.counts()}, pipeline.lidar
+        values = {name: str(count) for name, count in counts.items()}
         if losses is not None:
             values |= {
                 "lost_share": f"{losses.share:.4f}",

@@ -17,6 +17,7 @@ from localization.sensor_checks.gyro_rate import GyroRate
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
+from localization.sensor_checks.moving_objects import MovingObjects
 from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
@@ -36,7 +37,7 @@ class SensorChecks:
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
-        self._disagreement = Disagreement(faults)
+        self._disagreement, self._moving = Disagreement(faults), MovingObjects(faults, window)
         self._checks: tuple[Check, ...] = (
             LidarTilt(mounts),
             OwnBody(faults),
@@ -44,6 +45,7 @@ class SensorChecks:
             TurnRates(faults, step_config),
             TravelDirection(faults),
             Standstill(faults, window, step_config),
+            self._moving,
             self._disagreement,
         )
         self._preparing, self._comparing = self._that_override("prepare"), self._that_override("compare")
@@ -116,6 +118,11 @@ class SensorChecks:
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on."""
         return self._inflation.inflate_trajectory(smoothed)
+
+    def counts(self) -> Mapping[str, int]:
+        """Number of scans in which objects moved, if there were any."""
+        scans = self._moving.report.scans
+        return {"scans_with_moving_objects": scans} if scans else {}
 
     def warnings(self) -> list[str]:
         """Problems so far."""

@@ -34,6 +34,10 @@ class CovarianceInflation:
         """(3,) difference of a disagreement that lasts, of wheels and scans."""
         self.ongoing_pair: FloatArray | None = None
         """(3,) difference of a pair of sensors that differ for now."""
+        self.ongoing_scene: FloatArray | None = None
+        """(3,) difference of wheels and scans while objects move in these."""
+        self.possible: FloatArray | None = None
+        """(3,) the same while that is not decided: no fault yet."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -65,12 +69,14 @@ class CovarianceInflation:
     @property
     def is_lasting(self) -> bool:
         """Whether sensors disagree at present."""
-        return self.ongoing_pair is not None or (self.ongoing is not None and not self.are_wheels_outvoted)
+        return (
+            self.ongoing_pair is not None or self.ongoing_scene is not None or (self.ongoing is not None and not self.are_wheels_outvoted)
+        )
 
     @property
     def _lasting(self) -> list[FloatArray]:
         ongoing = None if self.are_wheels_outvoted else self.ongoing
-        return [difference for difference in (ongoing, self.ongoing_pair) if difference is not None]
+        return [difference for difference in (ongoing, self.ongoing_pair, self.ongoing_scene) if difference is not None]
 
     @property
     def spread(self) -> Cov3:
@@ -89,15 +95,14 @@ class CovarianceInflation:
             A = se2.adjoint(se2.inverse(delta))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
+        if estimate.covariance is not None and self.possible is not None:
+            estimate = _widen(estimate, np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
             return estimate
         spread = self.total
         if self._since_ns is None:
             self._since_ns = estimate.stamp_ns
-        odometry = estimate.odometry
-        if odometry is not None and odometry[1] is not None:
-            odometry = odometry[0], odometry[1] + spread
-        return replace(estimate, covariance=estimate.covariance + spread, odometry=odometry)
+        return _widen(estimate, spread)
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
@@ -113,6 +118,14 @@ class CovarianceInflation:
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
         return self._spread + self._pending + sum((np.outer(d, d) for d in self._lasting), np.zeros((3, 3)))
+
+
+def _widen(estimate: Estimate, spread: Cov3) -> Estimate:
+    """``estimate`` whose pose has the covariance ``spread`` (3, 3) besides."""
+    odometry = estimate.odometry
+    if odometry is not None and odometry[1] is not None:
+        odometry = odometry[0], odometry[1] + spread
+    return replace(estimate, covariance=None if estimate.covariance is None else estimate.covariance + spread, odometry=odometry)
 
 
 def _turn(cov: Cov3, angle: float) -> Cov3:

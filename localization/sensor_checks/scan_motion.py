@@ -18,11 +18,11 @@ from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import solve
 from motion_models.se2 import FloatArray, Points2, Pose2, Triple, triple
 
-_BEARINGS = 180
+BEARINGS = 180
 """Number of bearings of a profile, each 2 deg wide: each has a beam of any scanner in use, however its beams lie to the bins."""
-_BIN_RAD = 2.0 * np.pi / _BEARINGS
+_BIN_RAD = 2.0 * np.pi / BEARINGS
 _MIN_BEARINGS = 30
-"""Filled bearings of a profile, of `_BEARINGS`; fewer leave the turn ambiguous."""
+"""Filled bearings of a profile, of `BEARINGS`; fewer leave the turn ambiguous."""
 _MAX_ALONE, _MAX_GAP = 0.7, 5
 """Share of the filled bearings without a neighbour on both sides, from where on a scan is sparse; and the widest gap, in bearings (10 deg),
 across which its beams are connected."""
@@ -65,15 +65,16 @@ class ScanOdometry:
     """Scan-to-scan odometry: `register` returns the motion since the scan before, or None."""
 
     def __init__(self) -> None:
-        self._last: Profile | None = None
+        self.last: Profile | None = None
+        """Of the last scan."""
 
     def register(self, points: FloatArray, center: FloatArray) -> ScanMotion | None:
         """Motion since the last call; ``points`` (M, 2) and sensor position ``center`` (2,) in the body frame [m]; of any of its LiDARs.
 
         None for the first scan, for scans with too few points and where the scans do not fit onto each other.
         """
-        last, now = self._last, make_profile(points - center, center)
-        self._last = now
+        last, now = self.last, make_profile(points - center, center)
+        self.last = now
         if last is None or now is None:
             return None
         turn = _correlate(np.log(last.ranges), np.log(now.ranges))
@@ -92,9 +93,15 @@ def align_from(a: Profile, b: Profile, a_T_b: Pose2, min_inliers: float) -> Scan
 
 def make_profile(points: Points2, center: FloatArray) -> Profile | None:
     """Profile of ``points`` (M, 2) about the sensor, which is at ``center`` (2,) in the body frame [m]; None for too few points."""
-    surface, ranges, normals = np.full((_BEARINGS, 2), np.nan), np.full(_BEARINGS, np.nan), np.full((_BEARINGS, 2), np.nan)
+    surface, ranges, normals = np.full((BEARINGS, 2), np.nan), np.full(BEARINGS, np.nan), np.full((BEARINGS, 2), np.nan)
     _fill_profile(points, surface, ranges, normals)
     return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else Profile(center, surface, ranges, normals)
+
+
+@subroutine
+def bearing_bin(x: float, y: float) -> int:
+    """Bearing of a point, as an index of a profile."""
+    return math.floor(math.atan2(y, x) / _BIN_RAD) % BEARINGS
 
 
 @kernel
@@ -103,12 +110,12 @@ def _fill_profile(points: Points2, surface: FloatArray, ranges: FloatArray, norm
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         r = math.hypot(x, y)
-        k = math.floor(math.atan2(y, x) / _BIN_RAD) % _BEARINGS
+        k = bearing_bin(x, y)
         if r > 1e-3 and not r >= ranges[k]:
             surface[k, 0], surface[k, 1], ranges[k] = x, y, r
     _connect(surface, ranges)
-    for k in range(_BEARINGS):
-        before, after = surface[k - 1], surface[(k + 1) % _BEARINGS]
+    for k in range(BEARINGS):
+        before, after = surface[k - 1], surface[(k + 1) % BEARINGS]
         dx, dy = after[0] - before[0], after[1] - before[1]
         length = math.hypot(dx, dy)
         if length < 0.1 + 0.5 * ranges[k]:  # else from one surface to another, or unknown
@@ -119,21 +126,21 @@ def _fill_profile(points: Points2, surface: FloatArray, ranges: FloatArray, norm
 def _connect(surface: FloatArray, ranges: FloatArray) -> None:
     """Fill the bearings between the beams of a sparse scan (three degrees and more apart) where neighbours are of one surface."""
     filled, alone = 0, 0
-    for k in range(_BEARINGS):
+    for k in range(BEARINGS):
         if not math.isnan(ranges[k]):
             filled += 1
-            alone += math.isnan(ranges[k - 1]) or math.isnan(ranges[(k + 1) % _BEARINGS])
+            alone += math.isnan(ranges[k - 1]) or math.isnan(ranges[(k + 1) % BEARINGS])
     if alone <= _MAX_ALONE * filled:
         return
     is_beam = ~np.isnan(ranges)
-    for k in range(_BEARINGS):
+    for k in range(BEARINGS):
         gap = 1
-        while gap < _MAX_GAP and not is_beam[(k + gap) % _BEARINGS]:
+        while gap < _MAX_GAP and not is_beam[(k + gap) % BEARINGS]:
             gap += 1
-        step = surface[(k + gap) % _BEARINGS] - surface[k]  # NaN where one of them is no beam
+        step = surface[(k + gap) % BEARINGS] - surface[k]  # NaN where one of them is no beam
         if math.hypot(step[0], step[1]) < 0.1 + 0.5 * ranges[k]:
             for i in range(1, gap):
-                middle = (k + i) % _BEARINGS
+                middle = (k + i) % BEARINGS
                 surface[middle] = surface[k] + i / gap * step
                 ranges[middle] = math.hypot(surface[middle, 0], surface[middle, 1])
 
@@ -144,8 +151,8 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
     best, turn = np.inf, np.nan
     for shift in range(-_MAX_TURN_BINS, _MAX_TURN_BINS + 1):
         n, cost = 0, 0.0
-        for i in range(_BEARINGS):
-            difference = abs(a[i] - b[(i - shift) % _BEARINGS])
+        for i in range(BEARINGS):
+            difference = abs(a[i] - b[(i - shift) % BEARINGS])
             if not math.isnan(difference):
                 n += 1
                 cost += difference
@@ -157,7 +164,7 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
 def _refine(a: Profile, b: Profile, guess: Pose2, min_inliers: float) -> ScanMotion | None:
     """a_T_b of the body by point-to-line Gauss-Newton from the sensor's ``guess`` (3,); None where the scans do not fit."""
     structure = np.empty((2, 2))
-    found, inliers = _align_profiles(a.points, a.normals, b.points, triple(guess), structure)
+    found, inliers = align_profiles(a.points, a.normals, b.points, triple(guess), structure)
     if inliers < max(min_inliers * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(found).all():
         return None
     a_T_b = np.array(found)
@@ -167,7 +174,7 @@ def _refine(a: Profile, b: Profile, guess: Pose2, min_inliers: float) -> ScanMot
 
 
 @kernel
-def _align_profiles(
+def align_profiles(
     surface: FloatArray, normals: FloatArray, points: FloatArray, guess: Triple, structure: FloatArray
 ) -> tuple[Triple, int]:
     """Motion of the sensor from ``guess`` on, and the number of inliers: 0 where too few points are associated. ``structure`` (2, 2)
@@ -210,7 +217,7 @@ def _fill_normal_equations(
         x, y = tx + a_T_b[0], ty + a_T_b[1]
         if math.isnan(x):
             continue
-        k = math.floor(math.atan2(y, x) / _BIN_RAD) % _BEARINGS
+        k = bearing_bin(x, y)
         nx, ny = normals[k, 0], normals[k, 1]
         dx, dy = x - surface[k, 0], y - surface[k, 1]
         if math.isnan(nx) or not (abs(dx) < _MAX_DISTANCE_M and abs(dy) < _MAX_DISTANCE_M):

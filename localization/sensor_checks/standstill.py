@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -50,6 +51,7 @@ class Standstill(Check):
         self._stood_s = 0.0  # time for which the wheels read zero
         self._turned_s = 0.0  # the same, while the gyro turns
         self._is_confirmed = False  # that the robot moved meanwhile, by gyro or IMU
+        self._rested_s = 0.0  # the same, while gyro and IMU are at rest too
         self._trusted_s = 0.0  # the same, as far as it counted as standing and no scan has measured the pose since
 
     def insert_imu(self, sample: ImuSample) -> None:
@@ -59,7 +61,7 @@ class Standstill(Check):
     def apply(self, step: Step) -> Step:
         """``step`` with unknown wheels where another sensor shows motion."""
         if not step.is_standing:
-            self._turned_s = self._stood_s = self._trusted_s = 0.0
+            self._turned_s = self._stood_s = self._trusted_s = self._rested_s = 0.0
             self._is_confirmed = False
             self._velocity.lasted_s = 0.0
             if step.has_wheels:
@@ -76,7 +78,9 @@ class Standstill(Check):
         if not contradicted_s:
             self._trusted_s += step.duration
             self._velocity.lasted_s = 0.0
-            return step
+            self._rested_s = self._rested_s + step.duration if self._is_at_rest(step) else 0.0
+            return replace(step, rested_s=self._rested_s) if self._rested_s else step
+        self._rested_s = 0.0
         unknown_s = step.duration
         if moving:
             unknown_s, self._trusted_s = unknown_s + self._trusted_s, 0.0
@@ -87,6 +91,11 @@ class Standstill(Check):
         if nis is not None:
             self._velocity.lasted_s = 0.0
             self._trusted_s = 0.0
+
+    def _is_at_rest(self, step: Step) -> bool:
+        """Whether wheels, gyro and IMU measure in ``step`` what they do on a robot at rest."""
+        has_imu = any(detector.has_noise and not detector.lasted_s for detector in self._shaking.values())
+        return step.is_standing and step.has_wheels and step.turn is not None and not _is_turning(step) and has_imu
 
     def _moving(self) -> str:
         """What shows that the robot drives; "" where nothing does."""

@@ -11,12 +11,12 @@ import numpy as np
 
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig, Sweep
-from localization.sensor_checks.scan_motion import ScanOdometry
+from localization.sensor_checks.scan_motion import Profile, ScanOdometry, make_profile
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray, Points2
 
-_BIN_S = 0.25
+BIN_S = 0.25
 WINDOW_BINS, MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
 _MAX_BIN_S = 1.0
@@ -50,13 +50,15 @@ class Window:
         """Whether any scan has come."""
         self.begin_s = self.end_s = 0.0
         """After the first step [s]."""
+        self.registered: Scan | None = None
+        """The last scan that ended a bin."""
 
     def add(self, step: Step, now_s: float) -> bool:
         """Whether ``step`` ends a bin and there are enough to compare. A bin ends where it is long enough, at a scan if there are any."""
         self._open.add(step)
         self.has_scans |= step.scan is not None
         waits_for_scan = self.has_scans and step.scan is None
-        if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else _BIN_S):
+        if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else BIN_S):
             return False
         lidar = np.full(3, np.nan) if step.scan is None else self._register(step.scan)
         self.bins.append(self._open.close(lidar))
@@ -67,6 +69,7 @@ class Window:
 
     def _register(self, scan: Scan) -> FloatArray:
         """Motion (3,) in the open bin, which ``scan`` ends."""
+        self.registered = scan
         motion = self._scans.register(*self.project(scan))
         if motion is None or not self._open.has_scan_at_start:
             return np.full(3, np.nan)
@@ -77,6 +80,18 @@ class Window:
         mount = self._mounts.get(scan.frame_id, Mount())
         sweep = Sweep.from_scan(scan, mount).within(self._config.min_range_m, self._config.max_range_m)
         return sweep.project(sweep.points), np.array([mount.x, mount.y])
+
+    def profile(self, scan: Scan) -> Profile | None:
+        """Profile of ``scan``; None for too few points."""
+        if scan is self.registered:
+            return self._scans.last
+        points, center = self.project(scan)
+        return make_profile(points - center, center)
+
+    def points_about_lidar(self, scan: Scan) -> Points2:
+        """(N, 2) all points of a planar ``scan`` about its LiDAR, in the body's axes."""
+        R = self._mounts.get(scan.frame_id, Mount()).rotation()
+        return np.ascontiguousarray(scan.points[:, :2] @ R[:2, :2].T)
 
     @property
     def turn_rates(self) -> FloatArray:

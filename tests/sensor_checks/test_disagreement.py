@@ -59,7 +59,7 @@ def test_disagreements_that_end_stay_in_the_covariance_without_scans(
 
 
 def test_memory_stays_flat_over_many_disagreements() -> None:
-    """Wheels that count three times too far for 3 of every 9 s."""
+    """Wheels that count three times too far for 3 of every 9 s. The kept scans of the last seconds are one more at times."""
     sizes = []
     for times in (2, 3):
         robot = CheckedDrive()
@@ -67,7 +67,7 @@ def test_memory_stays_flat_over_many_disagreements() -> None:
         checks = robot.drive(9.0 * times)
         assert f"the largest of {times} such times" in checks.warnings()[0]
         sizes.append(len(serialize(checks)[1]))  # bytes of all arrays
-    assert sizes[0] == sizes[1]
+    assert sizes[1] - sizes[0] < 180 * 5 * 8  # of 180 bearings, five numbers each
 
 
 def test_estimate_without_covariance_is_not_compared_with_the_wheels() -> None:

@@ -1,0 +1,286 @@
+"""Scans of scenes that move: people who walk along, vehicles, dust about the robot."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.events import Step
+from localization.sensor_checks.check import Check, without_scan
+from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
+from localization.sensor_checks.own_body import LIDAR_OWN_BODY
+from localization.sensor_checks.scan_motion import Profile
+from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, label, refine
+from localization.sensor_checks.standstill import WHEELS_STANDING
+from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
+from localization.sensor_checks.turn_rates import LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_SPIN
+from localization.sensor_checks.window import BIN_S, Window
+from localization.trajectory import BoolArray
+from motion_models import se2
+from motion_models.se2 import FloatArray, Points2, Pose2
+
+MOVING_OBJECTS = Fault(
+    "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
+    " the wheels are matched meanwhile. Without people and vehicles about the robot, check the wheels' radius and what covers the LiDAR."
+)
+
+_EXPLAINING = (LIDAR_OWN_BODY, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_SPIN, WHEELS_STANDING)
+"""Named faults of which parts of a scan, or the wheels, move otherwise."""
+_MAX_VIEWS = 17
+"""Views of the last four seconds, one for each bin of the window, after which at .05 m/s an object has moved by more than its tolerance."""
+_MAX_WAY_M, _MAX_TURN_RAD = 0.6, 0.6
+"""Largest motion since the view that is compared: farther away, surfaces are hidden by others [m, rad]."""
+_MIN_MOVED = 0.12
+"""Share of a scan on objects that move, from where on they are left out. Healthy drives: at most .09 (fr079), .17 once in ACES."""
+_MIN_MOVED_WITHOUT_GYRO = 0.2
+"""The same of a robot whose wheels alone measure its turns."""
+_MIN_UNSURE = 0.06
+"""The same from where on it is not sure that the scene is still."""
+_MIN_OFF_M, _MAX_OFF_M = 0.08, 0.25
+"""Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
+from where on labels show whether they do [m]."""
+_MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
+"""Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
+Wheels that slip in a still scene explain 14 to 33 % by chance where they turn otherwise (fr079 at 168 to 185 s), else 15 to 20 %."""
+_MAX_WHEEL_TURN_RAD = 0.1
+"""Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
+_RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
+"""A rival leaves less than this share of what moves; and the least share of a scan that it is said not to explain."""
+_AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
+"""Successive comparisons that show it."""
+_CALM_S = 1.0
+"""Time without moving objects after which all beams are matched again [s]."""
+_MIN_POINTS = 30
+"""Points of the still world with which a scan is matched."""
+
+
+class _View(NamedTuple):
+    """A scan, and where it was taken by two odometries."""
+
+    at_s: float
+    by_wheels: Pose2
+    by_estimate: Pose2
+    profile: Profile
+
+
+@dataclass
+class _Lidar:
+    """What one LiDAR has measured."""
+
+    views: deque[_View] = field(default_factory=lambda: deque(maxlen=_MAX_VIEWS))
+    standing: _View | None = None
+    """The first since the wheels stand."""
+    shown: int = 0
+    """Successive comparisons that showed moving objects."""
+    last_s: float = -math.inf
+    """Time of the last one that did [s]."""
+    is_active: bool = False
+
+
+class MovingObjects(Check):
+    """Where part of a scene moves and the rest agrees with wheels and gyro, the rest alone is matched.
+
+    A scan is compared with one from before under the motion by wheels and gyro. Where one other motion explains all of it, as with wheels
+    that slip, nothing is left out: the matcher finds it. Where the points that the wheels do not explain need a motion that does not
+    explain those which they do, the scene has two motions, and that of the wheels is the still world's. Until that is decided, and while
+    objects move, the covariance has the distance of the estimate from the motion by wheels and gyro.
+    """
+
+    def __init__(self, faults: FaultLog, window: Window) -> None:
+        self._faults, self._window = faults, window
+        self._by_wheels, self._by_estimate = np.zeros(3), np.zeros(3)
+        self._lidars: dict[str, _Lidar] = {}
+        self._compared: _View | None = None
+        """With which the last scan was compared."""
+        self._is_unsure = False
+        """Objects may move, or the wheels slip."""
+        self._since: _View | None = None
+        """Before objects began to move."""
+        self._explained: tuple[Fault, ...] = ()
+        """Named faults so far that explain what was taken for moving objects."""
+        self.report = _Report(faults)
+
+    def apply(self, step: Step) -> Step:
+        """``step`` whose scan has the still world alone, while more than a few objects move."""
+        self._add_motion(step)
+        if any(fault in self._faults.declared for fault in _EXPLAINING if fault not in self._explained):
+            self._explained = tuple(fault for fault in _EXPLAINING if fault in self._faults.declared)
+            self._faults.retract(MOVING_OBJECTS)
+            self._since, self.report = None, _Report(self._faults)
+            self._restart()
+        scan, now_s = step.scan, self._faults.now_s
+        if not step.has_wheels:
+            self._restart()
+        if scan is None or not scan.is_planar or not step.has_wheels:
+            return step
+        lidar = self._lidars.setdefault(scan.frame_id, _Lidar())
+        if lidar.standing is not None and not self._is_near(lidar.standing):
+            lidar.standing = None
+        is_due = scan is self._window.registered
+        if not (is_due or lidar.is_active):
+            return step
+        profile = self._window.profile(scan)
+        if profile is None:
+            return step
+        points = self._window.points_about_lidar(scan)
+        references = self._references(lidar)
+        if references:
+            found = self._label(references[0], profile, points)
+            self._update(step, lidar, found)
+            if lidar.is_active:
+                labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
+                step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
+        if is_due:
+            view = _View(now_s, self._by_wheels, self._by_estimate, profile)
+            lidar.views.append(view)
+            if step.is_standing and lidar.standing is None:
+                lidar.standing = view
+        return step
+
+    def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+        """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
+        self._by_estimate = se2.compose(self._by_estimate, delta)
+        inflation, view = self._faults.inflation, self._compared
+        inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
+        inflation.possible = None
+        if self._since is None and view is not None and self._is_near(view):
+            off = self._distance(view)
+            is_off = self._is_unsure or _MIN_OFF_M < math.hypot(off[0], off[1]) < _MAX_OFF_M
+            inflation.possible = off if is_off else None
+
+    def _distance(self, view: _View) -> FloatArray:
+        """(3,) of the motion by the wheels since ``view`` from that by the estimate."""
+        by_estimate, by_wheels = se2.between(view.by_estimate, self._by_estimate), se2.between(view.by_wheels, self._by_wheels)
+        return se2.log(se2.between(by_estimate, by_wheels))
+
+    def _add_motion(self, step: Step) -> None:
+        delta = step.predicted.delta
+        if step.turn is not None and not step.is_standing:
+            delta = np.array([delta[0], delta[1], step.turn.angle])
+        self._by_wheels = se2.compose(self._by_wheels, delta)
+
+    def _references(self, lidar: _Lidar) -> list[_View]:
+        """The oldest view from which wheels and estimate have hardly moved, and the middle one of those after it."""
+        if lidar.standing is not None and not lidar.is_active and self._is_near(lidar.standing):
+            return [lidar.standing]
+        views = lidar.views
+        while views and not self._is_near(views[0]):
+            views.popleft()
+        return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
+
+    def _is_near(self, view: _View) -> bool:
+        for start, end in ((view.by_wheels, self._by_wheels), (view.by_estimate, self._by_estimate)):
+            x, y, turn = se2.between(start, end).tolist()
+            if math.hypot(x, y) >= _MAX_WAY_M or abs(turn) >= _MAX_TURN_RAD:
+                return False
+        return True
+
+    def _label(self, view: _View, profile: Profile, points: Points2) -> _Comparison:
+        """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``."""
+        a, b = (np.array([*p.center, 0.0]) for p in (view.profile, profile))
+
+        def of_lidar(start: Pose2, end: Pose2) -> Pose2:
+            return se2.compose(se2.compose(se2.inverse(a), se2.between(start, end)), b)
+
+        motion = refine(view.profile, points, of_lidar(view.by_wheels, self._by_wheels))
+        scene = label(view.profile, profile, points, motion)
+        return _Comparison(view, profile, points, scene, of_lidar(view.by_estimate, self._by_estimate))
+
+    def _update(self, step: Step, lidar: _Lidar, found: _Comparison) -> None:
+        """Whether objects move now."""
+        self._compared = found.view
+        scene, now_s, is_standing = found.scene, self._faults.now_s, step.rested_s > 0.0
+        off = self._distance(found.view)
+        distance = math.hypot(off[0], off[1])
+        is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
+        is_moving = scene.moved_share >= _MIN_UNSURE and is_standing
+        if not is_standing and (scene.moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
+            has_turn = step.turn is not None or lidar.is_active
+            unique = found.unique_share(has_turn)
+            is_unsure |= unique >= _KEPT_UNIQUE
+            least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
+            is_moving = unique >= least and (has_turn or scene.moved_share >= _MIN_MOVED_WITHOUT_GYRO)
+        is_moving &= scene.moved_share >= _MIN_MOVED
+        lidar.shown = lidar.shown + 1 if is_moving else 0
+        if is_moving:
+            lidar.last_s = now_s
+        again = 1 if is_standing else _AGAIN if step.turn is not None else _AGAIN_WITHOUT_GYRO
+        lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
+        self._is_unsure = is_unsure
+        if lidar.is_active:
+            self.report.add(scene.moved_share)
+            self._since = found.view if self._since is None else self._since
+        elif not any(other.is_active for other in self._lidars.values()):
+            self._end()
+
+    def _end(self) -> None:
+        """No objects move any more: what the estimate is off by stays."""
+        if self._since is not None:
+            self._faults.inflation.add(self._distance(self._since))
+            self._since = None
+
+    def _restart(self) -> None:
+        """The wheels' motion is not known: scans are compared from here on."""
+        self._end()
+        self._lidars.clear()
+        self._compared = None
+
+
+class _Report:
+    """What is reported of all times in which objects moved."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults, self._seconds, self._largest = faults, 0.0, 0.0
+        self._begin_s, self._last_s = math.nan, -math.inf
+        self.scans = 0
+        """Scans in which objects moved."""
+
+    def add(self, share: float) -> None:
+        """Objects move in this ``share`` of the beams now."""
+        now_s = self._faults.now_s
+        self._begin_s = now_s if math.isnan(self._begin_s) else self._begin_s
+        self._seconds += min(now_s - self._last_s, BIN_S)
+        self.scans, self._last_s, self._largest = self.scans + 1, now_s, max(self._largest, share)
+        message = MOVING_OBJECTS.message.format(percent=100.0 * self._largest, seconds=self._seconds)
+        self._faults.revise(DetectedFault(MOVING_OBJECTS, self._begin_s, message))
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A scan, and one from before under the motion by the wheels."""
+
+    view: _View
+    profile: Profile
+    points: Points2
+    scene: SceneMotion
+    by_estimate: Pose2
+    """(3,) motion of the LiDAR meanwhile, by the estimate."""
+
+    def unique_share(self, has_turn: bool) -> float:
+        """Share, of the points that a rival motion does not explain, which the wheels' motion explains; the least of all rivals. A rival
+        explains most of what moves under the wheels' motion. Unless ``has_turn``, by a gyro, rivals that turn otherwise are right.
+        """
+        least = math.inf
+        for start in (self.by_estimate, align_rest(self.view.profile, self.points, self.scene)):
+            rival = None if start is None else refine(self.view.profile, self.points, start)
+            other = None if rival is None else label(self.view.profile, self.profile, self.points, rival)
+            if rival is None or other is None or other.moved_share >= _RIVAL_MOVED * self.scene.moved_share:
+                continue
+            if not has_turn and abs(float(se2.scalar_wrap(rival[2] - self.scene.motion[2]))) > _MAX_WHEEL_TURN_RAD:
+                return 0.0
+            unique = float(np.sum((self.scene.labels == STILL) & (other.labels != STILL)))
+            least = min(least, unique / max(float(np.sum(other.labels != STILL)), _MIN_UNEXPLAINED * len(self.points)))
+        return least
+
+
+def _with_still(step: Step, is_still: BoolArray) -> Step:
+    """``step`` whose scan has the points ``is_still`` (N,) alone; without it where these are too few."""
+    scan = step.scan
+    if scan is None or is_still.sum() < _MIN_POINTS:
+        return without_scan(step)
+    offsets = scan.offsets[is_still] if len(scan.offsets) else scan.offsets
+    return replace(step, scan=replace(scan, points=scan.points[is_still], offsets=offsets))

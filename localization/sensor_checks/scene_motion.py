@@ -1,0 +1,144 @@
+"""Points of a scan by the motion that explains them: of the still world, or of what moves in it.
+
+A scan is compared with one of the same LiDAR from some seconds before, by bearing about where that was taken. Under the right motion of the
+robot the still world lies on the same lines. What lies in front of them was free space then, and what was there and is seen through now
+has left (free-space violations; Pomerleau et al. 2014, "Long-term 3D map maintenance in dynamic environments").
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.sensor_checks.scan_motion import BEARINGS, Profile, align_profiles, bearing_bin
+from motion_models import se2
+from motion_models.compiled import kernel, subroutine
+from motion_models.linear_equations import solve
+from motion_models.se2 import FloatArray, Points2, Pose2, Triple, triple
+
+_STATIC_M, _STATIC_SHARE = 0.1, 0.01
+"""Distance of a point of the still world from its line at most [m], and per metre of range: noise of ranges, bearings of 2 deg."""
+_FREE_M, _FREE_SHARE = 0.2, 0.03
+"""What is nearer by this [m], and per metre of range, than the surfaces about its bearing is in free space."""
+_PRIOR_M, _PRIOR_RAD, _RESIDUAL_M = 0.1, 0.05, 0.05
+"""How far the wheels' motion over a second may be off, and sigma of a residual [m]: wheels that slip by less are refined."""
+_ITERATIONS = 4
+_MAX_DISTANCE_M, _MIN_ALIGNED = 1.0, 15
+"""Largest distance of a point from its associated one [m], and least number of points that have a motion of their own."""
+HIDDEN, STILL, MOVED = 0, 1, -1
+"""Labels of points: nothing was measured there before; of the still world; in what was free space."""
+
+Labels = NDArray[np.int8]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMotion:
+    """Points of a scan under one motion of the LiDAR since the reference."""
+
+    motion: Pose2
+    """(3,) of the LiDAR."""
+    labels: Labels
+    """(N,) of the points."""
+    vanished: int
+    """Bearings of the reference whose surface is seen through."""
+    bearings: int
+    """Bearings of the reference that are compared: in view, and not hidden."""
+
+    @property
+    def still_share(self) -> float:
+        """Share of the points that are of the still world."""
+        return float(np.mean(self.labels == STILL))
+
+    @property
+    def moved_share(self) -> float:
+        """The larger one of the shares of points that appeared, and of surfaces that vanished."""
+        return max(float(np.mean(self.labels == MOVED)), self.vanished / max(self.bearings, 1))
+
+
+def refine(reference: Profile, points: Points2, motion: Pose2) -> Pose2:
+    """``motion`` (3,) of the LiDAR since ``reference`` by those of ``points`` (N, 2), about the LiDAR, that it nearly explains.
+
+    Gauss-Newton for the sum of the squared distances from their lines, and those from ``motion`` as a prior.
+    """
+    return np.array(_refine(reference.points, reference.normals, points, triple(motion)))
+
+
+def label(reference: Profile, now: Profile, points: Points2, motion: Pose2) -> SceneMotion:
+    """Label ``points`` (N, 2), of which ``now`` is the profile, for the ``motion`` (3,) of the LiDAR since ``reference``."""
+    labels = np.zeros(len(points), dtype=np.int8)
+    _label(reference.points, reference.normals, reference.ranges, points, motion, labels)
+    back = np.zeros(BEARINGS, dtype=np.int8)
+    _label(now.points, now.normals, now.ranges, reference.points, se2.inverse(motion), back)
+    return SceneMotion(motion, labels, int(np.sum(back == MOVED)), int(np.sum(back != HIDDEN)))
+
+
+def align_rest(reference: Profile, points: Points2, still: SceneMotion) -> Pose2 | None:
+    """Motion (3,) of the LiDAR that explains those ``points`` (N, 2) which are not of the still world; None for too few."""
+    rest = points[still.labels != STILL]
+    motion, inliers = align_profiles(reference.points, reference.normals, rest, triple(still.motion), np.empty((2, 2)))
+    return np.array(motion) if inliers >= _MIN_ALIGNED and np.isfinite(motion).all() else None
+
+
+@kernel
+def _refine(surface: FloatArray, normals: FloatArray, points: Points2, prior: Triple) -> Triple:
+    """See `refine`; the first step takes points from twice as far."""
+    A, g, x = np.empty((3, 3)), np.empty(3), prior
+    for k in range(_ITERATIONS):
+        off = se2.scalar_log(se2.scalar_between(prior, x))
+        A[:] = 0.0
+        for a in range(3):
+            w = (_RESIDUAL_M / (_PRIOR_RAD if a == 2 else _PRIOR_M)) ** 2
+            A[a, a], g[a] = w, w * off[a]
+        _add_near(surface, normals, points, x, 2.0 if k == 0 else 1.0, A, g)
+        u, v, turn = solve(A, g)
+        x = se2.scalar_compose(x, se2.scalar_exp((-u, -v, -turn)))
+    return x
+
+
+@subroutine
+def _add_near(surface: FloatArray, normals: FloatArray, points: Points2, x: Triple, width: float, A: FloatArray, g: FloatArray) -> None:
+    """Add J^T J to ``A`` (3, 3) and J^T r to ``g`` (3,) for right perturbations of ``x``, of points within ``width`` times the tolerance
+    from their line."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    for i in range(points.shape[0]):
+        px, py = points[i, 0], points[i, 1]
+        wx, wy = x[0] + c * px - s * py, x[1] + s * px + c * py
+        k = bearing_bin(wx, wy)
+        nx, ny = normals[k, 0], normals[k, 1]
+        dx, dy = wx - surface[k, 0], wy - surface[k, 1]
+        r = nx * dx + ny * dy
+        if not abs(r) < width * (_STATIC_M + _STATIC_SHARE * math.hypot(wx, wy)) or abs(dx) + abs(dy) > _MAX_DISTANCE_M:
+            continue
+        bx, by = c * nx + s * ny, -s * nx + c * ny
+        J = (bx, by, px * by - py * bx)
+        for a in range(3):
+            g[a] += J[a] * r
+            for b in range(3):
+                A[a, b] += J[a] * J[b]
+
+
+@kernel
+def _label(surface: FloatArray, normals: FloatArray, ranges: FloatArray, points: Points2, x: Pose2, labels: Labels) -> None:
+    """Fill the ``labels`` (N,) of ``points`` (N, 2), moved by ``x`` (3,) into the frame of a profile."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    for i in range(points.shape[0]):
+        wx, wy = x[0] + c * points[i, 0] - s * points[i, 1], x[1] + s * points[i, 0] + c * points[i, 1]
+        if math.isnan(wx):
+            continue
+        distance, k = math.hypot(wx, wy), bearing_bin(wx, wy)
+        nearest, tolerance = math.inf, _STATIC_M + _STATIC_SHARE * distance
+        for m in range(k - 1, k + 2):
+            m = m % BEARINGS
+            if math.isnan(ranges[m]):
+                nearest = 0.0  # nothing is known of it
+                continue
+            nearest = min(nearest, ranges[m])
+            dx, dy = wx - surface[m, 0], wy - surface[m, 1]
+            off = abs(normals[m, 0] * dx + normals[m, 1] * dy)
+            if math.hypot(dx, dy) < tolerance or (off < tolerance and abs(dx) + abs(dy) < 3.0 * tolerance + 0.05 * distance):
+                labels[i] = STILL
+        if labels[i] != STILL and distance < nearest - _FREE_M - _FREE_SHARE * nearest:
+            labels[i] = MOVED

@@ -1,0 +1,82 @@
+"""Scenes that move: people who walk off about a standing robot, who walk along, and wheels that slip in a still world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from localization.ros.state_serialization import deserialize, serialize
+from localization.sensor_checks.moving_objects import MOVING_OBJECTS
+from localization.sensor_checks.scan_motion import make_profile
+from localization.sensor_checks.scene_motion import MOVED, STILL, align_rest, label, refine
+from localization.simulation import world
+from motion_models import se2
+from tests.helpers import rooms
+from tests.helpers.event_faults import multiply_wheels
+from tests.helpers.extended import cases
+from tests.helpers.fault_drives import in_room, run
+from tests.helpers.moving_scenes import SCENES
+
+MOTION = np.array([0.4, 0.05, 0.1])
+
+
+def _scans(people: list[np.ndarray]) -> list[np.ndarray]:
+    """Scans of a room from the origin and after `MOTION`, with ``people`` (k, 2) about the robot."""
+    walls = np.concatenate([world.box(-4, -3, 5, 4), world.pillar(2, 2, 0.3)])
+    rng, found = np.random.default_rng(0), []
+    for pose, places in zip((np.zeros(3), MOTION), people, strict=True):
+        bodies = [world.pillar(*se2.transform(pose, place), 0.25) for place in places]
+        found.append(rooms.scan_from(np.concatenate([walls, *bodies]), pose, rng, 0.01))
+    return found
+
+
+def test_still_scene_has_one_motion() -> None:
+    before, now = _scans([np.zeros((0, 2))] * 2)
+    reference, profile = make_profile(before, np.zeros(2)), make_profile(now, np.zeros(2))
+    assert reference is not None
+    assert profile is not None
+    motion = refine(reference, now, MOTION + np.array([0.06, -0.05, 0.02]))
+    assert motion == pytest.approx(MOTION, abs=0.02)
+    scene = label(reference, profile, now, motion)
+    assert scene.still_share > 0.9
+    assert scene.moved_share < 0.03
+
+
+def test_people_who_walk_along_have_another_motion_than_the_room() -> None:
+    places = np.array([[1.2, 0.8], [-1.0, 1.0], [-1.2, -0.9], [0.3, -1.3], [1.3, -0.6], [0.2, 1.4]])
+    before, now = _scans([places, places])
+    reference, profile = make_profile(before, np.zeros(2)), make_profile(now, np.zeros(2))
+    assert reference is not None
+    assert profile is not None
+    scene = label(reference, profile, now, refine(reference, now, MOTION))
+    is_person = np.hypot(now[:, 0], now[:, 1]) < 1.9
+    assert (scene.labels[~is_person] == STILL).mean() > 0.6  # some walls were hidden by people before
+    assert (scene.labels[~is_person] == MOVED).mean() < 0.03
+    assert scene.moved_share > 0.12
+    rest = align_rest(reference, now, scene)
+    assert rest is not None
+    assert np.hypot(*rest[:2]) < 0.15  # as if the robot stood
+
+
+@pytest.mark.parametrize("name", cases(SCENES, usual=["12 people walk off"]))
+def test_scene_that_moves_is_in_the_covariance(name: str) -> None:
+    drive = SCENES[name](0)
+    if name == "12 people walk off":  # within the first seconds
+        drive = replace(drive, events=[e for e in drive.events if e.stamp_ns < drive.events[0].stamp_ns + 9_000_000_000])
+    outcome = run(drive)
+    assert not outcome.is_wrong, (outcome.least_consistent, outcome.warnings)
+    if "people walk off" in name:
+        assert MOVING_OBJECTS in outcome.pipeline.checks.found
+        assert outcome.worst[0] < 0.1
+        assert outcome.pipeline.checks.counts()["scans_with_moving_objects"] > 10
+        assert deserialize(*serialize(outcome.pipeline.checks)).counts() == outcome.pipeline.checks.counts()
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_wheels_that_slip_in_a_still_world_are_no_moving_objects(factor: float) -> None:
+    outcome = run(in_room(), multiply_wheels(factor, 0.3, 0.6))
+    assert MOVING_OBJECTS not in outcome.pipeline.checks.found
+    assert outcome.worst[0] < 0.05
