@@ -64,8 +64,6 @@ _PRIOR_SQUARE = 9.0
 """A search agrees with an earlier place within 3 sigma of the odometry since, and of `_SAME_COV`."""
 _SAME_COV = np.diag([0.1, 0.1, 0.033]) ** 2
 """Covariance of a searched pose against another of the same place [m^2, m^2, rad^2]."""
-_RECKONED_SHARE = 0.2
-"""Sigma of a pose by odometry since it was tracked, over the extent of the map, up to which that pose confirms a search."""
 _INDEPENDENT_M = 1.0
 """Way between the first and the last of the scans that are searched, from which on they are more than the same view again [m]."""
 _NEW_VIEW_M = 2.0 / math.pi
@@ -289,9 +287,8 @@ class Localizer:
             self._begin_tracking(best.pose, A @ (cov + _BEND) @ A.T + moved_cov)
 
     def _is_reckoned_at(self, pose: Pose2) -> bool:
-        """Whether the odometry leads to ``pose`` (3,) from where the robot was tracked, and to few other places of the map."""
-        variance, whole = np.trace(self._cov[:2, :2]), np.trace(self.places.extent_cov[:2, :2])
-        return self._is_reckoned and variance < _RECKONED_SHARE**2 * whole and _agree(self.pose, pose, self._cov)
+        """Whether the odometry leads to ``pose`` (3,) from where the robot was tracked; not where it is as wide as after being carried."""
+        return self._is_reckoned and self.state == "searching" and _agree(self.pose, pose, self._cov)
 
     def _begin_tracking(self, pose: Pose2, cov: Cov3) -> None:
         """The robot is at ``pose`` (3,) with covariance ``cov`` (3, 3)."""
