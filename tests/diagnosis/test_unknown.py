@@ -11,7 +11,6 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.diagnosis_unknown import UNKNOWN
-from tests.helpers.extended import cases
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,8 @@ def test_diagnose_reference_that_scatters_is_named_in_a_note(nominal: Drive, nam
     assert found.verdict == "unexplained" or any("motion reference states" in note for note in found.warnings)
 
 
-@pytest.mark.parametrize("name", cases(sorted(set(UNKNOWN) - set(OF_REFERENCE)), ("slip in left turns only",)))
+@pytest.mark.extended
+@pytest.mark.parametrize("name", sorted(set(UNKNOWN) - set(OF_REFERENCE)))
 def test_diagnose_effect_outside_catalogue_is_unexplained(nominal: Drive, name: str) -> None:
     found = diagnose(UNKNOWN[name](nominal), make_model("friction", nominal.robot))
     assert found.verdict == "unexplained"

@@ -114,6 +114,7 @@ def test_weigh_by_brush_tyres_of_other_law_holds_the_truth() -> None:
     assert np.all(np.abs(found.offset - [-0.05, 0.06]) < 2.0 * found.sigmas)
 
 
+@pytest.mark.extended
 def test_weigh_by_tyres_of_the_model_finds_no_model_error() -> None:
     found = weigh_simulated("husky_a200", {"cg_offset_x": 0.04, "cg_offset_y": 0.03, "track_width": 0.03}, 5)
     assert found.model_errors == ()

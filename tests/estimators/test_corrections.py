@@ -183,6 +183,7 @@ def learned(form, hidden, seed, wheels=weave, steps=150):
     return world.correction - slow[-k:], P[-k:, -k:], estimator.corrections.sigmas
 
 
+@pytest.mark.extended
 def test_cg_offset_of_hidden_load_is_estimated_within_sigma():
     """Twelve drives, the CG 4 cm ahead and 2 cm to the right of where its message has it, with a floor of another grip."""
     hidden = np.array([0.15, 0.04, -0.02])
@@ -287,6 +288,7 @@ def consistency():
     return np.array([[r[0] for r in level] for level in found]), np.array([[r[1] for r in level] for level in found]), found[0][0][2]
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("corrections_nees")
 @pytest.mark.parametrize("level", range(len(LEVELS)))
 def test_corrections_nees_at_each_noise_level_is_in_band(consistency, level):
@@ -297,6 +299,8 @@ def test_corrections_nees_at_each_noise_level_is_in_band(consistency, level):
         assert low < values[level, :, part].mean() < high
 
 
+@pytest.mark.extended
+@pytest.mark.xdist_group("corrections_nees")
 def test_corrections_nees_over_all_levels_is_in_band(consistency):
     values, inside, dof = consistency
     for part, d in enumerate(dof):

@@ -25,6 +25,7 @@ from motion_models.registry import make_model
 from motion_models.robot import Mount, WheelNoise
 from motion_models.se2 import FloatArray
 from tests.helpers import rooms
+from tests.helpers.extended import cases
 
 S = 1_000_000_000
 NO_SLIP = WheelNoise(*[0.0] * 8)
@@ -79,7 +80,7 @@ def driven() -> rooms.Drive:
 # --- accuracy and consistency
 
 
-@pytest.mark.parametrize("walls", [pytest.param(LAB), HALL])
+@pytest.mark.parametrize("walls", [LAB, pytest.param(HALL, marks=pytest.mark.extended)])
 def test_ekf_in_rooms_errs_by_millimetres(walls: np.ndarray) -> None:
     """Also where wheels slip by a fifth of their turning, changing twice a second. Root mean square of three drives."""
     for noise, most_rad in ((NO_SLIP, math.radians(0.03)), (WheelNoise(), math.radians(0.05))):
@@ -90,7 +91,7 @@ def test_ekf_in_rooms_errs_by_millimetres(walls: np.ndarray) -> None:
         assert radians < most_rad
 
 
-@pytest.mark.parametrize("walls", [LAB, HALL])
+@pytest.mark.parametrize("walls", [LAB, pytest.param(HALL, marks=pytest.mark.extended)])
 def test_ekf_in_rooms_has_consistent_nees(walls: np.ndarray) -> None:
     """Eight drives of 10 s but for the first two seconds; errors of one drive are correlated, so the band is that of eight drives."""
     few, means = rooms.Beams(beams=240, rate_hz=6.25), []
@@ -103,8 +104,10 @@ def test_ekf_in_rooms_has_consistent_nees(walls: np.ndarray) -> None:
     assert 1.0 < np.mean(means) < 6.0
 
 
-@pytest.mark.parametrize("offset_s", [0.06, -0.06])
-@pytest.mark.parametrize("wheel_every", [1, 4])
+@pytest.mark.parametrize(
+    ("offset_s", "wheel_every"),
+    cases([(0.06, 1), (-0.06, 1), (0.06, 4), (-0.06, 4)], ("-0.06, 4",), ids=("0.06, 1", "-0.06, 1", "0.06, 4", "-0.06, 4")),
+)
 def test_ekf_with_shifted_wheels_estimates_clock_offset(offset_s: float, wheel_every: int) -> None:
     """What happened at t bears t + offset in the wheels' stamps; with 50 samples a second, and with one per scan."""
     scanner = rooms.Beams(beams=240)
@@ -130,6 +133,7 @@ def test_ekf_with_beam_times_follows_slip() -> None:
 # --- scenes that leave directions open
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", [0, 1])
 def test_ekf_there_and_back_in_a_corridor_stays_on_its_map(seed: int) -> None:
     """Of 45 m, whose ends are out of range most of the time. Once noise of normals was learned as the wheels' radius, the pose was known
@@ -179,6 +183,7 @@ def test_ekf_with_spinning_wheels_follows_lidar() -> None:
     assert off["ekf"] < 0.02
 
 
+@pytest.mark.extended
 def test_ekf_with_encoders_at_zero_follows_lidar() -> None:
     def stuck(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
         return twists * np.where((t > 5) & (t < 9), 0.0, 1.0)[:, None]
@@ -204,6 +209,7 @@ def test_ekf_with_wheels_that_stall_and_catch_up_loses_no_scan() -> None:
     assert rooms.ate(drive, rooms.at_scans(drive, result)[0]) < 0.02
 
 
+@pytest.mark.extended
 def test_ekf_after_gap_of_8_s_is_within_5_sigma() -> None:
     """Neither wheels nor scans while the robot drives on: the covariance says so, and the submap is found again."""
     drive = rooms.drive_through(HALL, rooms.path((1, 0, 0), (6, 0.4, 0.2), (8, 0.4, -0.2), (6, 0.3, 0.3), (1, 0, 0)), 0)
@@ -219,6 +225,7 @@ def test_ekf_after_gap_of_8_s_is_within_5_sigma() -> None:
     assert np.hypot(*(poses[-1] - drive.poses[-1])[:2]) < 0.05
 
 
+@pytest.mark.extended
 def test_ekf_without_wheels_turns_by_the_gyro_where_the_lidar_is_blind() -> None:
     drive = rooms.drive_through(HALL, rooms.path((2, 0, 0), (10, 0.3, 0.2), (4, 0.2, 0.6), (4, 0.3, -0.2)), 0)
     begin, end = rooms.WALL_START_NS + 12 * S, rooms.WALL_START_NS + 16 * S
@@ -361,7 +368,7 @@ def test_ekf_with_two_lidars_uses_both() -> None:
     assert worst(front, estimates, 0, len(front.poses)) < 0.02
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.03])
+@pytest.mark.parametrize("tilt", cases([0.0, 0.03], ("0.03",)))
 def test_ekf_with_clouds_errs_by_centimetres(tilt: float) -> None:
     """The floor is most of a cloud and holds nothing; a robot that pitches by 2 degrees is still where it is."""
     pipeline, mounts = None, {"laser": Mount(z=0.8)}

@@ -117,6 +117,7 @@ def errors_on_second_visit(drive: rooms.Drive, poses: np.ndarray) -> np.ndarray:
 # --- loops about a building
 
 
+@pytest.mark.extended
 def test_graph_around_building_closes_loop() -> None:
     """After it, live poses are nearer the place of the first visit than the odometry's, and smoothed trajectories nearer the truth: in the
     mean of four drives, as drift differs by chance."""
@@ -294,6 +295,7 @@ def driven_with(fixes: list[PositionSample]) -> tuple[np.ndarray, Pipeline]:
     return np.hypot(*(at - drive.poses[:, :2]).T), pipeline
 
 
+@pytest.mark.extended
 def test_graph_with_positions_corrects_wrong_wheels() -> None:
     without, with_fixes = driven_with([])[0], driven_with(positions(around()))[0]
     assert without.max() > 2.0
