@@ -24,6 +24,9 @@ _KISS_OF_RANGE, _MIN_VOXEL_M, _MAX_VOXEL_M = 0.05, 0.1, 1.0
 """Voxel of the map as a share of the first scan's median range, at least and at most [m]. Its default, a hundredth of the maximal range,
 fails indoors, where scanners reach far less than they could."""
 
+_LEAST_ERROR_VOXELS = 0.5
+"""Least sigma of associations, in voxels: points of the map are that far apart."""
+
 
 @contextlib.contextmanager
 def _without_environment() -> Iterator[None]:
@@ -65,9 +68,12 @@ class KissIcp:
         self._kiss.register_frame(points, _NO_STAMPS)
         return _planar(self._kiss.last_pose)
 
-    def align(self, points: FloatArray, guess: Pose2) -> Pose2:
-        """The pose of ``points`` in the map, searched from ``guess`` (3,)."""
-        kiss, sigma = self._kiss, self._threshold.get_threshold()
+    def align(self, points: FloatArray, guess: Pose2, error: float) -> Pose2:
+        """The pose of ``points`` in the map, searched from ``guess`` (3,), by which a point is off by up to ``error`` (3 sigma) [m].
+
+        KISS-ICP alone learns the error of its guesses from past frames; that of a filter's prediction is known.
+        """
+        kiss, sigma = self._kiss, max(error / 3.0, _LEAST_ERROR_VOXELS * self._made[0])
         source, _ = kiss.voxelize(kiss.preprocessor.preprocess(points, _NO_STAMPS, np.eye(4)))
         pose = kiss.registration.align_points_to_map(
             points=source,
@@ -76,7 +82,6 @@ class KissIcp:
             max_correspondance_distance=3.0 * sigma,  # the spelling is theirs
             kernel=sigma,
         )
-        self._threshold.update_model_deviation(np.linalg.inv(_matrix(guess)) @ pose)
         return _planar(pose)
 
     def insert(self, points: FloatArray, pose: Pose2) -> None:

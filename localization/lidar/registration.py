@@ -67,14 +67,14 @@ def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, gues
     ``guess_error``: how far the guess may be off at a point [m]; None for a guess that is as uncertain as the prior.
     """
     information, H, g = np.asarray(np.linalg.inv(cov), dtype=float), np.empty((3, 3)), np.empty(3)
-    first = _prior_error_at_points(points, cov) if guess_error is None else guess_error
+    first = prior_error_at_points(points, cov) if guess_error is None else guess_error
     pose, sums = _align(grid, points, triple(prior), information, triple(guess), first, H, g)
     return Fit(np.array(pose), H, g, *sums)
 
 
 @kernel
-def _prior_error_at_points(points: Points2, cov: Cov3) -> float:
-    """How far a prior of ``cov`` (3, 3) may move a point of ``points`` (N, 2) [m]."""
+def prior_error_at_points(points: Points2, cov: Cov3) -> float:
+    """How far a point of ``points`` (N, 2) may be off with a prior of ``cov`` (3, 3): 3 sigma at the median range, within limits [m]."""
     r2 = np.median(points[:, 0] ** 2 + points[:, 1] ** 2)
     return min(3.0 * math.sqrt(cov[0, 0] + cov[1, 1] + cov[2, 2] * r2), _MAX_ASSOCIATION_M)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -40,7 +40,7 @@ class LidarConfig(Settings):
     """How scans are matched."""
 
     matcher: Literal["submap", "kiss"] = "submap"
-    """What aligns scans: `submap`, or `kiss` for KISS-ICP started from the prediction."""
+    """What aligns scans first: Gauss-Newton on the `submap` from the prediction, or KISS-ICP from it (`kiss`), which the submap refines."""
     voxel_size_m: Annotated[float, Allowed("0, or from 0.01 to 10", lambda value: value == 0.0 or 0.01 <= value <= 10.0)] = 0.0
     """Edge of the voxels [m]; 0 takes 2 % of the first scan's median range (KISS-ICP: 5 %), at least 0.04 m."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.1
@@ -177,14 +177,6 @@ class ScanMatcher:
         pull = sum(np.einsum("g,gij,jk,glk->il", gap, M, slip_rate, M) for gap, M in ((after, later), (before, earlier)))
         R = np.linalg.inv(H.sum(axis=0) + _OPEN_INFORMATION)
         return np.asarray(R @ pull @ R)
-
-    def evaluate(self, points: Points2, pose: Pose2) -> ScanMatch | None:
-        """The match of ``points`` at ``pose`` (3,), which another method has found; None where too few of them fit there."""
-        assert self._grid is not None
-        fit = linearize(self._grid, points, pose)
-        if fit.overlap < self._config.lost_below:
-            return None
-        return self._result(replace(fit, gradient=np.zeros(3)), np.zeros((3, 3)))
 
     def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None) -> KeyScanError:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""

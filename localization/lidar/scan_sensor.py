@@ -12,7 +12,7 @@ from localization.events import Step
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
-from localization.lidar.registration import is_narrow
+from localization.lidar.registration import is_narrow, prior_error_at_points
 from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.lidar.scan_policies import MovedRobot, OpenPlace, StaleScans
 from motion_models import se2
@@ -165,9 +165,7 @@ class ScanMatchingSensor:
     def _match(self, matcher: ScanMatcher, scan: _Scan, offset: Tangent2) -> ScanMatch | None:
         if self._kiss is None:
             return matcher.match(scan.planar, self._prior, self._cov, offset=offset)
-        guess = self._kiss.align(scan.points, self._prior)
-        if self._config.matcher == "kiss":
-            return matcher.evaluate(scan.planar, guess)
+        guess = self._kiss.align(scan.points, self._prior, prior_error_at_points(scan.planar, self._cov))
         return matcher.match(scan.planar, self._prior, self._cov, guess, offset)
 
     def _mount(self, frame: str) -> Mount:

@@ -35,7 +35,7 @@ def test_align_from_prior_reaches_the_pose() -> None:
     for scan, pose in zip(scans[:10], POSES, strict=False):
         kiss.insert(scan, pose)
     off = np.array([0.1, -0.08, 0.05])
-    found = kiss.align(scans[10], se2.compose(POSES[10], off))
+    found = kiss.align(scans[10], se2.compose(POSES[10], off), 0.3)
     error = np.abs(se2.log(se2.between(POSES[10], found)))
     assert error[:2].max() < 0.02
     assert error[2] < 0.005
