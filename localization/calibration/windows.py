@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,12 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _NOTHING = np.zeros((0,))
+_LEAST_STEP_RAD = 1e-6
+"""Smaller differences of angles are rounding [rad]."""
+_COARSE = 0.25
+"""Step of an encoder, over the way of a side between two samples, from which on rates are those of its counts and not of the wheel."""
+_MERGED_STEPS, _MERGED_S = 8.0, 0.25
+"""Intervals are merged until a side has gone so many steps, or so long [s]: rates are then right to a tenth."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,8 @@ def cut(
     waiting: list[Span] = []
     found: list[tuple[Span, Maneuver]] = []
     first_wheel_ns: int | None = None
+    last_wheels: WheelSample | None = None
+    step_rad = math.inf
     short = unmeasured = 0
 
     def take(until_ns: int | None) -> Iterator[Span]:
@@ -77,7 +86,7 @@ def cut(
     def use(span: Span) -> int:
         """1 if the span was not measured."""
         nonlocal short
-        window = _window(history, span, around)
+        window = _window(history, span, around, step_rad)
         if window is None:
             return 1
         dt, rates, cg, lead, middle, n = window
@@ -94,6 +103,7 @@ def cut(
     for event in events:
         if isinstance(event, WheelSample):
             history.insert(event)
+            step_rad, last_wheels = _least_step(step_rad, event, last_wheels), event
             first_wheel_ns = event.stamp_ns if first_wheel_ns is None else first_wheel_ns
         elif isinstance(event, CgSample):
             history.set_cg(event)
@@ -104,8 +114,7 @@ def cut(
     for span in take(None):
         unmeasured += use(span)
     corrected = reference.correct([span for span, _ in found])
-    group_s = config.window_s * config.per_group
-    maneuvers = _grouped([maneuver for _, maneuver in found], corrected, first_wheel_ns or 0, group_s, name)
+    maneuvers = _grouped([maneuver for _, maneuver in found], corrected, first_wheel_ns or 0, config.window_s * config.per_group, name)
     return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()))
 
 
@@ -119,9 +128,17 @@ def _grouped(maneuvers: Sequence[Maneuver], spans: Sequence[Span], begin_ns: int
     return found
 
 
-def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, FloatArray, FloatArray, int, int, int] | None:
-    """Intervals (n,), rates (n, 2) and CG (n, 2) around a span; how many lie before it, in it before its middle, and in it. None where some
-    are missing."""
+def _least_step(step_rad: float, sample: WheelSample, before: WheelSample | None) -> float:
+    """Smallest difference of angles so far, which is the encoders' step where these are coarse [rad]."""
+    ways = [] if before is None else np.abs(sample.position - before.position).tolist()
+    return float(min([step_rad, *(way for way in ways if way > _LEAST_STEP_RAD)]))
+
+
+def _window(
+    history: WheelBuffer, span: Span, around: int, step_rad: float
+) -> tuple[FloatArray, FloatArray, FloatArray, int, int, int] | None:
+    """Intervals (n,), rates (n, 2) and CG (n, 2) around a span, by encoders of this step; how many lie before it, in it before its middle,
+    and in it. None where some are missing."""
     middle_ns = span.start_ns if span.middle_ns is None else span.middle_ns
     edges = (span.start_ns - around, span.start_ns, middle_ns, span.end_ns, span.end_ns + around)
     parts = []
@@ -131,10 +148,33 @@ def _window(history: WheelBuffer, span: Span, around: int) -> tuple[FloatArray, 
             if span.start_ns <= begin < span.end_ns:
                 return None
             dt, rates, cg = _NOTHING, np.zeros((0, 2)), np.zeros((0, 2))  # at the log's ends, no clock is looked for
-        parts.append((dt, rates, cg))
+        parts.append(merge_counts(dt, rates, cg, step_rad))
     dt, rates, cg = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     lead, first, second, _ = (len(part[0]) for part in parts)
     return dt, rates, cg, lead, first, first + second
+
+
+def merge_counts(dt: FloatArray, rates: FloatArray, cg: FloatArray, step_rad: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Intervals (n,) [s], rates (n, 2) and CG (n, 2), merged where the encoders' step is not much less than a side's way in one.
+
+    By such encoders a wheel stands in one interval and rolls twice as fast in the next, and so does the other side at another time: no
+    robot turns as a model predicts for these rates, but as for their mean.
+    """
+    ways = np.abs(rates) * dt[:, None]
+    moving = ways[ways > 0.0]
+    if not moving.size or step_rad < _COARSE * float(np.median(moving)):
+        return dt, rates, cg
+    index, gone, seconds = np.zeros(len(dt), dtype=np.int64), np.zeros(2), 0.0
+    for i in range(1, len(dt)):
+        gone, seconds = gone + ways[i - 1], seconds + float(dt[i - 1])
+        is_full = gone.max() >= _MERGED_STEPS * step_rad or seconds + float(dt[i]) > _MERGED_S
+        index[i] = index[i - 1] + is_full
+        if is_full:
+            gone, seconds = np.zeros(2), 0.0
+    first = np.flatnonzero(np.diff(index, prepend=-1))
+    merged = np.add.reduceat(dt, first)
+    means = [np.add.reduceat(values * dt[:, None], first) / merged[:, None] for values in (rates, cg)]
+    return merged, means[0], means[1]
 
 
 def driven(maneuvers: Sequence[Maneuver], wheel_radius_m: float, track_width_m: float) -> tuple[float, float, float]:

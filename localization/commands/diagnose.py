@@ -189,7 +189,7 @@ class Diagnose:
         d = found.diagnosis
         if d.handover is None or found.predictor is None or found.linearization is None or self._reader is None:
             return found
-        named = [f.definition.key for f in correctable_findings(d)]
+        named = d.handover.corrected if d.handover.is_better else [f.definition.key for f in correctable_findings(d)]
         try:
             handover = check_findings(found.predictor, found.linearization, named, self._reader)
         except SkidlocError as error:  # a robot that no command runs with keeps its old values

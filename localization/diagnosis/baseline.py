@@ -13,11 +13,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.diagnosis.causes.cause import with_sizes
+from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import candidate_causes, make_predictor
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.prediction import Baseline, DrivePredictor
-from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map, slip_stiffness_cause, stiffness_exponent_cause
+from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map
 from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
@@ -32,10 +33,6 @@ _SLIPS: Mapping[str, float] = {
 """Sigma of slips that grow with speed: their typical sizes, in their units; and of rotations that no friction model predicts."""
 _CG_SIGMA_M = 0.01
 """Sigma of the centre of gravity by robot files [m], with batteries and cables that these do not have."""
-_LOG_STIFFNESS_SIGMA = 1.0
-"""Sigma of the logarithm of the slip stiffness, whatever the floor: a factor of 3 either way."""
-_STIFFNESS_EXPONENT_SIGMA = 0.5
-"""Sigma of the power with which the stiffness grows with speed: 0 for tyres by way, 1 for contacts by rate (`friction_response`)."""
 _PASSING = frozenset({"gyro_bias", "slope"})
 """Causes of one drive alone, which the baseline does not have."""
 
@@ -52,8 +49,7 @@ def estimate_baseline(drive: Drive, model: MotionModel) -> Baseline:
     sigmas = {**PRIOR_SIGMAS, **_SLIPS, "cg_offset_x": _CG_SIGMA_M, "cg_offset_y": _CG_SIGMA_M}
     causes = [dataclasses.replace(c, prior_sigma=sigmas[c.id]) for c in candidate_causes(predictor, moments=0) if c.id in sigmas]
     if model.name == FrictionModel.name:
-        causes.append(dataclasses.replace(slip_stiffness_cause(drive.robot), prior_sigma=_LOG_STIFFNESS_SIGMA))
-        causes.append(dataclasses.replace(stiffness_exponent_cause(), prior_sigma=_STIFFNESS_EXPONENT_SIGMA))
+        causes += [slip_stiffness_cause(drive.robot), stiffness_exponent_cause()]
     found = estimate_map(predictor, tuple(causes))
     lasting = with_sizes({c: float(v) for c, v in zip(found.causes, found.sizes, strict=True) if c.id not in _PASSING})
     noise = found.linearization.noise

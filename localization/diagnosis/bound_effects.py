@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Hypothesis
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor
-from localization.diagnosis.verdict import moved_by
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor, moved_by
 from motion_models import se2
 from motion_models.calibration.prediction import series_of
 from motion_models.se2 import FloatArray

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,11 +32,13 @@ from localization.diagnosis.linearization import (
     TOLERANCE,
     Linearization,
     candidate_causes,
+    is_skid_steer,
     linearize,
     make_predictor,
 )
+from localization.diagnosis.model_error import ModelError, find_model_error, size_error, unmodelled_by
 from localization.diagnosis.noise import slow_turn_sigmas
-from localization.diagnosis.prediction import Baseline, DrivePredictor
+from localization.diagnosis.prediction import Baseline, DrivePredictor, Unmodelled
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -61,11 +64,13 @@ from localization.diagnosis.verdict import (
     find_trends,
     general_advice,
     mark_trends,
+    model_error_advice,
     noise_excess,
     separating_drive,
 )
 from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
+from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray
 
 _ROUNDS = 5
@@ -125,12 +130,39 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
-    predictor = make_predictor(drive, model, baseline)
-    causes = candidate_causes(predictor, config.moments)
-    first = linearize(predictor, causes, {}, TOLERANCE)
+    predictor, first, error = _linearize_with_model_error(make_predictor(drive, model, baseline), config)
     rng = np.random.default_rng(config.seed)
     linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
-    return _conclude(predictor, first, linearization, _drop_insignificant(linearization, chosen, rng, config), rng, config)
+    chosen = _drop_insignificant(linearization, chosen, rng, config)
+    return _conclude(_Searched(predictor, first, linearization, error), chosen, rng, config)
+
+
+class _Searched(NamedTuple):
+    """A drive in which causes were searched."""
+
+    predictor: DrivePredictor
+    first: Linearization
+    """About the robot file."""
+    linearization: Linearization
+    """About the best causes."""
+    error: ModelError
+
+
+def _linearize_with_model_error(predictor: DrivePredictor, config: DiagnosisConfig) -> tuple[DrivePredictor, Linearization, ModelError]:
+    """The drive about the robot file, beside what the friction model is off on other contacts; a healthy drive shows that, so that nothing
+    is added to its baseline."""
+    drive = predictor.drive
+    is_searched = predictor.model.name == FrictionModel.name and is_skid_steer(drive.robot) and drive.kind in ("log", "windows")
+    if not is_searched or predictor.has_baseline:
+        return predictor, linearize(predictor, candidate_causes(predictor, config.moments), {}, TOLERANCE), ModelError(0.0, 0.0)
+    predictor = dataclasses.replace(predictor, unmodelled=Unmodelled(has_stiffness=True))
+    causes = candidate_causes(predictor, config.moments)
+    first = linearize(predictor, causes, {}, TOLERANCE)
+    error = find_model_error(predictor, first)
+    if unmodelled_by(predictor, error) != predictor.unmodelled:
+        predictor = dataclasses.replace(predictor, unmodelled=unmodelled_by(predictor, error))
+        first = linearize(predictor, causes, {}, TOLERANCE)
+    return predictor, first, error
 
 
 def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Linearization, tuple[int, ...]]:
@@ -197,21 +229,17 @@ def _p_value(linearization: Linearization, others: tuple[int, ...], i: int, rng:
     return p_value(statistic(linearization.problem, others, i), max_statistic(linearization.problem, others, rng, df), df)
 
 
-def _conclude(
-    predictor: DrivePredictor,
-    first: Linearization,
-    linearization: Linearization,
-    chosen: tuple[int, ...],
-    rng: np.random.Generator,
-    config: DiagnosisConfig,
-) -> DiagnosisResult:
+def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> DiagnosisResult:
     """Findings, the table with its attributions, and the verdict that follows from it."""
+    predictor, first, linearization, error = searched
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
     reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
     excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
     chosen, gains, dropped = _keep_useful(linearization, chosen, config, max(excess) <= MAX_NOISE_OVER_REFERENCE)
     sizes, gained = problem.fit_by_likelihood(chosen)[0], problem.gain(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
+    if error.is_shown:
+        findings = [dataclasses.replace(f, sigma=math.hypot(f.sigma, size_error(predictor, f.definition))) for f in findings]
     rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
@@ -229,6 +257,8 @@ def _conclude(
         next_drive = separating_drive(predictor, findings)
     else:
         next_drive = general_advice(verdict, [e.id for e in undetectable])
+    if error.is_shown:
+        next_drive = f"{next_drive} {model_error_advice(findings)}".strip()
     within = {**dropped, **_within_tolerance(linearization, chosen, sizes, rows)}
     result = Diagnosis(
         *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, rows, tuple(findings), trends),
@@ -241,7 +271,7 @@ def _conclude(
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
-        warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *drive.warnings),
+        warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *error.notes, *drive.warnings),
         suspected=None if suspected is None else suspected[0],
     )
     named = [f.definition.key for f in correctable_findings(result)] or [causes[i].key for i in chosen]

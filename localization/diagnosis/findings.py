@@ -221,16 +221,13 @@ class Replayed(NamedTuple):
     before_m: float
     """Root mean square [m]."""
     after_m: float
-    gain: Interval
-    """Difference of both; 95 % interval over blocks of windows [m]."""
     noise_m: float = 0.0
     """Root mean square of the drive's noise in these windows [m]: an estimator with the same scans errs by less against them."""
 
     @property
     def is_worse(self) -> bool:
-        """Whether errors grow by more than 2 %, by more than their scatter, and by more than the drive's noise."""
-        has_grown = self.after_m > _MAX_GROWTH * self.before_m and self.gain.high < 0.0
-        return has_grown and self.after_m**2 - self.before_m**2 > self.noise_m**2
+        """Whether errors grow by more than 2 %, and by more than the drive's noise."""
+        return self.after_m > _MAX_GROWTH * self.before_m and self.after_m**2 - self.before_m**2 > self.noise_m**2
 
 
 @dataclass(frozen=True)
@@ -245,6 +242,8 @@ class HandoverCheck:
     """Share by which the windows' errors shrink, each component over its root mean square before; 95 % interval over blocks of windows."""
     replays: Mapping[str, Replayed] = field(default_factory=dict)
     """By estimator."""
+    corrected: tuple[str, ...] = ()
+    """Keys of the findings that the file corrects."""
 
     @property
     def is_better(self) -> bool:
@@ -440,7 +439,10 @@ def correctable_findings(d: Diagnosis) -> list[Finding]:
 
 def confirmed_findings(d: Diagnosis) -> list[Finding]:
     """Findings that the sentence orders to correct, and that a robot file is written with: they improve what they were not fitted to."""
-    return correctable_findings(d) if d.is_confirmed else []
+    if not d.is_confirmed:
+        return []
+    held = None if d.handover is None else d.handover.corrected
+    return [f for f in correctable_findings(d) if held is None or f.definition.key in held]
 
 
 def sentence(d: Diagnosis) -> str:
@@ -457,9 +459,11 @@ def sentence(d: Diagnosis) -> str:
         text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
         return text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
     estimated = correctable_findings(d)
-    orders = [_correction(d, estimated)] if estimated and d.is_confirmed else []
-    if estimated and not d.is_confirmed and d.verdict != "unexplained":
-        orders = [_not_better(estimated)]
+    confirmed = confirmed_findings(d)
+    orders = [_correction(d, confirmed)] if confirmed else []
+    others = [f for f in estimated if f not in confirmed]
+    if others and d.verdict != "unexplained":
+        orders.append(_not_better(others))
     parts = [f"{part[0].upper()}{part[1:]}" for part in orders + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
     if left:
@@ -485,9 +489,9 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
 
 
 def _not_better(findings: Sequence[Finding]) -> str:
-    """Findings that improve nothing: causes, and why nothing is to be corrected."""
+    """Findings that are not to be corrected, and why."""
     listed = ", ".join(_further(f) for f in findings)
-    return f"{listed}; a robot file with it improves nothing beyond the scatter of the half held out, so that nothing is to be corrected"
+    return f"Not to be corrected, as a robot file with it improves nothing beyond the scatter of the half held out: {listed}"
 
 
 def _further(f: Finding) -> str:

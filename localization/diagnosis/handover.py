@@ -42,12 +42,23 @@ _SENSOR_FIELDS = (
 """What of a hypothesis a robot file corrects when messages are read."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Reader:
     """How the diagnosed log is read with a robot: its drive, and its events."""
 
     drive: Callable[[Robot], Drive]
     log: Callable[[Robot], Log]
+    _replayed: dict[tuple[int, str, int], tuple[Robot, list[Run]]] = dataclasses.field(default_factory=dict, init=False, repr=False)
+    """Runs by robot, model and start; with the robot, so that its identity stays its own."""
+
+    def runs(self, robot: Robot, model: str, start_ns: int) -> list[Run]:
+        """The log from ``start_ns`` on by ``robot`` and this model, by each of `_ESTIMATORS`; replayed once."""
+        key = id(robot), model, start_ns
+        if key not in self._replayed:
+            log, trials = self.log(robot), [Trial(make_model(model, robot), name) for name in _ESTIMATORS]
+            events = (event for event in log.events() if event.stamp_ns >= start_ns)
+            self._replayed[key] = robot, replay(events, trials, log.robot, log.mounts, log.sources.lidar is not None)
+        return self._replayed[key][1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,13 +77,23 @@ def check_findings(
 ) -> HandoverCheck | None:
     """Correct the robot by the first half of the drive, and check its file on the second half, as `check_written`.
 
-    ``named`` are the keys of the findings. None where the file would hold none of them, for tables, and for drives that are too short.
+    ``named`` are the keys of the findings, strongest first. Where the file is not better, the weakest is left out, and the next file is
+    tried. None where the first file would hold none of the findings, for tables, and for drives that are too short.
     """
-    sizes = _first_half_sizes(predictor, linearization, named)
-    if sizes is None:
-        return None
+    first: HandoverCheck | None = None
     held = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
-    return check_written(predictor, linearization.noise, Candidate(correct_robot(predictor, sizes), sizes, held), reader)
+    for count in range(len(named), 0, -1):
+        sizes = _first_half_sizes(predictor, linearization, named[:count])
+        if sizes is None:
+            break
+        found = check_written(predictor, linearization.noise, Candidate(correct_robot(predictor, sizes), sizes, held), reader)
+        if found is None:
+            break
+        found = dataclasses.replace(found, corrected=tuple(named[:count]))
+        if found.is_better:
+            return found
+        first = first or found
+    return first
 
 
 def check_written(predictor: DrivePredictor, noise: Noise, candidate: Candidate, reader: Reader | None) -> HandoverCheck | None:
@@ -121,8 +142,11 @@ def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidat
     found = _compared_rows(predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second])
     if found is None or not drive.has_headings:  # chords between positions are no poses to compare with
         return found
-    runs = (old, predictor.drive, first), (new, drive, second)
-    errors = [_replay_errors(reader.log(robot), robot, name, cut, windows) for robot, cut, windows in runs]
+    start_ns = int(predictor.drive.spans_ns[candidate.held, 0].min()) - _LEAD_NS
+    errors = []
+    for robot, cut, windows in ((old, predictor.drive, first), (new, drive, second)):
+        turn_m = 0.5 * robot.geometry.track_width_m
+        errors.append({run.estimator: _window_error(run, cut, windows, turn_m) for run in reader.runs(robot, name, start_ns)})
     variances = _window_noise(noise, first, 0.5 * old.geometry.track_width_m)
     compared = {estimator: _compared(errors[0][estimator], errors[1][estimator], variances) for estimator in errors[0]}
     return dataclasses.replace(found, replays={estimator: one for estimator, one in compared.items() if one is not None})
@@ -173,10 +197,7 @@ def _compared(before: FloatArray, after: FloatArray, noise: FloatArray) -> Repla
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
-    gain = root_mean_gain(before[known], after[known], np.arange(int(known.sum())) // _BLOCK, np.random.default_rng(0))
-    return Replayed(
-        math.sqrt(float(before[known].mean())), math.sqrt(float(after[known].mean())), gain, math.sqrt(float(noise[known].mean()))
-    )
+    return Replayed(*(math.sqrt(float(squares[known].mean())) for squares in (before, after, noise)))
 
 
 def _paired(before: Drive, after: Drive, held: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:
@@ -189,15 +210,6 @@ def _paired(before: Drive, after: Drive, held: NDArray[np.bool_]) -> tuple[IntAr
             pairs.append((int(i), j))
     first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
     return first, second
-
-
-def _replay_errors(log: Log, robot: Robot, model: str, drive: Drive, windows: IntArray) -> dict[str, FloatArray]:
-    """Squared errors (W,) of the motion in ``windows`` of ``drive`` by each estimator, headings times half the track [m^2]."""
-    trials = [Trial(make_model(model, robot), name) for name in _ESTIMATORS]
-    start_ns = int(drive.spans_ns[windows, 0].min()) - _LEAD_NS
-    events = (event for event in log.events() if event.stamp_ns >= start_ns)
-    runs = replay(events, trials, log.robot, log.mounts, log.sources.lidar is not None)
-    return {run.estimator: _window_error(run, drive, windows, 0.5 * robot.geometry.track_width_m) for run in runs}
 
 
 def _window_noise(noise: Noise, windows: IntArray, turn_m: float) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,9 +11,10 @@ import numpy as np
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with_sizes
+from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.noise import Noise, estimate_drive_noise
-from localization.diagnosis.prediction import Baseline, DrivePredictor
+from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
+from localization.diagnosis.prediction import Baseline, DrivePredictor, give_columns, mirrored, slip_columns
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel
 from motion_models.diff_drive import DiffDrive
@@ -160,17 +162,27 @@ def bounded_minimum(a: FloatArray, b: FloatArray, limit: FloatArray) -> FloatArr
     return x
 
 
+def without_nuisances(nuisances: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """What takes whitened ``nuisances`` (K, q) with sizes of the sigma `FLAT` off whitened columns (K, ...): their least squares, whose
+    rows of priors are appended (K + q, ...) (Barfoot 2017, sec. 3.1)."""
+    q = np.linalg.qr(np.vstack([nuisances * FLAT, np.eye(nuisances.shape[1])]))[0]
+
+    def take_off(columns: FloatArray) -> FloatArray:
+        padded = np.concatenate([columns, np.zeros((nuisances.shape[1], *columns.shape[1:]))])
+        return np.asarray(padded - q @ (q.T @ padded))
+
+    return take_off
+
+
 def regression(
     y: FloatArray, signatures: FloatArray, nuisances: FloatArray, scale: FloatArray, tolerance: FloatArray | None = None
 ) -> Regression:
     """From whitened rows (K,), signatures (K, p) and nuisances (K, q); ``scale`` and ``tolerance`` (p,) in the causes' own units."""
     s = signatures * scale
-    used = np.linalg.norm(nuisances, axis=0) > 1e-9 if nuisances.size else np.zeros(0, dtype=bool)
-    if used.any():
-        q, r = np.linalg.qr(nuisances[:, used])
-        q = q[:, np.abs(np.diag(r)) > 1e-9 * np.abs(np.diag(r)).max()]
-        y, s = y - q @ (q.T @ y), s - q @ (q.T @ s)
     count = int(np.count_nonzero(np.abs(signatures).sum(axis=1) + np.abs(y)))
+    if nuisances.size:
+        without = without_nuisances(nuisances)
+        y, s = without(y), without(s)
     within = np.full(len(scale), _NO_SIZE) if tolerance is None else np.maximum(tolerance / scale, _NO_SIZE)
     return Regression(s.T @ s, s.T @ y, float(y @ y), count, scale, within)
 
@@ -265,7 +277,7 @@ def linearize(predictor: DrivePredictor, causes: tuple[Cause, ...], sizes: dict[
     linear = rows.copy()
     for cause, size in sizes.items():
         linear += signatures[..., [e.key for e in causes].index(cause.key)] * size
-    nuisances = _nuisances(rows)
+    nuisances = _nuisances(predictor, hypothesis, rows)
     noise = estimate_drive_noise(predictor, linear, signatures, nuisances, causes)
     problem = make_regression(linear, signatures, nuisances, noise, causes, tolerance)
     return Linearization(causes, rows, linear, signatures, nuisances, noise, tolerance, problem)
@@ -288,8 +300,26 @@ def make_regression(
     return regression(y, s, z, np.array([e.plausible for e in causes]), tolerance * np.array([e.negligible for e in causes]))
 
 
-def _nuisances(rows: FloatArray) -> FloatArray:
-    """(M, 6, 2) accelerometers and the floor under the IMU are never quite level."""
-    level = np.zeros((*rows.shape, 2))
-    level[:, 4, 0] = level[:, 5, 1] = 1.0
-    return np.where(np.isfinite(rows)[..., None], level, np.nan)
+def nuisance_part(state: Linearization, left: FloatArray) -> FloatArray:
+    """(M, 6) what nuisances make of ``left`` (M, 6), each within what is tolerated of its prior."""
+    z = state.noise.whiten(state.nuisances).reshape(state.rows.size, -1) * FLAT
+    gram = z.T @ z + np.eye(z.shape[1])
+    sizes = bounded_minimum(gram, z.T @ state.noise.whiten(left).ravel(), np.full(z.shape[1], MAX_TOLERANCE_SIGMAS))
+    return np.asarray(np.nan_to_num(state.nuisances) @ (FLAT * sizes))
+
+
+LEVELS = 2
+"""Nuisances that are no error of the model: the first ones."""
+
+
+def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArray) -> FloatArray:
+    """(M, 6, q) accelerometers and the floor under the IMU are never quite level; and what the model itself is off."""
+    columns = [np.zeros((*rows.shape, LEVELS))]
+    columns[0][:, 4, 0] = columns[0][:, 5, 1] = 1.0
+    if predictor.unmodelled.has_stiffness:
+        for cause in (slip_stiffness_cause(predictor.drive.robot), stiffness_exponent_cause()):
+            columns.append(predictor.signature(hypothesis, cause, rows)[..., None] * (cause.plausible / FLAT))
+        columns.append(give_columns(predictor) / FLAT)
+    if predictor.unmodelled.slip_share:
+        columns.append(mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT))
+    return np.where(np.isfinite(rows)[..., None], np.concatenate(columns, axis=-1), np.nan)

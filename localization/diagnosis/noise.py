@@ -16,6 +16,8 @@ from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from motion_models.calibration.maneuvers import Batch
 from motion_models.se2 import FloatArray
 
+FLAT = 1e3
+"""Sigma of the size of a nuisance, over the unit of its column: what may have any size has a column of about one."""
 _ROUNDS = 8
 _MIN_FREE_SHARE = 0.1  # of all numbers, however many causes there are
 _MIN_SIGMA_OVER_CLAIMED = 0.5  # least sigma, as a share of the one that the motion reference gives
@@ -211,11 +213,11 @@ def estimate_drive_noise(
     known = np.isfinite(linear)
     for _ in range(3):
         y = noise.whiten(linear).ravel()
-        design = np.hstack([noise.whiten(signatures).reshape(len(y), -1) * scale, noise.whiten(nuisances).reshape(len(y), -1) * 1e3])
+        design = np.hstack([noise.whiten(signatures).reshape(len(y), -1) * scale, noise.whiten(nuisances).reshape(len(y), -1) * FLAT])
         inverse = np.linalg.inv(design.T @ design + np.eye(design.shape[1]))
         x = inverse @ (design.T @ y)
         spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(causes)
-        left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * 1e3)
+        left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * FLAT)
         noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, (sigmas, predictor.baseline.windows), creep)
     return noise

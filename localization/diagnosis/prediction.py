@@ -114,6 +114,16 @@ class Baseline:
     """Number of windows that these sigmas count for."""
 
 
+@dataclass(frozen=True)
+class Unmodelled:
+    """What no robot file has of the contacts, as nuisances of a diagnosis (`model_error`)."""
+
+    has_stiffness: bool = False
+    """The tyres' slip stiffness, how it grows with speed, and how far contacts give way while speeds change, are unknown."""
+    slip_share: float = 0.0
+    """Sigma of slips by kind of motion, alike on both sides, that the model does not have, over the wheels' way."""
+
+
 @dataclass
 class DrivePredictor:
     """Predicts a drive's motions with one model; discrepancies are measured minus predicted.
@@ -129,6 +139,8 @@ class DrivePredictor:
     """Hypotheses count from there."""
     is_gyro_scaled: bool = False
     """Whether headings are corrected by the gyro's scale against the motion reference: turning for a minute, 1 % makes 0.1 rad."""
+    unmodelled: Unmodelled = field(default_factory=Unmodelled)
+    """What the model's own error may be; no cause, and part of what is tolerated."""
     batch: Batch = field(init=False)
     headings: FloatArray = field(init=False)
     """(W,) at the start of each maneuver, counted from the first [rad]."""
@@ -326,6 +338,69 @@ class DrivePredictor:
         step = 0.1 * cause.typical
         ahead = self.discrepancies(cause.inject(hypothesis, step))
         return np.asarray(((self.discrepancies(hypothesis) if base is None else base) - ahead) / step)
+
+
+def moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:
+    """(3, 3, K) change of a window's last pose, in its frame, by the ``increments`` (n, K) of each component (second axis) of the twist."""
+    turned = np.cumsum(twist[:, 2] * dt)
+    before = turned - 0.5 * twist[:, 2] * dt - turned[-1]
+    c, s = np.cos(before), np.sin(before)
+    steps = np.column_stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]]) * dt[:, None]
+    ahead = steps[::-1].cumsum(axis=0)[::-1] - 0.5 * steps
+    moved = np.zeros((3, 3, increments.shape[1]))
+    moved[0, 0], moved[1, 0] = c @ increments, s @ increments
+    moved[0, 1], moved[1, 1] = -s @ increments, c @ increments
+    moved[0, 2], moved[1, 2], moved[2, 2] = -ahead[:, 1] @ increments, ahead[:, 0] @ increments, increments.sum(axis=0)
+    return moved
+
+
+_KINDS = 8
+"""Straight ahead and back, turns in place and arcs, to both sides."""
+
+
+def slip_columns(predictor: DrivePredictor) -> FloatArray:
+    """(M, 6, 3 `_KINDS`) motion by a slip of each component of the twist in each kind of motion, as a share of the wheels' way.
+
+    The kind is the direction of (q_l + q_r, q_r - q_l); slips are piecewise linear around its circle.
+    """
+    batch, g = predictor.batch, predictor.drive.robot.geometry
+    found = np.zeros((len(batch.ends), len(CHANNELS), 3 * _KINDS))
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
+        inside = slice(batch.first[owner] + batch.lead[owner], end)
+        ways = batch.wheels[inside] * batch.dt[inside, None] * g.wheel_radius_m
+        direction = np.arctan2(ways[:, 1] - ways[:, 0], ways[:, 0] + ways[:, 1]) * (_KINDS / (2.0 * math.pi))
+        apart = (direction[:, None] - np.arange(_KINDS) + 0.5 * _KINDS) % _KINDS - 0.5 * _KINDS
+        slips = np.maximum(1.0 - np.abs(apart), 0.0) * np.sqrt(np.mean(ways**2, axis=1))[:, None]
+        moved = moved_by(predictor.nominal_twist[inside], batch.dt[inside], slips)
+        moved[:, 2] /= 0.5 * g.track_width_m
+        found[i, :3] = moved.reshape(3, -1)
+    return found
+
+
+def mirrored(columns: FloatArray) -> FloatArray:
+    """(M, 6, 11) sums of the `slip_columns` (M, 6, 24) of robots whose sides are alike: in mirrored motions vx slips alike, vy and wz to
+    the other side, and neither when the robot drives straight on. Slips of one side alone are no error of contacts."""
+    by = columns.reshape(*columns.shape[:2], 3, _KINDS)
+    half = _KINDS // 2
+    ahead = [by[..., 0, k] + (by[..., 0, -k] if k % half else 0.0) for k in range(half + 1)]
+    aside = [by[..., component, k] - by[..., component, -k] for component in (1, 2) for k in range(1, half)]
+    return np.stack([*ahead, *aside], axis=-1)
+
+
+_GIVE_S = 0.01
+"""Sigma of how far wheels slip while speeds change, over the change: MuJoCo's contacts stop a slip within 5 to 9 ms [s]."""
+
+
+def give_columns(predictor: DrivePredictor) -> FloatArray:
+    """(M, 6, 2) motion by contacts that give way while speed and turning rate change, for `_GIVE_S` seconds of the change."""
+    batch, twist = predictor.batch, predictor.nominal_twist
+    found = np.zeros((len(batch.ends), len(CHANNELS), 2))
+    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
+        inside = slice(batch.first[owner] + batch.lead[owner], end)
+        gains = np.diff(twist[inside], axis=0, prepend=twist[inside][:1])[:, [0, 2]] * _GIVE_S
+        moved = moved_by(twist[inside], batch.dt[inside], gains)
+        found[i, :3] = np.column_stack([moved[:, 0, 0], moved[:, 2, 1]])
+    return found
 
 
 def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:

@@ -18,7 +18,7 @@ from localization.diagnosis.linearization import (
     make_regression,
     regression,
 )
-from localization.diagnosis.noise import Noise
+from localization.diagnosis.noise import FLAT, Noise
 from localization.diagnosis.prediction import DrivePredictor
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
@@ -171,7 +171,7 @@ def heldout_squares(linear: FloatArray, signatures: FloatArray, nuisances: Float
     """(M,) sum of squares of each window, predicted from the others by causes with the prior sigmas ``spreads`` (p,), 0 for none."""
     y = noise.whiten(linear)
     used = spreads > 0.0
-    columns = [noise.whiten(signatures[..., used]) * spreads[used], noise.whiten(nuisances) * 1e3]
+    columns = [noise.whiten(signatures[..., used]) * spreads[used], noise.whiten(nuisances) * FLAT]
     design = np.concatenate(columns, axis=-1)
     out = np.zeros(len(y))
     for held in folds(len(y)):

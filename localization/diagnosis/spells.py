@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Cause, Spell, in_spell
-from localization.diagnosis.linearization import Linearization, Regression, regression
+from localization.diagnosis.linearization import Linearization, Regression, regression, without_nuisances
 from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.selection import cost, folds, price
 from motion_models.se2 import FloatArray
@@ -114,17 +114,16 @@ def spell_gains(
     shares = np.array([s.share(*predictor.window_times_s) for s in spells])
     S = noise.whiten(state.signatures).reshape(-1, len(state.causes)) * problem.scale
     y, z = noise.whiten(state.linear).ravel(), noise.whiten(state.nuisances).reshape(S.shape[0], -1)
-    used = np.linalg.norm(z, axis=0) > 1e-9
-    q = np.linalg.qr(z[:, used])[0]
-    y, S = y - q @ (q.T @ y), S - q @ (q.T @ S)
+    without = without_nuisances(z)
+    measured, y, S = len(y), without(y), without(S)
     variances = np.square(problem.tolerance)
     variances[list(base)] = 1.0
     A = S.T @ S + np.diag(1.0 / variances)
     left = y - S @ np.linalg.solve(A, S.T @ y)
     gains = np.zeros((len(tried), len(spells)))
     for row, i in zip(gains, tried, strict=True):
-        columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, :]).reshape(len(y), -1) * problem.scale[i]
-        columns -= q @ (q.T @ columns)
+        columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, :]).reshape(measured, -1) * problem.scale[i]
+        columns = without(columns)
         u = columns.T @ left
         v = np.sum(columns**2, axis=0) - np.sum((S.T @ columns) * np.linalg.solve(A, S.T @ columns), axis=0)
         v = np.maximum(v, 0.0)

@@ -27,9 +27,8 @@ from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Hypothesis, with_sizes
 from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize
-from localization.diagnosis.noise import Noise, estimate_drive_noise
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor
-from localization.diagnosis.verdict import moved_by
+from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
+from localization.diagnosis.prediction import CHANNELS, DrivePredictor, moved_by
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
 from motion_models.se2 import FloatArray
@@ -51,7 +50,6 @@ _OF_CG = {
     "wz": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x", "wz*cg_x^2"),
 }
 _CG_MOVES_M = 0.005
-_FLAT = 1e3  # sigma of nuisances, over their unit
 _COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
 _ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
 """Of a term that a robot with equal sides does not have; two in three robots have such sides."""
@@ -338,7 +336,7 @@ def _make_design(
 def _tolerated(state: Linearization) -> FloatArray:
     """(M, 6, b) signatures of causes within tolerance, and nuisances, each times its prior sigma."""
     S = np.nan_to_num(state.signatures) * (state.problem.scale * state.problem.tolerance)
-    return np.concatenate([S, np.nan_to_num(state.nuisances) * _FLAT], axis=-1)
+    return np.concatenate([S, np.nan_to_num(state.nuisances) * FLAT], axis=-1)
 
 
 def refine(

@@ -14,9 +14,9 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive import drive_of_table, path_of
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import Linearization, regression
+from localization.diagnosis.linearization import Linearization, nuisance_part, regression
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor
+from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.selection import max_statistic, p_value, price, statistics
 from motion_models import se2
 from motion_models.calibration.chords import chord_jacobians
@@ -24,6 +24,7 @@ from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.se2 import FloatArray
 
 _SIGNIFICANT = 0.01
+_LOADS = frozenset({"payload", "cg_offset_x", "cg_offset_y"})
 _COMPONENTS = 3
 _LEAD_LOG_ODDS = 7.0  # twice the log-likelihood by which a trend must be better than a cause, beside the choice among trends: odds of 33
 _LEAD_SHARE = 0.05  # or this share of what the cause explains: accuracy of its signature
@@ -109,20 +110,6 @@ def _moved(twist: FloatArray, dt: FloatArray, increments: FloatArray, middle: in
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turn = np.array([[c, -s], [s, c]])
         moved += np.einsum("ij,jkm->ikm", by @ turn @ lever, moved_by(twist[:n], dt[:n], increments[:n]))
-    return moved
-
-
-def moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:
-    """(3, 3, K) change of a window's last pose, in its frame, by the ``increments`` (n, K) of each component (second axis) of the twist."""
-    turned = np.cumsum(twist[:, 2] * dt)
-    before = turned - 0.5 * twist[:, 2] * dt - turned[-1]
-    c, s = np.cos(before), np.sin(before)
-    steps = np.column_stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]]) * dt[:, None]
-    ahead = steps[::-1].cumsum(axis=0)[::-1] - 0.5 * steps
-    moved = np.zeros((3, 3, increments.shape[1]))
-    moved[0, 0], moved[1, 0] = c @ increments, s @ increments
-    moved[0, 1], moved[1, 1] = -s @ increments, c @ increments
-    moved[0, 2], moved[1, 2], moved[2, 2] = -ahead[:, 1] @ increments, ahead[:, 0] @ increments, increments.sum(axis=0)
     return moved
 
 
@@ -265,6 +252,7 @@ def attribute_rows(
     every = linearization.problem.tolerated(chosen, sizes)
     named = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     rest = named - np.nan_to_num(linearization.signatures) @ every
+    rest = rest - nuisance_part(linearization, rest)
     is_significant = np.abs(every) >= _MIN_LISTED_SIGMAS * linearization.problem.posterior_sigmas(chosen)
     every[list(chosen)], is_significant[list(chosen)] = sizes, True
     alone = dataclasses.replace(linearization.noise, correlation=np.eye(len(CHANNELS)))  # a row is tested by itself
@@ -467,6 +455,13 @@ def _candidate_drives(predictor: DrivePredictor) -> Iterator[tuple[str, DrivePre
     for text, maneuvers in candidate_maneuvers(speed, g.wheel_radius_m, cg, has_arms, g.track_width_m):
         table = drive_of_table("next", predictor.drive.robot, maneuvers, "windows")
         yield text, DrivePredictor(table, predictor.model, predictor.has_inertia, predictor.baseline)
+
+
+def model_error_advice(findings: Sequence[Finding]) -> str:
+    """What to drive where the friction model does not describe the contacts: what tells its errors from the robot's."""
+    if any(f.cause in _LOADS for f in findings):
+        return "Record a second drive with a known load: it shows how far a load moves this robot's centre of rotation."
+    return "Record two minutes of arcs and turns of the healthy robot, and name them by --healthy: smaller faults will show beside them."
 
 
 def general_advice(verdict: str, blind: Sequence[str]) -> str:

@@ -22,10 +22,11 @@ from scipy import stats
 
 from localization.calibration.windows import driven
 from localization.diagnosis.causes import CAUSES, STIFFNESS_EXPONENT
-from localization.diagnosis.causes.cause import Cause, Hypothesis
+from localization.diagnosis.causes.cause import Cause
+from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
-from localization.diagnosis.model_error import model_error_log_odds
+from localization.diagnosis.model_error import cg_error_sigmas, cg_prior_sigmas, find_model_error
 from localization.diagnosis.prediction import DrivePredictor
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
@@ -37,8 +38,6 @@ MIN_TURN_RAD = 2.0 * math.pi
 """Least turning, by the difference of the wheels: below it the sigma of the CG comes from the prior."""
 MIN_WINDOWS = 8
 _CG = ("cg_offset_x", "cg_offset_y")
-_CG_SIGMA_SHARE = 0.25
-"""Sigma of the CG's prior, over wheelbase and track width: a third of the way to an axle."""
 PRIOR_SIGMAS: Mapping[str, float] = {
     "wheel_radius_scale": 0.02,
     "wheel_radius_difference": 0.005,
@@ -75,14 +74,8 @@ _ROUNDS = 30
 _CONVERGED_M = 1e-4
 _MAX_NOISE_RATIO = 3.0
 """Noise of the drive over that of its motion reference beyond which the friction model does not describe the drive."""
-_MAX_MODEL_ERROR_LOG_ODDS = 7.0
-"""Twice the log-likelihood that errors of the model by kind of motion may gain (`model_error`): odds of 33. Of 100 drives by the tyres of
-the model 4 have more, of 80 by MuJoCo's contacts 74."""
 _MAX_CORRECTION_SIGMAS = 2.5
 """Over the sigma of its prior; beyond it a correction stands for something else, which may be a part of the load."""
-_MODEL_ERROR_SHARE = 0.22
-"""Sigma that is added to the CG where the model does not describe the drive, over the sigma of its prior: 1/18 of wheelbase and track. By
-MuJoCo's contacts errors have a root mean square of 0.20 and 0.19 in x and y, by brush tyres 0.07 and 0.06 (`tests.studies.weigh`)."""
 _WIDENED = "The interval has the errors in it that the model has on other contacts; run `skidloc diagnose`, or weigh on scales."
 
 
@@ -184,7 +177,7 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
     model_errors = _model_errors(predictor, estimate, ratio)
     systematic = np.square(_SYSTEMATIC_SIGMAS_M)
     if model_errors:
-        systematic += np.square(_MODEL_ERROR_SHARE * np.array([cause.plausible for cause in causes[:2]]))
+        systematic += np.square(cg_error_sigmas(robot))
     found = DrivenWeighing(
         *(drive.name, robot.name, drive.motion_reference, len(drive.maneuvers), turned),
         given=predictor.batch.cg.mean(axis=0),
@@ -257,36 +250,11 @@ def _check(drive: Drive) -> float:
 
 def _causes(predictor: DrivePredictor, robot: Robot) -> tuple[Cause, ...]:
     """Offsets of the CG, and what else may turn the robot in the same way, with their priors."""
-    g = robot.geometry
-    cg = (_CG_SIGMA_SHARE * g.wheelbase_m, _CG_SIGMA_SHARE * g.track_width_m)
+    cg = cg_prior_sigmas(robot)
     shown = candidate_causes(predictor, moments=0)
-    stiffness = slip_stiffness_cause(robot)
+    stiffness = dataclasses.replace(slip_stiffness_cause(robot), prior_sigma=_SLIP_STIFFNESS_SIGMA)
     others = [dataclasses.replace(c, prior_sigma=PRIOR_SIGMAS[c.id]) for c in shown if c.id in PRIOR_SIGMAS]
     return (*(dataclasses.replace(CAUSES[name], prior_sigma=s) for name, s in zip(_CG, cg, strict=True)), *others, stiffness)
-
-
-def slip_stiffness_cause(robot: Robot) -> Cause:
-    """Slip stiffness of the tyres, relative to the robot file's; as a logarithm, which keeps it positive."""
-    nominal = _nominal(robot, "slip_stiffness")
-
-    def inject(b: Hypothesis, size: float) -> Hypothesis:
-        now = nominal + b.friction.get("slip_stiffness", 0.0)
-        return dataclasses.replace(b, friction={**b.friction, "slip_stiffness": now * math.exp(size) - nominal})
-
-    words = "the tyres' slip stiffness is {} more", "the tyres' slip stiffness is {} less"
-    meaning = "the slip stiffness of the tyres is more by this share"
-    return Cause("slip_stiffness", "1", meaning, _SLIP_STIFFNESS_SIGMA, 0.03, inject, words, prior_sigma=_SLIP_STIFFNESS_SIGMA)
-
-
-def stiffness_exponent_cause() -> Cause:
-    """How the slip stiffness grows with the wheels' speed."""
-
-    def inject(b: Hypothesis, size: float) -> Hypothesis:
-        return dataclasses.replace(b, stiffness_exponent=b.stiffness_exponent + size)
-
-    words = "the tyres' slip stiffness grows with speed, by the power {}", "the tyres' slip stiffness falls with speed, by the power {}"
-    meaning = "power of the wheels' speed with which the slip stiffness grows"
-    return Cause(STIFFNESS_EXPONENT, "1", meaning, 0.5, 0.1, inject, words)
 
 
 def _truncated(mean: FloatArray, cov: FloatArray, i: int, least: float) -> tuple[FloatArray, FloatArray]:
@@ -341,9 +309,9 @@ def _noise_ratio(predictor: DrivePredictor, linearization: Linearization) -> flo
 def _model_errors(predictor: DrivePredictor, estimate: MapEstimate, noise_ratio: float) -> tuple[str, ...]:
     """Why the friction model does not describe the drive."""
     found = []
-    odds = model_error_log_odds(predictor, estimate.linearization)
-    if odds > _MAX_MODEL_ERROR_LOG_ODDS:
-        gain = f"log-likelihood +{0.5 * odds:.0f}"
+    error = find_model_error(predictor, estimate.linearization)
+    if error.is_shown:
+        gain = f"log-likelihood +{0.5 * error.log_odds:.0f}"
         found.append(f"the robot does not turn as the friction model has it, alike in all motions of one kind ({gain}).")
     sizes = {c: v / c.plausible for c, v in zip(estimate.causes, estimate.sizes.tolist(), strict=True) if c.id not in _CG}
     far = [f"{c.id} {v * c.plausible:+.3g} ({v:+.1f} sigma)" for c, v in sizes.items() if abs(v) > _MAX_CORRECTION_SIGMAS]

@@ -110,12 +110,12 @@ def test_diagnose_light_payload_names_its_alias(diagnosed: Diagnosed) -> None:
 
 @pytest.mark.extended
 def test_diagnose_weak_cause_is_suspected_but_not_named(diagnosed: Diagnosed) -> None:
-    found = diagnosed({"diagonal_load": 0.045}, 452)
+    found = diagnosed({"diagonal_load": 0.041}, 452)
     assert found.verdict == "consistent"
     assert not found.findings
     assert found.suspected is not None
     assert found.suspected.cause == "diagonal_load"
-    assert found.suspected.size == pytest.approx(0.045, abs=3.0 * found.suspected.sigma)
+    assert found.suspected.size == pytest.approx(0.041, abs=3.0 * found.suspected.sigma)
     assert 0.01 < found.suspected.p_value < 0.2
     assert "Too weak to be named is diagonal_load" in found.sentence
     assert found.next_drive

@@ -63,10 +63,10 @@ def law_predictor(robot_name: str, model: str) -> DrivePredictor:
     return dataclasses.replace(make_predictor(drive, make_model(model, drive.robot)), has_inertia=False)
 
 
-def measured_under(drive: Drive, model: MotionModel, hypothesis: Hypothesis, rng: np.random.Generator) -> Drive:
+def measured_under(drive: Drive, model: MotionModel, hypothesis: Hypothesis, rng: np.random.Generator, has_inertia: bool = False) -> Drive:
     """``drive`` as it would have been measured, with the noise of `law_drive`, where ``hypothesis`` holds."""
     unmoved = tuple(dataclasses.replace(m, measured=np.zeros((1, 3))) for m in drive.maneuvers)
-    predictor = DrivePredictor(dataclasses.replace(drive, maneuvers=unmoved), model, has_inertia=False)
+    predictor = DrivePredictor(dataclasses.replace(drive, maneuvers=unmoved), model, has_inertia)
     poses = se2.inverse(predictor.discrepancies(hypothesis)[:, :3])  # of the origin in the predicted frames
     noisy = se2.compose(poses, rng.normal(0.0, 1.0, poses.shape) * _SIGMAS)
     maneuvers = tuple(dataclasses.replace(m, measured=pose[None]) for m, pose in zip(drive.maneuvers, noisy, strict=True))

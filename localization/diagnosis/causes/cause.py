@@ -165,6 +165,16 @@ class Setting:
         """Whether the motion was measured along time, and not once for each row of a table."""
         return self.kind not in ("rotations", "runs")
 
+    @property
+    def is_timed_with_positions(self) -> bool:
+        """Whether positions were measured along time."""
+        return self.is_timed and self.has_positions
+
+    @property
+    def is_of_windows(self) -> bool:
+        """A table of windows, or headings alone."""
+        return self.kind == "windows" or (self.kind != "runs" and not self.has_positions)
+
 
 @dataclass(frozen=True)
 class Draft:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, Setting, add, add_item
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
-from motion_models.robot import DIFF_DRIVE
+from motion_models.robot import DIFF_DRIVE, Robot
 
 _FILE = "than the robot file has it"
 _MAX_NARROWING = 0.8
@@ -193,3 +193,33 @@ SLOPE_ACROSS = Cause(
 FRICTION_CHANGE = dataclasses.replace(
     _change_at(0.0), variants=lambda _, setting: tuple(_change_at(at_s) for at_s in setting.change_times_s)
 )
+
+
+LOG_STIFFNESS_SIGMA = 1.0
+"""Sigma of the logarithm of the slip stiffness, whatever the floor: a factor of 3 either way."""
+STIFFNESS_EXPONENT_SIGMA = 0.5
+"""Sigma of the power with which the stiffness grows with speed: 0 for tyres by way, 1 for contacts by rate (`friction_response`)."""
+
+
+def slip_stiffness_cause(robot: Robot) -> Cause:
+    """Slip stiffness of the tyres, relative to the robot file's; as a logarithm, which keeps it positive."""
+    nominal = float(FrictionModel.from_robot(robot).nominal[FrictionModel.param_names.index("slip_stiffness")])
+
+    def inject(b: Hypothesis, size: float) -> Hypothesis:
+        now = nominal + b.friction.get("slip_stiffness", 0.0)
+        return dataclasses.replace(b, friction={**b.friction, "slip_stiffness": now * math.exp(size) - nominal})
+
+    words = "the tyres' slip stiffness is {} more", "the tyres' slip stiffness is {} less"
+    meaning = "the slip stiffness of the tyres is more by this share"
+    return Cause("slip_stiffness", "1", meaning, 0.3, 0.03, inject, words, prior_sigma=LOG_STIFFNESS_SIGMA)
+
+
+def stiffness_exponent_cause() -> Cause:
+    """How the slip stiffness grows with the wheels' speed."""
+
+    def inject(b: Hypothesis, size: float) -> Hypothesis:
+        return dataclasses.replace(b, stiffness_exponent=b.stiffness_exponent + size)
+
+    words = "the tyres' slip stiffness grows with speed, by the power {}", "the tyres' slip stiffness falls with speed, by the power {}"
+    meaning = "power of the wheels' speed with which the slip stiffness grows"
+    return Cause("stiffness_exponent", "1", meaning, 0.5, 0.1, inject, words, prior_sigma=STIFFNESS_EXPONENT_SIGMA)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from localization.diagnosis.causes.cause import Cause, Draft, Setting, add, add_item
+from localization.diagnosis.causes.cause import Cause, Draft, add, add_item
 from motion_models.robot import Mount
 
 _TRANSFORM = "than its transform has it"
@@ -48,10 +48,6 @@ def _shift_clock(sensor: str, entry: str) -> Callable[[Draft, float], Draft]:
         )
 
     return correct
-
-
-def _is_timed_with_positions(s: Setting) -> bool:
-    return s.is_timed and s.has_positions
 
 
 LIDAR_OFFSET_X = Cause(
@@ -102,7 +98,7 @@ LIDAR_TIME_OFFSET = Cause(
     ("the LiDAR's stamps are {} late", "the LiDAR's stamps are {} early"),
     correct=_shift_clock("LiDAR", "lidar_time_offset_s"),
     remedy="synchronize the clocks, or set lidar_time_offset_s = {c.lidar_time_offset_s:.3f} in [clock]",
-    applies=_is_timed_with_positions,
+    applies=lambda s: s.is_timed_with_positions,
     reference_words=("the reference's stamps are {} late", "the reference's stamps are {} early"),
     is_clock=True,
     prior_sigma=_CLOCK_SIGMA_S,

@@ -11,17 +11,8 @@ from motion_models.registry import MODELS, params_of
 from motion_models.terms import Term, parse_expression
 
 
-def _is_timed_with_positions(s: Setting) -> bool:
-    return s.is_timed and s.has_positions
-
-
-def _shown_in_windows(s: Setting) -> bool:
-    """In tables of windows, and where headings alone were measured."""
-    return s.kind == "windows" or (s.kind != "runs" and not s.has_positions)
-
-
 def _shows_rotation(s: Setting) -> bool:
-    return s.skids and s.kind != "runs" and (_shown_in_windows(s) or not s.is_friction_model)
+    return s.skids and s.kind != "runs" and (s.is_of_windows or not s.is_friction_model)
 
 
 def _add_term(cause: str, component: str, expression: str, sign: float) -> Callable[[Draft, float], Draft]:
@@ -50,7 +41,7 @@ LATERAL_SLIP_SPEED = Cause(
     *("s", "the robot slides sideways in curves: vy += s vx wz", 0.05, 0.005, add_item("slip_coefficients", 0)),
     ("the robot slides to the inside of curves: vy += {} vx wz", "the robot slides to the outside of curves: vy -= {} vx wz"),
     correct=_add_term("lateral_slip_speed", "vy", "v*wz", 1.0),
-    applies=_is_timed_with_positions,
+    applies=lambda s: s.is_timed_with_positions,
 )
 ROTATION_SLIP_SPEED = Cause(
     "rotation_slip_speed",
@@ -66,13 +57,13 @@ LONGITUDINAL_SLIP_TURNING = Cause(
     *("s/rad", "the robot goes less far in turns: vx *= 1 - s |wz|", 0.1, 0.01, add_item("slip_coefficients", 2)),
     ("the robot goes less far in turns: vx *= 1 - {} |wz|", "the robot goes farther in turns: vx *= 1 + {} |wz|"),
     correct=_add_term("longitudinal_slip_turning", "vx", "v*abs(wz)", -1.0),
-    applies=_is_timed_with_positions,
+    applies=lambda s: s.is_timed_with_positions,
 )
 LONGITUDINAL_SLIP_CURVATURE = Cause(
     "longitudinal_slip_curvature",
     *("1", "the robot goes less far on tight arcs, at any speed: vx *= 1 - s T", 0.2, 0.02, add("longitudinal_curvature_slip")),
     ("the robot goes less far on tight arcs: vx *= 1 - {} T", "the robot goes farther on tight arcs: vx *= 1 + {} T"),
-    applies=_shown_in_windows,
+    applies=lambda s: s.is_of_windows,
 )
 ROTATION_SCALE = Cause(
     "rotation_scale",
@@ -88,7 +79,7 @@ ROTATION_SLIP_RATE = Cause(
     *("s/rad", "the robot turns less the faster it turns: wz *= 1 - s |wz|", 0.1, 0.01, add_item("rotation_coefficients", 1)),
     ("the robot turns less the faster it turns: wz *= 1 - {} |wz|", "the robot turns more the faster it turns: wz *= 1 + {} |wz|"),
     correct=_add_term("rotation_slip_rate", "wz", "wz*abs(wz)", -1.0),
-    applies=_shown_in_windows,
+    applies=lambda s: s.is_of_windows,
     is_shown_by_headings=True,
 )
 ROTATION_SLIP_CURVATURE = Cause(
@@ -97,6 +88,6 @@ ROTATION_SLIP_CURVATURE = Cause(
     "the robot turns less on gentle arcs, at any speed: wz *= 1 - s (1 - T)",
     *(0.2, 0.02, add_item("rotation_coefficients", 2)),
     ("the robot turns less on gentle arcs: wz *= 1 - {} (1 - T)", "the robot turns more on gentle arcs: wz *= 1 + {} (1 - T)"),
-    applies=_shown_in_windows,
+    applies=lambda s: s.is_of_windows,
     is_shown_by_headings=True,
 )

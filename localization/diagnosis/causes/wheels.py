@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, Setting, add
+from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, add
 from motion_models.friction import FrictionModel
 
 _FILE = "than the robot file has it"
@@ -30,10 +30,6 @@ def _correct_difference(draft: Draft, size: float) -> Draft:
     g = draft.robot.geometry
     left, right = g.left_wheel_radius_multiplier * (1.0 + 0.5 * size), g.right_wheel_radius_multiplier * (1.0 - 0.5 * size)
     return draft.with_robot(geometry=dataclasses.replace(g, left_wheel_radius_multiplier=left, right_wheel_radius_multiplier=right))
-
-
-def _shown_in_windows(s: Setting) -> bool:
-    return s.kind == "windows" or (s.kind != "runs" and not s.has_positions)
 
 
 WHEEL_RADIUS_SCALE = Cause(
@@ -76,7 +72,7 @@ WHEEL_LAG = Cause(
     *("s", "the body follows the wheels with this time constant", 0.05, 0.008, add("wheel_lag_s")),
     ("the body follows the wheels with a time constant of {}", "the body leads the wheels by {}"),
     correct=lambda d, s: d.with_step(f"the body follows the wheels {1e3 * s:.0f} ms late."),
-    applies=_shown_in_windows,
+    applies=lambda s: s.is_of_windows,
     one_sided=True,
 )
 MISSING_MESSAGES = Cause(
