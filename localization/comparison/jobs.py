@@ -209,7 +209,8 @@ def _scores(metrics: Mapping[str, Any]) -> Row:
     left_out = ("model", "estimator", "corrections", "parameters", "counts", "lidar", "moments", "real_time_factor")
     lidar = metrics["lidar"] or dict.fromkeys(("lost_share", "longest_lost_s", "longest_lost_since_s"))
     losses = {f"lidar_{name}": lidar[name] for name in ("lost_share", "longest_lost_s", "longest_lost_since_s")}
-    return {**{name: value for name, value in metrics.items() if name not in left_out}, **losses}
+    numbers = {name: value for name, value in metrics.items() if name not in left_out and not isinstance(value, list | dict)}
+    return {**numbers, **losses}
 
 
 def _reference(log: Log, job: Job) -> ReferenceTrack | Relations:
