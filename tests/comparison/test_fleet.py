@@ -74,7 +74,7 @@ def test_fleet_run_is_kept_by_log_and_resumed(tmp_path, asked, capsys):
     capsys.readouterr()
     assert main(["table", str(out), "--json", str(tmp_path / "table.json")]) == 0
     printed = capsys.readouterr().out
-    assert "1 of the logs failed" in printed
+    assert "1 log has no result" in printed
     days = json.loads((tmp_path / "table.json").read_text())["days"]
     assert [day["logs"] for day in days] == [1, 1]
 
