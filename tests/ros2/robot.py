@@ -2,13 +2,15 @@
 
 python robot.py MESSAGES, where MESSAGES is a pickle of (log time [ns], topic, type, bytes). Commands come on the standard input, one
 a line, and each is answered by one line: `play SECONDS`, `spin SECONDS`, `report` (JSON), `cloud BYTES COUNT` (PointCloud2 at 10 Hz),
-`payload KG`, `reset`, `set_pose X Y`, `clear` (what was received so far), `drive SECONDS` (the same messages over and over, stamped by the
+`payload KG`, `reset`, `set_pose X Y`, `initialpose X Y YAW`, `text TOPIC TEXT` (std_msgs/String), `call SERVICE` (std_srvs/Empty),
+`clear` (what was received so far), `drive SECONDS` (the same messages over and over, stamped by the
 clock on the wall).
 It imports nothing of this project.
 """
 
 import importlib
 import json
+import math
 import pickle
 import struct
 import sys
@@ -19,11 +21,12 @@ from collections import deque
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import InertiaStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2, PointField
-from std_msgs.msg import Empty
+from std_msgs.msg import Empty, String
+from std_srvs.srv import Empty as EmptyService
 from tf2_msgs.msg import TFMessage
 
 PERIOD_NS = 80_000_000  # of the scans
@@ -46,6 +49,8 @@ class Robot:
         self.begin = time.monotonic()
         for topic, kind in (("/skidloc/odometry", Odometry), ("/tf", TFMessage), ("/diagnostics", DiagnosticArray)):
             self.node.create_subscription(kind, topic, getattr(self, f"on_{kind.__name__}"), 50)
+        self.grids = []
+        self.node.create_subscription(OccupancyGrid, "/skidloc/map", self.grids.append, LATCHED)
         self.node.create_subscription(Odometry, "/skidloc/odometry_predicted", lambda m: self.predicted.append(stamp(m)), 50)
         self.initial_pose = self.node.create_publisher(PoseWithCovarianceStamped, "/set_pose", 1)
         self.payloads = self.node.create_publisher(InertiaStamped, "/skidloc/payload", 1)
@@ -88,6 +93,37 @@ class Robot:
         message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.orientation.w = x, y, 1.0
         self.initial_pose.publish(message)
         self.spin(0.5)
+
+    def initialpose(self, x, y, yaw):
+        """As RViz sends it."""
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id, pose = "map", message.pose.pose
+        pose.position.x, pose.position.y = x, y
+        pose.orientation.z, pose.orientation.w = math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+        message.pose.covariance[0] = message.pose.covariance[7] = 0.25
+        message.pose.covariance[35] = 0.07
+        self.send("/initialpose", message)
+
+    def text(self, topic, data):
+        self.send(topic, String(data=data))
+
+    def send(self, topic, message):
+        publisher = self.node.create_publisher(type(message), topic, 1)
+        end = time.monotonic() + 20.0
+        while not publisher.get_subscription_count() and time.monotonic() < end:
+            self.spin(0.1)
+        publisher.publish(message)
+        self.spin(1.0)
+        self.node.destroy_publisher(publisher)
+
+    def call(self, service):
+        client = self.node.create_client(EmptyService, service)
+        assert client.wait_for_service(timeout_sec=30.0), f"no service {service}"
+        future = client.call_async(EmptyService.Request())
+        end = time.monotonic() + 30.0
+        while not future.done() and time.monotonic() < end:
+            self.spin(0.1)
+        assert future.done(), f"{service} does not answer"
 
     def payload(self, mass):
         """Command the payload on the body, by its topic."""
@@ -186,6 +222,7 @@ class Robot:
             "frames": sorted({(o.header.frame_id, o.child_frame_id) for o in self.odometry}),
             "poses": [[o.pose.pose.position.x, o.pose.pose.position.y] for o in self.odometry],
             "statuses": self.statuses,
+            "grids": [[g.header.frame_id, g.info.width, g.info.height, sum(c == 0 for c in g.data) / len(g.data)] for g in self.grids],
         }
 
 
@@ -197,7 +234,8 @@ def main():
         if command == "report":
             print(json.dumps(robot.report()), flush=True)
             continue
-        getattr(robot, command)(*(float(n) if command != "cloud" else int(n) for n in numbers))
+        convert = {"cloud": int, "text": str, "call": str}.get(command, float)
+        getattr(robot, command)(*map(convert, numbers))
         print("done", flush=True)
     robot.executor.shutdown()
     robot.node.destroy_node()
