@@ -15,10 +15,10 @@ import numpy as np
 
 from localization.attitude import AttitudeFilter, Tilt
 from localization.body_rates import BodyRates
+from localization.bounded_settings import Positive, Settings, at_least
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, Turn, WheelSample, turn_twist
 from localization.gyro import GyroBuffer
 from localization.lidar.frames import LidarFrames
-from localization.settings import Positive, Settings, at_least
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
         skid_steer_fit,
     )
     from motion_models.calibration.ros_export import diff_drive_controller_yaml, multiplier_table, multipliers, robot_localization_yaml
+    from motion_models.center_of_gravity.cg_model import CgModel, CgTracker, cg_model, posture_for, static_part_from_weighing
     from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
-    from motion_models.center_of_gravity.model import CgModel, CgTracker, cg_model, posture_for, static_part_from_weighing
     from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, Tolerances, support_margin
     from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
     from motion_models.diff_drive import DiffDrive
@@ -125,7 +125,7 @@ _MODULES = {
     " rotations_as_maneuvers skid_steer_fit",
     "motion_models.calibration.ros_export": "diff_drive_controller_yaml multiplier_table multipliers robot_localization_yaml",
     "motion_models.center_of_gravity.files": "arms_model arms_postures urdf_cg weighed_cg",
-    "motion_models.center_of_gravity.model": "CgModel CgTracker cg_model posture_for static_part_from_weighing",
+    "motion_models.center_of_gravity.cg_model": "CgModel CgTracker cg_model posture_for static_part_from_weighing",
     "motion_models.center_of_gravity.parts": "Arms CgEstimate Payload StaticPart Tolerances support_margin",
     "motion_models.center_of_gravity.weighing": "Scales WeighedCg cg_from_scales read_weighings wheel_contacts",
     "motion_models.diff_drive": "DiffDrive",

@@ -32,7 +32,7 @@ from localization.evaluation.reference_files import load_reference
 from localization.events import Scan
 from localization.logs.writer import write_bag
 from localization.report.notebook import Panel, Series, picture, table
-from localization.simulation.faults import TrueRobot
+from localization.simulation.injected_faults import TrueRobot
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import LASER, SensorConfig, make_sensors, nominal_mounts, transforms
 from localization.simulation.vehicle import ANGLES, COLUMNS, MARGIN, POSE, RATES, TWIST, Body, MassDistribution, TrueMotion

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from localization.estimators import check_estimator
-from localization.estimators.base import Estimate
+from localization.estimators.estimator import Estimate
 from localization.events import Event
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from motion_models.errors import ModelError

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.bounded_settings import Count, Positive, Settings
 from localization.calibration.motion_references import HOLD_S, MotionReference, Span, Wheels
 from localization.events import CgSample, Event, WheelSample
-from localization.settings import Count, Positive, Settings
 from localization.wheel_buffer import WheelBuffer
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Maneuver

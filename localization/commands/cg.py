@@ -13,8 +13,8 @@ from rich.console import Console
 
 from localization.commands.common import add_row, plain_table, print_line, print_table, write_json
 from localization.output import check_outputs
+from motion_models.center_of_gravity.cg_model import Posture, parse_postures, static_part_from_weighing
 from motion_models.center_of_gravity.files import arms_model, arms_postures, weighed_cg
-from motion_models.center_of_gravity.model import Posture, parse_postures, static_part_from_weighing
 from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, require_support
 from motion_models.center_of_gravity.urdf_wheels import wheel_geometry
 from motion_models.center_of_gravity.weighing import WHEELS, WeighedCg, read_weighings

@@ -17,12 +17,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table as Grid
 
 from localization.commands.common import names, write_json
+from localization.comparison.comparison_page import CompareHead, check_report, write_comparison_report
 from localization.comparison.jobs import OK, Job, Place, Row, job_key, run_job, run_local, run_on_cluster, trials
 from localization.comparison.manifest import Entry, read_manifest
-from localization.comparison.page import CompareHead, check_report, write_comparison_report
 from localization.comparison.remote import is_url
+from localization.comparison.result_table import ResultFolder, ResultTable
 from localization.comparison.statistics import Findings, against_best, closing, find, headline
-from localization.comparison.table import ResultFolder, ResultTable
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides

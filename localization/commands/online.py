@@ -28,7 +28,7 @@ from localization.ros.node import Node, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by, shared_of
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
-from localization.ros.transports.base import SimTimeTransport
+from localization.ros.transports.transport import SimTimeTransport
 from motion_models.prior import prior_notes
 
 _LINE_S = 0.25

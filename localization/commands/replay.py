@@ -37,7 +37,7 @@ from localization.evaluation.scores import Result, score
 from localization.events import Event, PositionSample
 from localization.lifting import write_tum3
 from localization.logs import Log, TopicOverrides
-from localization.logs.references import merge_positions, read_positions
+from localization.logs.reference_topics import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap

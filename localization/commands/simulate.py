@@ -14,7 +14,7 @@ from rich.table import Table
 from localization.commands.common import write_json
 from localization.output import check_outputs
 from localization.simulation.experiments import EXPERIMENTS
-from localization.simulation.faults import FAULTS, parse_faults
+from localization.simulation.injected_faults import FAULTS, parse_faults
 from localization.simulation.open_loop_scores import OpenLoopScore, mean_scores_by_trajectory, score_open_loop_runs
 from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation

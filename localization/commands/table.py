@@ -12,7 +12,7 @@ from rich.console import Console
 
 from localization.commands.common import add_row, plain_table, print_line, print_table, write_json
 from localization.comparison.fleet import LEAST_CHANGE, LEVEL, Day, FleetTable, fleet_table
-from localization.comparison.table import read_results
+from localization.comparison.result_table import read_results
 from localization.output import check_outputs
 
 _MOST_FAULTS = 10

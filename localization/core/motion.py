@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from localization.bounded_settings import Settings
 from localization.core.filter import Transition
 from localization.core.state import SE2, Group, Layout, State, Vector
 from localization.events import Step
-from localization.settings import Settings
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections

@@ -14,10 +14,10 @@ from typing import Annotated
 import numpy as np
 
 from localization.attitude import GRAVITY
+from localization.bounded_settings import Settings, at_least
 from localization.core.filter import Measurement, Transition
 from localization.core.state import Layout, State, Vector
 from localization.events import BodyTurn, Gravity, Step
-from localization.settings import Settings, at_least
 from motion_models import se3
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray

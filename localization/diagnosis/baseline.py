@@ -15,9 +15,9 @@ import numpy as np
 from localization.diagnosis.causes.cause import with_sizes
 from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import Baseline, DrivePredictor
 from localization.diagnosis.linearization import candidate_causes, make_predictor
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import Baseline, DrivePredictor
 from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map
 from motion_models.base import MotionModel
 from motion_models.errors import CalibrationError

@@ -1,8 +1,8 @@
 """Effects that are bound to a time, a place, a wheel's angle, a tilt or a sensor: shapes of what a drive leaves that no robot file holds.
 
-They compete with causes and terms (`terms.py`), so that a floor that is slippery in one corner, an eccentric wheel or a gyro that feels
-accelerations is named as such. Columns are those of a twist that is added to the predicted one, integrated along each window, or of what a
-sensor measured beside the motion.
+They compete with causes and terms (`missing_terms.py`), so that a floor that is slippery in one corner, an eccentric wheel or a gyro
+that feels accelerations is named as such. Columns are those of a twist that is added to the predicted one, integrated along each window, or
+of what a sensor measured beside the motion.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Hypothesis
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor, moved_by
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from motion_models import se2
 from motion_models.calibration.prediction import series_of
 from motion_models.se2 import FloatArray

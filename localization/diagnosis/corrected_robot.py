@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, with_sizes
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Finding
-from localization.diagnosis.prediction import DrivePredictor
 from motion_models.base import MotionModel
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import FrictionModel

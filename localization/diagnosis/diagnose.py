@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.bounded_settings import Count, Probability, Seed, Settings
 from localization.calibration.calibrate import describe_clocks
 from localization.diagnosis.causes import MISSING_MESSAGES
 from localization.diagnosis.causes.cause import Cause, with_sizes
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, Unmodelled
 from localization.diagnosis.findings import (
     MAX_NOISE_OVER_REFERENCE,
     Component,
@@ -38,7 +40,6 @@ from localization.diagnosis.linearization import (
 )
 from localization.diagnosis.model_error import ModelError, find_model_error, size_error, unmodelled_by
 from localization.diagnosis.noise import slow_turn_sigmas
-from localization.diagnosis.prediction import Baseline, DrivePredictor, Unmodelled
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -68,7 +69,6 @@ from localization.diagnosis.verdict import (
     noise_excess,
     separating_drive,
 )
-from localization.settings import Count, Probability, Seed, Settings
 from motion_models.base import MotionModel
 from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray

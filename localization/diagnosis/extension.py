@@ -18,10 +18,20 @@ from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Attribution, HandoverCheck
 from localization.diagnosis.handover import Candidate, Reader, check_written
-from localization.diagnosis.prediction import DrivePredictor
-from localization.diagnosis.terms import SEARCHED, FoundEffect, FoundTerm, Search, extended_model, find_terms, halves, merge_terms, sizes_on
+from localization.diagnosis.missing_terms import (
+    SEARCHED,
+    FoundEffect,
+    FoundTerm,
+    Search,
+    extended_model,
+    find_terms,
+    halves,
+    merge_terms,
+    sizes_on,
+)
 from localization.events import Turn
 from localization.gyro import GyroRecord
 from motion_models import se2

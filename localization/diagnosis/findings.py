@@ -13,8 +13,8 @@ import numpy as np
 from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES
 from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.drive import MessageLoss, StandstillTurn
+from localization.diagnosis.drive_predictor import CHANNELS
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import CHANNELS
 from motion_models.calibration.cross_validation import Interval
 from motion_models.se2 import FloatArray
 
@@ -235,7 +235,7 @@ class HandoverCheck:
     """Discrepancies of a half of a drive by the old robot, and by one that was corrected by the other half alone."""
 
     before: dict[str, float]
-    """Root mean square by component, as `prediction.CHANNELS`."""
+    """Root mean square by component, as `drive_predictor.CHANNELS`."""
     after: dict[str, float]
     windows: int
     gain: Interval

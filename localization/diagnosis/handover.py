@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot, predictor_after
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
 from localization.diagnosis.findings import HandoverCheck, Replayed
 from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from localization.logs.reader import Log
 from localization.pipeline import Run, Trial, replay
 from motion_models import se2

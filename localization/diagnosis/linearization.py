@@ -13,8 +13,8 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with_sizes
 from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, give_columns, mirrored, slip_columns
 from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
-from localization.diagnosis.prediction import Baseline, DrivePredictor, give_columns, mirrored, slip_columns
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel
 from motion_models.diff_drive import DiffDrive

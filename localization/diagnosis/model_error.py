@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.diagnosis.causes.cause import Cause
+from localization.diagnosis.drive_predictor import DrivePredictor, Unmodelled, slip_columns
 from localization.diagnosis.linearization import LEVELS, Linearization
 from localization.diagnosis.noise import FLAT, estimate_drive_noise
-from localization.diagnosis.prediction import DrivePredictor, Unmodelled, slip_columns
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 

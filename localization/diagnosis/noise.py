@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from localization.diagnosis.causes import STIFFNESS_EXPONENT
 from localization.diagnosis.causes.cause import Cause
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
 from motion_models.calibration.maneuvers import Batch
 from motion_models.se2 import FloatArray
 

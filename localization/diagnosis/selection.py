@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Gain
 from localization.diagnosis.linearization import (
     Linearization,
@@ -19,7 +20,6 @@ from localization.diagnosis.linearization import (
     regression,
 )
 from localization.diagnosis.noise import FLAT, Noise
-from localization.diagnosis.prediction import DrivePredictor
 from motion_models.errors import CgError, ModelError
 from motion_models.se2 import FloatArray
 

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Cause, Spell, in_spell
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization, Regression, regression, without_nuisances
-from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.selection import cost, folds, price
 from motion_models.se2 import FloatArray
 

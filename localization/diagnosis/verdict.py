@@ -13,10 +13,10 @@ from scipy.stats import f as f_distribution
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive import drive_of_table, path_of
+from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
 from localization.diagnosis.linearization import Linearization, nuisance_part, regression
 from localization.diagnosis.noise import Noise
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.selection import max_statistic, p_value, price, statistics
 from motion_models import se2
 from motion_models.calibration.chords import chord_jacobians

@@ -25,9 +25,9 @@ from localization.diagnosis.causes import CAUSES, STIFFNESS_EXPONENT
 from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
 from localization.diagnosis.model_error import cg_error_sigmas, cg_prior_sigmas, find_model_error
-from localization.diagnosis.prediction import DrivePredictor
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.base import NO_POINTS, Estimate, Estimator, mean_twist, twist_at_end
+from localization.estimators.estimator import NO_POINTS, Estimate, Estimator, mean_twist, twist_at_end
 from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS

@@ -16,7 +16,7 @@ from localization.core.policies.excitation import Excitation
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
-from localization.estimators.base import (
+from localization.estimators.estimator import (
     NO_POINTS,
     Estimate,
     Estimator,

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from localization.bounded_settings import Positive, Settings, Signed
 from localization.errors import EstimatorError
-from localization.estimators.base import Estimate
+from localization.estimators.estimator import Estimate
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.events import PositionSample, Step
@@ -23,7 +24,6 @@ from localization.lidar import OUTLIER_SIGMAS, LidarConfig
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
-from localization.settings import Positive, Settings, Signed
 from localization.trajectory import Trajectory, through_nodes
 from motion_models import se2
 from motion_models.online_calibration import Corrections

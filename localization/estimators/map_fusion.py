@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.estimators.base import Estimate, Estimator
+from localization.estimators.estimator import Estimate, Estimator
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.events import Step
 from localization.maps import KeyframeMap

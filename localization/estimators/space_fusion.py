@@ -20,7 +20,7 @@ from localization.core.space import (
     start_at,
 )
 from localization.core.state import State
-from localization.estimators.base import NO_POINTS, Estimate, Estimator, twist_at_end
+from localization.estimators.estimator import NO_POINTS, Estimate, Estimator, twist_at_end
 from localization.events import Gravity, Step
 from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size, key_scan_noise
 from localization.lidar.cloud_map import CloudMap, thin

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from localization.bounded_settings import Positive, Settings
 from localization.errors import EvaluationError
 from localization.evaluation.references import ReferenceTrack, Relations, no_overlap_message
-from localization.settings import Positive, Settings
 from localization.trajectory import IntArray, Trajectory, path_nodes
 from motion_models import se2
 from motion_models.se2 import FloatArray

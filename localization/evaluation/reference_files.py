@@ -17,7 +17,7 @@ from localization.errors import EvaluationError
 from localization.evaluation.references import RELATION_COLUMNS, ReferenceTrack, Relations, make_track, read_relations, reference_track
 from localization.events import Scan
 from localization.logs import Log
-from localization.logs.references import east_north, geodetic_to_ecef
+from localization.logs.reference_topics import east_north, geodetic_to_ecef
 from localization.trajectory import IntArray, number_rows, parse_float, tum_rows, yaw_of_quaternion
 from motion_models import se2
 from motion_models.se2 import FloatArray

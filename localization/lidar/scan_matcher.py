@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
 from localization.lidar.correlative_search import OUTLIER_COST, LikelihoodImage, draw_image, find_place, prior_outlier_cov
 from localization.lidar.registration import Fit, align_points, fill_informations, is_narrow, linearize, mahalanobis
 from localization.lidar.submap import VoxelGrid, make_grid, measure_shares, voxel_means
-from localization.settings import Allowed, Below, Count, Positive, Settings, Share
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
 

@@ -35,7 +35,7 @@ from localization.logs.decode import (
 )
 from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
-from motion_models.center_of_gravity.model import CgModel, CgTracker
+from motion_models.center_of_gravity.cg_model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import support_margin
 from motion_models.robot import Clock, Driver, Geometry, Lidar, Robot
 from motion_models.se2 import FloatArray

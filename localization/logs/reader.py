@@ -22,7 +22,7 @@ from localization.logs.chunks import DamagedError, RawMessage, Source, decompres
 from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item, late_ns
-from localization.logs.references import reference_decoder
+from localization.logs.reference_topics import reference_decoder
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles

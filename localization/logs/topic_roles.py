@@ -10,8 +10,8 @@ from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
 from localization.logs.topic_names import find_in_namespace, is_filter, is_other_estimate
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
+from motion_models.center_of_gravity.cg_model import CgModel
 from motion_models.center_of_gravity.files import arms_model
-from motion_models.center_of_gravity.model import CgModel
 from motion_models.robot import Robot
 
 TYPES: Mapping[str, str] = {

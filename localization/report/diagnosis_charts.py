@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from localization.diagnosis.diagnose import DiagnosisResult
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS, DrivePredictor
+from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS, DrivePredictor
 from localization.report.charts import Axis, Chart, Series
 from motion_models import se2
 from motion_models.se2 import FloatArray

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from localization.diagnosis.diagnose import DiagnosisResult
+from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS
 from localization.diagnosis.findings import (
     Diagnosis,
     describe_outliers,
@@ -17,7 +18,6 @@ from localization.diagnosis.findings import (
     is_contesting,
     unit_of,
 )
-from localization.diagnosis.prediction import CHANNEL_UNITS, CHANNELS
 from localization.report.diagnosis_charts import COMPONENTS, diagnosis_charts, motion_in_windows
 from localization.report.figures import Axes, svg
 from localization.report.figures import Figure as Canvas

@@ -16,7 +16,7 @@ from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
 from localization.logs.transforms import FixedTransforms
 from localization.ros.settings import Names
-from localization.ros.transports.base import Received, Transport
+from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount, Robot
 
 _POLL_S, _SETTLE_S, _REPORT_PERIOD_S = 0.1, 1.0, 30.0

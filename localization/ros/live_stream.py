@@ -20,7 +20,7 @@ from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
 from localization.ros.discovery import DiscoveredTopics
 from localization.ros.payloads import Payloads
-from localization.ros.transports.base import Received
+from localization.ros.transports.transport import Received
 from motion_models.robot import Robot
 
 _NS = 1e-9

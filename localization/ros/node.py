@@ -35,7 +35,7 @@ from localization.ros.payloads import Payloads
 from localization.ros.publisher import EstimatePublisher, Predictor
 from localization.ros.session import Session, SessionState, StartPose, View, made_by, shared_of
 from localization.ros.settings import LiveRun
-from localization.ros.transports.base import Received, Transport
+from localization.ros.transports.transport import Received, Transport
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
 from motion_models.robot import Mount

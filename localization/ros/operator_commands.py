@@ -26,7 +26,7 @@ from localization.output import versions
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
 from localization.ros.settings import Names
-from localization.ros.transports.base import Received, ServiceReply, Transport
+from localization.ros.transports.transport import Received, ServiceReply, Transport
 from motion_models import se2
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray

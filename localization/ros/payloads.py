@@ -10,9 +10,9 @@ import numpy as np
 
 from localization.events import CgSample
 from localization.logs.decode import ArmReading
+from motion_models.center_of_gravity.cg_model import CgModel
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.kinematics import forward
-from motion_models.center_of_gravity.model import CgModel
 from motion_models.center_of_gravity.parts import Payload, require_support
 from motion_models.errors import CgError, RobotError
 from motion_models.robot import Mount, Robot

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from localization.estimators import Estimate
-from localization.estimators.base import CHANGE_SHARE, GyroCalibration, fuse_turn, mean_twist, twist_at_end
+from localization.estimators.estimator import CHANGE_SHARE, GyroCalibration, fuse_turn, mean_twist, twist_at_end
 from localization.events import CgSample, Event, Turn, WheelSample
 from localization.logs.serialization import FusedWriter, encode, make
 from localization.logs.writer import FusedEstimate, odom_axes, six_by_six
@@ -18,7 +18,7 @@ from localization.maps.grid import Grid
 from localization.ros.diagnostics import Status
 from localization.ros.discovery import TF, TF_TYPE
 from localization.ros.settings import Frames, Names
-from localization.ros.transports.base import Transport
+from localization.ros.transports.transport import Transport
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 
+from localization.bounded_settings import Allowed, Positive, Settings, rules_of
 from localization.errors import SettingError
 from localization.estimators import LOCALIZER, PriorMap, check_estimator
 from localization.logs.topic_roles import TopicOverrides
@@ -27,7 +28,6 @@ from localization.maps import load_map
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import ReplayConfig, Trial
 from localization.ros.session import Files
-from localization.settings import Allowed, Positive, Settings, rules_of
 from motion_models.online_calibration import check_forms
 from motion_models.registry import make_model
 from motion_models.robot import Robot

@@ -9,8 +9,6 @@ import numpy as np
 from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
-from localization.sensor_checks.check import Check
-from localization.sensor_checks.consistency import Consistency
 from localization.sensor_checks.disagreement import Disagreement
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GyroRate
@@ -19,6 +17,8 @@ from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MovingObjects
 from localization.sensor_checks.own_body import OwnBody
+from localization.sensor_checks.sensor_check import Check
+from localization.sensor_checks.sensor_consistency import Consistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
 from localization.sensor_checks.turn_rates import TurnRates

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.check import Check
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
+from localization.sensor_checks.sensor_check import Check
 from motion_models import se2
 from motion_models.se2 import FloatArray
 

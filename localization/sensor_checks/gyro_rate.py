@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 
 from localization.events import Step
-from localization.sensor_checks.check import Check
 from localization.sensor_checks.faults import MEMORY_S, Fault, FaultLog
+from localization.sensor_checks.sensor_check import Check
 
 GYRO_RATE = Fault(
     "the gyro turns by {rate:.1f} rad/s against the wheels, more than slip explains. It is not used for 3 s after each time. Check"

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.events import Scan, Step
-from localization.sensor_checks.check import Check
+from localization.sensor_checks.sensor_check import Check
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 

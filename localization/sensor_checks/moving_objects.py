@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.check import Check, without_scan
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, label, refine
+from localization.sensor_checks.sensor_check import Check, without_scan
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
 from localization.sensor_checks.turn_rates import LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_SPIN

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import Scan, Step
-from localization.sensor_checks.check import Check
 from localization.sensor_checks.faults import Fault, FaultLog
+from localization.sensor_checks.sensor_check import Check
 from localization.trajectory import BoolArray
 from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray, Points2

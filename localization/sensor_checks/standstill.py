@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import ImuSample, Step
-from localization.sensor_checks.check import Check, without_wheels
 from localization.sensor_checks.faults import Fault, FaultLog
+from localization.sensor_checks.sensor_check import Check, without_wheels
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray

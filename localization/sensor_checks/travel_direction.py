@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from localization.events import Step
-from localization.sensor_checks.check import Check, without_scan
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
+from localization.sensor_checks.sensor_check import Check, without_scan
 from localization.sensor_checks.window import Bin, Window
 
 LIDAR_DIRECTION = Fault(

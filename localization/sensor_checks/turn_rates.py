@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.check import Check, without_scan, without_wheels
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
 from localization.sensor_checks.gyro_rate import GYRO_RATE
+from localization.sensor_checks.sensor_check import Check, without_scan, without_wheels
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray

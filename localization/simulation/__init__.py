@@ -1,7 +1,7 @@
 """A physical skid-steer robot with arms, sensors and a world, that writes real bags. It shares no code with the linear models."""
 
 from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig
-from localization.simulation.faults import FAULTS, Fault
+from localization.simulation.injected_faults import FAULTS, Fault
 from localization.simulation.open_loop_scores import OpenLoopScore, score_open_loop_runs
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import RunRecord, Simulation, SimulationConfig, simulate, write_simulation

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import numpy as np
 
+from localization.bounded_settings import Count, Positive, Settings, up_to
 from localization.errors import SimulationError
-from localization.settings import Count, Positive, Settings, up_to
 from localization.simulation.world import WORLDS, World
 from motion_models import se2
 from motion_models.compiled import kernel, subroutine

@@ -9,9 +9,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.bounded_settings import Below, Count, Positive, Settings, Share, Signed, at_least
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
-from localization.settings import Below, Count, Positive, Settings, Share, Signed, at_least
 from localization.simulation.vehicle import SampleClock, TrueMotion, pose_at, seconds
 from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
 from motion_models.compiled import kernel

@@ -10,10 +10,10 @@ from typing import Annotated, Literal, Protocol
 
 import numpy as np
 
+from localization.bounded_settings import Allowed, Positive, Settings, Share, Signed
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
-from localization.settings import Allowed, Positive, Settings, Share, Signed
-from localization.simulation.faults import TrueRobot
+from localization.simulation.injected_faults import TrueRobot
 from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
 from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistribution, SampleClock, TrueMotion, seconds
 from localization.simulation.world import World

@@ -26,7 +26,7 @@ from localization.simulation.experiments import (
     find_experiment,
     turn_command,
 )
-from localization.simulation.faults import TrueRobot, apply_faults
+from localization.simulation.injected_faults import TrueRobot, apply_faults
 from localization.simulation.sensors import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
 from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, TrueMotion, VehicleConfig, VehicleState, advance
 from localization.simulation.world import clearance

@@ -14,11 +14,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.bounded_settings import Positive, Settings, up_to
 from localization.errors import SimulationError
-from localization.settings import Positive, Settings, up_to
-from localization.simulation.dynamics import Chassis, DynamicsInput, Plant, derivatives, integrate
+from localization.simulation.vehicle_dynamics import Chassis, DynamicsInput, Plant, derivatives, integrate
+from motion_models.center_of_gravity.cg_model import CgModel, Posture, posture_for
 from motion_models.center_of_gravity.files import arms_model, arms_postures
-from motion_models.center_of_gravity.model import CgModel, Posture, posture_for
 from motion_models.center_of_gravity.parts import Payload
 from motion_models.compiled import subroutine
 from motion_models.friction.contact import tyre

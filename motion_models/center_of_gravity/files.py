@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from motion_models.center_of_gravity.model import CgModel, Posture, cg_model, parse_postures
+from motion_models.center_of_gravity.cg_model import CgModel, Posture, cg_model, parse_postures
 from motion_models.center_of_gravity.parts import TYPICAL, Arms, CgEstimate, Payload, StaticPart, Tolerances, require_support
 from motion_models.center_of_gravity.urdf import Urdf, load_urdf, parse_urdf
 from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts

@@ -34,7 +34,7 @@ from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
 from localization.logs import open_log
-from localization.simulation.faults import FAULTS
+from localization.simulation.injected_faults import FAULTS
 from motion_models.registry import make_model
 from tests.helpers.diagnosis_drives import ONE_SIDED, TYPICAL, bag, drive, robot_named
 from tests.helpers.diagnosis_public import (

@@ -19,7 +19,7 @@ from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
 from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
-from localization.ros.transports.base import MonotonicTime, Received
+from localization.ros.transports.transport import MonotonicTime, Received
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig

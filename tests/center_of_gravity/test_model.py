@@ -11,9 +11,9 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from motion_models.center_of_gravity.cg_model import CgTracker, cg_model, parse_postures, posture_for, static_part_from_weighing
 from motion_models.center_of_gravity.files import arms_model, arms_postures, urdf_cg, weighed_cg
 from motion_models.center_of_gravity.kinematics import COM, MASS, flatten
-from motion_models.center_of_gravity.model import CgTracker, cg_model, parse_postures, posture_for, static_part_from_weighing
 from motion_models.center_of_gravity.parts import Arms, Payload, StaticPart, Tolerances, require_support, support_margin
 from motion_models.center_of_gravity.urdf import parse_urdf
 from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, wheel_contacts

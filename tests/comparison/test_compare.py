@@ -21,8 +21,8 @@ from scipy.stats import ttest_rel
 from localization.cli import main
 from localization.comparison import jobs as job_module
 from localization.comparison.jobs import Job, failed_rows, job_key, run_job, run_local, trials
+from localization.comparison.result_table import ResultTable
 from localization.comparison.statistics import differences, means, sign_flip_p
-from localization.comparison.table import ResultTable
 from localization.errors import OutputError
 from localization.logs import TopicOverrides
 from localization.pipeline import ReplayConfig

@@ -14,7 +14,7 @@ from localization.cli import main
 from localization.comparison import remote
 from localization.comparison.fleet import LEVEL, compare_k, fleet_table
 from localization.comparison.jobs import failed_rows, run_job
-from localization.comparison.table import read_results
+from localization.comparison.result_table import read_results
 from localization.comparison.turning import turning
 from localization.errors import LogError
 from motion_models.registry import MODELS, make_model

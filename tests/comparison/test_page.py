@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from localization.comparison.page import CompareHead, comparison_page, write_comparison_report
+from localization.comparison.comparison_page import CompareHead, comparison_page, write_comparison_report
 from localization.comparison.statistics import closing, find, headline
 from localization.errors import OutputError
 from tests.helpers.report import PageText, without_scripts

@@ -6,7 +6,7 @@ import functools
 
 import pytest
 
-from localization.simulation.faults import TrueRobot, apply_faults
+from localization.simulation.injected_faults import TrueRobot, apply_faults
 from localization.simulation.sensors import LASER, nominal_mounts
 from localization.simulation.vehicle import Body
 from tests.benchmarks.diagnosis import CASES, case_of, run

@@ -9,11 +9,11 @@ import pytest
 
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.diagnose import diagnose
+from localization.diagnosis.drive_predictor import mirrored
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.linearization import regression
 from localization.diagnosis.model_error import cg_error_sigmas
 from localization.diagnosis.noise import FLAT
-from localization.diagnosis.prediction import mirrored
 from motion_models.registry import make_model
 from tests.helpers.law_drives import law_drive, measured_under
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from localization.diagnosis.drive_predictor import CHANNELS
 from localization.diagnosis.noise import Noise, estimate_noise, given_noise
-from localization.diagnosis.prediction import CHANNELS
 from motion_models.se2 import FloatArray
 
 WINDOWS, SIGMA, CREEP = 60, 3e-4, 6e-3

@@ -11,9 +11,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.noise import given_noise
-from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.selection import heldout_log_odds, problems_without_a_fold, simplest_set, strongest_beyond_tolerance
 from motion_models.se2 import FloatArray
 

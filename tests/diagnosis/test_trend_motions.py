@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from localization.diagnosis.drive import drive_of_table
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.friction_response import quasi_static_twists
 from localization.diagnosis.linearization import make_predictor
-from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.verdict import trend_motions
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.friction import FrictionModel

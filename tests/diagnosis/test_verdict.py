@@ -12,6 +12,7 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Hypothesis, Setting, with_sizes
 from localization.diagnosis.diagnose import TOLERANCE, diagnose
 from localization.diagnosis.drive import drive_of_table
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
 from localization.diagnosis.findings import (
     Attribution,
     Component,
@@ -26,7 +27,6 @@ from localization.diagnosis.findings import (
 )
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, make_regression
 from localization.diagnosis.noise import given_noise
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor
 from localization.diagnosis.verdict import (
     _information_apart,
     attribute_rows,

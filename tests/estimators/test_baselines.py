@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from localization.estimators.base import fuse_turn, twist_at_end
 from localization.estimators.baselines import DeadReckoning
+from localization.estimators.estimator import fuse_turn, twist_at_end
 from localization.events import Step
 from motion_models import se2
 from motion_models.preintegration import preintegrate

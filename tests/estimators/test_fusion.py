@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from localization.core.policies.slip import SlipChanges
 from localization.errors import EstimatorError
 from localization.estimators import EstimatorConfig
-from localization.estimators.base import Estimate
+from localization.estimators.estimator import Estimate
 from localization.evaluation.consistency import nees
 from localization.events import Event, ImuSample, Scan, Step, WheelSample
 from localization.lidar import LidarConfig

@@ -17,8 +17,8 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, with_sizes
 from localization.diagnosis.causes.floor import friction_change
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization
-from localization.diagnosis.prediction import DrivePredictor
 from localization.diagnosis.selection import folds, heldout_gain, heldout_squares
 from motion_models.se2 import FloatArray
 

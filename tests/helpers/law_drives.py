@@ -8,8 +8,8 @@ import numpy as np
 
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.drive import Drive
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import make_predictor
-from localization.diagnosis.prediction import DrivePredictor
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Maneuver

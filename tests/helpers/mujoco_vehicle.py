@@ -14,7 +14,7 @@ import numpy as np
 
 from localization.errors import SimulationError
 from localization.simulation.experiments import Experiment
-from localization.simulation.faults import TrueRobot
+from localization.simulation.injected_faults import TrueRobot
 from localization.simulation.simulator import Simulation, SimulationConfig
 from localization.simulation.vehicle import ANGLES, CG, COLUMNS, POSE, RATES, TWIST
 from motion_models.robot import Robot

@@ -26,7 +26,7 @@ from localization.ros.node import Node
 from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files, View
 from localization.ros.settings import LiveRun, Names, NodeConfig
-from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
+from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler
 from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, Rest, constant
 from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from localization.core.motion import FilterConfig
-from localization.estimators.base import Estimator
+from localization.estimators.estimator import Estimator
 from localization.estimators.fusion import EkfFusion
 from localization.events import Scan, Step, Turn
 from localization.lidar import LostScans, ScanMatch

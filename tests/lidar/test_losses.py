@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from localization.comparison.jobs import _scores
+from localization.comparison.result_table import ResultTable
 from localization.comparison.statistics import closing, find
-from localization.comparison.table import ResultTable
 from localization.evaluation.scores import score
 from localization.lidar import LostScans
 from localization.lidar.losses import LidarLosses, per_cent

@@ -7,7 +7,7 @@ import pytest
 
 from localization.errors import LogError
 from localization.events import PositionSample, Reference, WheelSample
-from localization.logs.references import merge_positions, read_positions
+from localization.logs.reference_topics import merge_positions, read_positions
 
 KNOWN = np.diag([0.5, 0.2, 0.1]) ** 2
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.comparison.page import comparison_page
+from localization.comparison.comparison_page import comparison_page
 from localization.comparison.statistics import find
 from localization.diagnosis.weigh import DrivenWeighing
 from localization.report.charts import Chart, Series

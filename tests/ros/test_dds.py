@@ -22,7 +22,7 @@ from localization.cli import main
 from localization.errors import TransportError
 from localization.logs import open_log
 from localization.pipeline import Trial, replay
-from localization.ros.transports.base import default_domain
+from localization.ros.transports.transport import default_domain
 from localization.trajectory import read_tum
 from motion_models import se2
 from motion_models.registry import make_model

@@ -30,7 +30,7 @@ from localization.ros.node import Node
 from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
 from localization.ros.session import Files
 from localization.ros.settings import Frames, LiveRun, Names, NodeConfig
-from localization.ros.transports.base import Received, ServiceReply
+from localization.ros.transports.transport import Received, ServiceReply
 from localization.trajectory import read_tum
 from motion_models import se2
 from motion_models.registry import make_model

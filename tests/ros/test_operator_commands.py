@@ -11,7 +11,7 @@ from localization.ros.operator_commands import POSE_TYPE
 from localization.ros.publisher import DIAGNOSTICS, MAP, PATH, PREDICTED_ODOMETRY, occupancy_grid
 from localization.ros.session import Files
 from localization.ros.settings import NodeConfig
-from localization.ros.transports.base import Received
+from localization.ros.transports.transport import Received
 from motion_models import se2
 from tests.helpers.online import LogTransport, drive_log, published, run_node, stamp_of, track
 

@@ -17,7 +17,7 @@ from localization.pipeline import Trial, replay
 from localization.ros.diagnostics import OK, WARN
 from localization.ros.publisher import DIAGNOSTICS, MAP
 from localization.ros.settings import NodeConfig, OnlineSettings
-from localization.ros.transports.base import Received
+from localization.ros.transports.transport import Received
 from motion_models.registry import make_model
 from tests.helpers.floor_plan import make_map
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, track

@@ -9,7 +9,7 @@ from localization.logs.serialization import encode, make
 from localization.ros.publisher import ODOMETRY
 from localization.ros.settings import NodeConfig
 from localization.ros.transports import choose_transport
-from localization.ros.transports.base import CLOCK, CLOCK_TYPE, Received, SimTimeTransport
+from localization.ros.transports.transport import CLOCK, CLOCK_TYPE, Received, SimTimeTransport
 from tests.helpers.online import LogTransport, drive_log, run_node, track
 
 S = 1_000_000_000

@@ -10,11 +10,11 @@ import pytest
 from localization.estimators import Estimate, LearnedParameter, Residuals
 from localization.events import Step, Turn
 from localization.ros.state_serialization import deserialize, serialize
-from localization.sensor_checks.consistency import DIFFERENCES, PARAMETER_FAR, Consistency
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.innovations import InnovationWindows
 from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
+from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, Consistency
 from motion_models import se2
 from motion_models.base import Motion
 from tests.helpers.event_faults import faults_of_stamps, faults_of_turns

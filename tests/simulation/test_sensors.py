@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.logs.message_templates import STORE, Template
-from localization.logs.references import reference_decoder
+from localization.logs.reference_topics import reference_decoder
 from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
 from localization.simulation.sensors import (
     EncoderConfig,

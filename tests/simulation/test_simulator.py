@@ -32,7 +32,7 @@ from localization.simulation.experiments import (
     constant,
     grid_points,
 )
-from localization.simulation.faults import FAULTS, parse_faults
+from localization.simulation.injected_faults import FAULTS, parse_faults
 from localization.simulation.open_loop_scores import correction_time, score_open_loop_runs
 from localization.simulation.sensors import START_NS, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation

@@ -11,8 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from localization.errors import SimulationError
-from localization.simulation.dynamics import Chassis, DynamicsInput, derivatives, wheel_response
-from localization.simulation.faults import TrueRobot, apply_faults
+from localization.simulation.injected_faults import TrueRobot, apply_faults
 from localization.simulation.vehicle import (
     CG,
     MARGIN,
@@ -25,6 +24,7 @@ from localization.simulation.vehicle import (
     accelerations,
     advance,
 )
+from localization.simulation.vehicle_dynamics import Chassis, DynamicsInput, derivatives, wheel_response
 from motion_models.errors import CgError
 from motion_models.friction.contact import SATURATION
 from motion_models.friction.dynamics import FrictionDynamics, Influence

@@ -25,7 +25,7 @@ import numpy as np
 from localization.estimators import PriorMap
 from localization.evaluation.references import reference_track
 from localization.logs import open_log
-from localization.logs.references import merge_positions, read_positions
+from localization.logs.reference_topics import merge_positions, read_positions
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Run, Trial, replay
 from localization.simulation.sensors import SensorConfig

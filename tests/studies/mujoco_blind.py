@@ -21,10 +21,10 @@ from pathlib import Path
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.diagnose import DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.prediction import Baseline
+from localization.diagnosis.drive_predictor import Baseline
 from localization.logs import open_log
 from localization.simulation.experiments import Experiment, ExperimentConfig, Phase
-from localization.simulation.faults import FAULTS
+from localization.simulation.injected_faults import FAULTS
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import SimulationConfig, write_simulation

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import MutableMapping
 
-from localization.diagnosis.causes import floor, load, mounts_and_clocks, sensors, slips, wheels
+from localization.diagnosis.causes import floor, gyro_and_ranging, load, mounts_and_clocks, slips, wheels
 from localization.diagnosis.causes.cause import Cause
 
 CAUSES: MutableMapping[str, Cause] = {
@@ -33,10 +33,10 @@ CAUSES: MutableMapping[str, Cause] = {
     "scrub": floor.SCRUB,
     "slope": floor.SLOPE_ALONG,
     "encoder_dropout": wheels.ENCODER_DROPOUT,
-    "gyro_bias": sensors.GYRO_BIAS,
-    "gyro_scale": sensors.GYRO_SCALE,
-    "range_scale": sensors.RANGE_SCALE,
-    "range_bias": sensors.RANGE_BIAS,
+    "gyro_bias": gyro_and_ranging.GYRO_BIAS,
+    "gyro_scale": gyro_and_ranging.GYRO_SCALE,
+    "range_scale": gyro_and_ranging.RANGE_SCALE,
+    "range_bias": gyro_and_ranging.RANGE_BIAS,
     "wheel_radius_drift": wheels.WHEEL_RADIUS_DRIFT,
     "lateral_slip_speed": slips.LATERAL_SLIP_SPEED,
     "rotation_slip_speed": slips.ROTATION_SLIP_SPEED,

@@ -1,7 +1,7 @@
 """What a cause is: a direction in which robot, floor or sensors may differ from the robot file, with all that follows from it.
 
 A `Hypothesis` holds everything that may differ from the robot file; a cause adds its size to one place of it. The predictor that
-predicts motions from a hypothesis is in `localization.diagnosis.prediction`.
+predicts motions from a hypothesis is in `localization.diagnosis.drive_predictor`.
 """
 
 from __future__ import annotations

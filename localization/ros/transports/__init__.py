@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Literal
 
 from localization.ros.settings import Names
-from localization.ros.transports.base import Transport, default_domain
+from localization.ros.transports.transport import Transport, default_domain
 
 TransportName = Literal["auto", "dds", "rclpy", "zenoh", "rospy"]
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from localization.errors import TransportError
 from localization.logs.serialization import Shape, encode, fields, make, type_hash
-from localization.ros.transports.base import LAST_DOMAIN, MonotonicTime, Received
+from localization.ros.transports.transport import LAST_DOMAIN, MonotonicTime, Received
 
 try:
     import cyclonedds.core as dds

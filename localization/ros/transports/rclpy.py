@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from localization.errors import TransportError
-from localization.ros.transports.base import MonotonicTime, Received, ServiceHandler
+from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler
 
 _LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
 _MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")

@@ -15,7 +15,7 @@ from urllib.parse import urlparse
 
 from localization.errors import TransportError
 from localization.logs.serialization import definition
-from localization.ros.transports.base import MonotonicTime, Received
+from localization.ros.transports.transport import MonotonicTime, Received
 
 _DEBIAN = Path("/usr/lib/python3/dist-packages")
 _LATEST = 100

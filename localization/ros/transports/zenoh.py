@@ -21,7 +21,7 @@ from typing import Any
 
 from localization.errors import TransportError
 from localization.logs.serialization import type_hash
-from localization.ros.transports.base import MonotonicTime, Received
+from localization.ros.transports.transport import MonotonicTime, Received
 
 try:
     import zenoh

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Hypothesis, with_sizes
 from localization.diagnosis.diagnose import DiagnosisResult
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize
 from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
-from localization.diagnosis.prediction import CHANNELS, DrivePredictor, moved_by
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
 from motion_models.se2 import FloatArray

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.comparison.charts import is_wide, run_charts, run_table
+from localization.comparison.comparison_charts import is_wide, run_charts, run_table
 from localization.comparison.statistics import (
     Difference,
     Findings,
