@@ -40,6 +40,7 @@ _GLOBAL = ("/tf", "/tf_static", "/diagnostics")
 
 PARAMS_FILE = Path(__file__).parent / "share" / "params.yaml"
 _LEFT_OUT = "none"
+_SWITCH = 'true, false, or "" for None'
 _RENAMED = {"node.tf": "publish_tf"}  # as robot_localization has it
 _DYNAMIC = ("node.tf",)
 _LEFT_TO_ROS = ("topic.reference", "node.use_sim_time", "node.names")
@@ -298,6 +299,8 @@ def _flatten(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:
         text, full = texts.get(item.name, ""), ".".join(here)
         if here[0] == "topic":
             text, constraint = text + f' "" is the robot file\'s, "{_LEFT_OUT}" leaves the part out.', "a topic"
+        if hints[item.name] == (bool | None):
+            constraint = _SWITCH
         name = _RENAMED.get(full, here[-1] if here[0] == "node" else full)
         default: Value = "" if value is None else value
         yield Parameter(name, here, default, text, constraint, choices, full in _DYNAMIC)
@@ -312,6 +315,10 @@ def _choices(hint: Any) -> tuple[str, ...]:
 def _convert(parameter: Parameter, value: Any) -> Any:
     """``value`` as its field has it. Raises `SettingError`."""
     default = parameter.default
+    if parameter.constraint == _SWITCH:
+        if value != "" and not isinstance(value, bool):
+            raise SettingError(f"parameter '{parameter.name}' is {value!r}; it may be {_SWITCH}.")
+        return None if value == "" else value
     if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not type(default):

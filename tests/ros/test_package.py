@@ -46,6 +46,11 @@ def test_make_settings_of_defaults_are_the_settings_defaults():
     assert made == type(made)("vaultbot")
 
 
+@pytest.mark.parametrize(("value", "expected"), [("", None), (True, True), (False, False)])
+def test_make_settings_of_a_switch_with_a_third_state_takes_it_as_empty(value, expected):
+    assert make_settings({"robot": "vaultbot", "config.step.planar": value}, Names()).config.step.planar is expected
+
+
 def test_make_settings_puts_each_value_in_its_place():
     values = {
         "robot": "husky_a200",
@@ -74,6 +79,7 @@ def test_make_settings_puts_each_value_in_its_place():
         ({"wait_s": -1.0}, "setting wait_s of NodeConfig is -1; it must be 0 or more."),
         ({"config.estimator.lidar.matcher": "submaps"}, "Did you mean 'submap'?"),
         ({"odom_frame": "base_link"}, "they must be two frames"),
+        ({"config.step.planar": "yes"}, """it may be true, false, or "" for None."""),
     ],
 )
 def test_make_settings_refuses_names_types_and_ranges(values, error):
