@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from localization.evaluation.reference_files import read_reference_file
     from localization.evaluation.references import reference_track
     from localization.evaluation.scores import Result, score
+    from localization.log_replay import Run, replay
     from localization.logs import Log, TopicOverrides, open_log
-    from localization.pipeline import ReplayConfig, Run, Trial, replay
+    from localization.pipeline import ReplayConfig, Trial
     from localization.synchronizer import StepConfig
     from localization.trajectory import Trajectory, read_tum, write_tum
 
@@ -44,7 +45,8 @@ _MODULES = {
     "localization.evaluation.references": "reference_track",
     "localization.evaluation.scores": "Result score",
     "localization.logs": "Log TopicOverrides open_log",
-    "localization.pipeline": "ReplayConfig Run Trial replay",
+    "localization.pipeline": "ReplayConfig Trial",
+    "localization.log_replay": "Run replay",
     "localization.synchronizer": "StepConfig",
     "localization.trajectory": "Trajectory read_tum write_tum",
 }

@@ -20,8 +20,9 @@ from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result, score
 from localization.events import Event
+from localization.log_replay import replay
 from localization.logs import Log, TopicOverrides
-from localization.pipeline import ReplayConfig, replay
+from localization.pipeline import ReplayConfig
 from localization.trajectory import Trajectory
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from localization.events import ImuSample, WheelSample
-from localization.pipeline import Trial, replay
+from localization.log_replay import replay
+from localization.pipeline import Trial
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.stats import chi2
 
 from localization.cli import main
-from localization.pipeline import warnings_of
+from localization.log_replay import warnings_of
 from localization.trajectory import read_tum
 from tests.helpers import bags, rooms
 

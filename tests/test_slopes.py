@@ -9,8 +9,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from localization.log_replay import replay
 from localization.logs import open_log
-from localization.pipeline import ReplayConfig, Trial, replay
+from localization.pipeline import ReplayConfig, Trial
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation

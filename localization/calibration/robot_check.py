@@ -24,9 +24,10 @@ from localization.evaluation.reference_check import compare_reference
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
 from localization.events import Event, ImuSample
+from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
-from localization.pipeline import Run, Trial, replay, warnings_of
+from localization.pipeline import Trial
 from localization.trajectory import Trajectory
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma

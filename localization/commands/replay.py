@@ -36,13 +36,14 @@ from localization.evaluation.references import (
 from localization.evaluation.scores import Result, score
 from localization.events import Event, PositionSample
 from localization.lifting import write_tum3
+from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
 from localization.logs.reference_topics import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
 from localization.output import as_text, check_outputs, fingerprint, versions
-from localization.pipeline import ReplayConfig, Run, Trial, replay, warnings_of
+from localization.pipeline import ReplayConfig, Trial
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
 from localization.report.scan_layer import ScanLayer
 from localization.trajectory import write_tum

@@ -27,9 +27,10 @@ from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, check_estimator
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations, describe_instant
 from localization.evaluation.scores import score
+from localization.log_replay import Run, replay
 from localization.logs import Log, TopicOverrides
 from localization.output import fingerprint, output_errors, versions
-from localization.pipeline import ReplayConfig, Run, Trial, replay
+from localization.pipeline import ReplayConfig, Trial
 from localization.trajectory import Trajectory, write_tum
 from motion_models.errors import SkidlocError
 from motion_models.online_calibration import Form

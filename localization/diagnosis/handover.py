@@ -18,8 +18,9 @@ from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
 from localization.diagnosis.findings import HandoverCheck, Replayed
 from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.noise import Noise
+from localization.log_replay import Run, replay
 from localization.logs.reader import Log
-from localization.pipeline import Run, Trial, replay
+from localization.pipeline import Trial
 from motion_models import se2
 from motion_models.calibration.cross_validation import root_mean_gain
 from motion_models.calibration.maneuvers import IntArray

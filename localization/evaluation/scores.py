@@ -12,7 +12,7 @@ from localization.evaluation.consistency import Consistency, pose_consistency, p
 from localization.evaluation.metrics import Accuracy, evaluate
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
-from localization.pipeline import Run
+from localization.log_replay import Run
 
 _LEVER_SIGMA_M = 0.3
 """Sigma of where on the robot a reference without headings measures: antennas are within half a metre of the middle."""

@@ -20,8 +20,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from localization.events import Scan
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
+from localization.log_replay import replay
 from localization.logs import open_log
-from localization.pipeline import Trial, replay
+from localization.pipeline import Trial
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Mount

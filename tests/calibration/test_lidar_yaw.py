@@ -12,8 +12,9 @@ from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
 from localization.evaluation.references import reference_track
 from localization.evaluation.scores import score
 from localization.events import ImuSample, WheelSample
+from localization.log_replay import replay
 from localization.logs import Log, open_log
-from localization.pipeline import Trial, replay
+from localization.pipeline import Trial
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from tests.helpers.online import ROBOT, drive_log

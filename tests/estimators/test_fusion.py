@@ -17,7 +17,8 @@ from localization.estimators.estimator import Estimate
 from localization.evaluation.consistency import nees
 from localization.events import Event, ImuSample, Scan, Step, WheelSample
 from localization.lidar import LidarConfig
-from localization.pipeline import Pipeline, ReplayConfig, Run, Trial
+from localization.log_replay import Run
+from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.simulation import world
 from motion_models import se2
 from motion_models.base import Motion

@@ -19,8 +19,9 @@ from localization.estimators.graph_fusion import subtract_information
 from localization.estimators.pose_graph import PoseGraph
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
+from localization.log_replay import replay
 from localization.logs.reference_topics import merge_positions
-from localization.pipeline import Pipeline, ReplayConfig, Trial, replay
+from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation import world
 from localization.trajectory import Trajectory

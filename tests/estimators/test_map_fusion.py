@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from localization.estimators import MapFusion, PriorMap
+from localization.log_replay import replay
 from localization.logs import open_log
 from localization.maps.place_search import PlaceMap
-from localization.pipeline import Pipeline, Trial, replay
+from localization.pipeline import Pipeline, Trial
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
 from motion_models.registry import make_model

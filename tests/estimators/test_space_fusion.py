@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from localization.pipeline import ReplayConfig, Trial, replay
+from localization.log_replay import replay
+from localization.pipeline import ReplayConfig, Trial
 from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from tests.helpers.hill_scans import MOUNT, make_scene, scans

@@ -9,7 +9,7 @@ import numpy as np
 
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import score
-from localization.pipeline import Run
+from localization.log_replay import Run
 from localization.report.replay_page import ReportHead
 from localization.trajectory import Trajectory
 from motion_models import se2

@@ -13,7 +13,8 @@ from scipy.signal import lfilter
 
 from localization.events import Event, Scan, WheelSample
 from localization.lidar import Sweep
-from localization.pipeline import ReplayConfig, Run, Trial, replay
+from localization.log_replay import Run, replay
+from localization.pipeline import ReplayConfig, Trial
 from localization.simulation.world import Grid, cast, make_grid
 from motion_models import se2
 from motion_models.registry import make_model

@@ -10,7 +10,7 @@ import pytest
 
 from localization.evaluation.references import ReferenceTrack
 from localization.evaluation.scores import score
-from localization.pipeline import Run
+from localization.log_replay import Run
 from localization.report.interactive import explorer_data
 from localization.report.replay_page import ReportHead, page
 from localization.report.runs import plotted_runs

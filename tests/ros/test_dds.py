@@ -20,8 +20,9 @@ import pytest
 
 from localization.cli import main
 from localization.errors import TransportError
+from localization.log_replay import replay
 from localization.logs import open_log
-from localization.pipeline import Trial, replay
+from localization.pipeline import Trial
 from localization.ros.transports.transport import default_domain
 from localization.trajectory import read_tum
 from motion_models import se2

@@ -18,10 +18,11 @@ from localization.commands.online import PlaybackClock
 from localization.errors import CheckpointError, SettingError, TopicError, TransportError
 from localization.estimators import Estimate
 from localization.events import Scan, WheelSample
+from localization.log_replay import replay
 from localization.logs import TopicOverrides, open_log
 from localization.logs.serialization import encode
 from localization.logs.writer import FusedEstimate, transform_message
-from localization.pipeline import Trial, replay
+from localization.pipeline import Trial
 from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
 from localization.ros.discovery import TF

@@ -19,9 +19,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from localization.cli import main
 from localization.events import Scan
+from localization.log_replay import replay
 from localization.logs import open_log
 from localization.logs.serialization import definition
-from localization.pipeline import Trial, replay
+from localization.pipeline import Trial
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
 from tests.helpers.online import DRIVE, ROBOT

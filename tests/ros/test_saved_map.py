@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from localization.estimators import PriorMap
+from localization.log_replay import replay
 from localization.logs import open_log
 from localization.logs.serialization import encode, make
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
-from localization.pipeline import Trial, replay
+from localization.pipeline import Trial
 from localization.ros.diagnostics import OK, WARN
 from localization.ros.publisher import DIAGNOSTICS, MAP
 from localization.ros.settings import NodeConfig, OnlineSettings

@@ -35,8 +35,9 @@ from localization.evaluation.reference_files import read_reference_file
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.events import Event
 from localization.lidar import LidarConfig
+from localization.log_replay import Run, replay
 from localization.logs import open_log
-from localization.pipeline import ReplayConfig, Run, Trial, replay
+from localization.pipeline import ReplayConfig, Trial
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.registry import make_model

@@ -33,8 +33,9 @@ from localization.calibration.wheel_wiring import open_checked
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.reference_files import load_reference
 from localization.events import ImuSample, Scan, WheelSample
+from localization.log_replay import replay, warnings_of
 from localization.logs import Log, open_log
-from localization.pipeline import Trial, replay, warnings_of
+from localization.pipeline import Trial
 from motion_models.errors import SkidlocError
 from motion_models.registry import make_model
 from motion_models.robot import Robot

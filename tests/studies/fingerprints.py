@@ -24,10 +24,11 @@ import numpy as np
 
 from localization.estimators import PriorMap
 from localization.evaluation.references import reference_track
+from localization.log_replay import Run, replay
 from localization.logs import open_log
 from localization.logs.reference_topics import merge_positions, read_positions
 from localization.maps.place_search import PlaceMap
-from localization.pipeline import Run, Trial, replay
+from localization.pipeline import Trial
 from localization.simulation.sensors import SensorConfig
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot

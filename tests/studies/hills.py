@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 
 from localization.events import Scan
 from localization.lidar import Sweep
-from localization.pipeline import ReplayConfig, Trial, replay
+from localization.log_replay import replay
+from localization.pipeline import ReplayConfig, Trial
 from localization.synchronizer import StepConfig
 from motion_models import se3
 from motion_models.friction import FrictionModel

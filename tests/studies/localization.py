@@ -18,10 +18,11 @@ import numpy as np
 
 from localization.estimators import EstimatorConfig, MapFusion, PriorMap
 from localization.estimators.graph_fusion import GraphConfig
+from localization.log_replay import replay
 from localization.maps import KeyframeMap
 from localization.maps.localizer import LIKELY, Localizer
 from localization.maps.place_search import PlaceMap
-from localization.pipeline import Pipeline, ReplayConfig, Trial, replay
+from localization.pipeline import Pipeline, ReplayConfig, Trial
 from motion_models import se2
 from motion_models.registry import make_model
 from tests.studies.buildings import BUILDINGS, Drive

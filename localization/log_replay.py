@@ -1,0 +1,183 @@
+"""A whole log through pipelines: every trial sees the same events in the same order, and each gives a `Run`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from localization.errors import LogError
+from localization.estimate_table import NIS, TWIST, TWIST_COV, EstimateTable, trajectory
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, Estimate
+from localization.events import Event
+from localization.lidar.losses import LidarLosses
+from localization.lifting import AttitudeTable, SpaceTable, Trajectory3
+from localization.maps import KeyframeMap
+from localization.pipeline import Pipeline, ReplayConfig, Trial
+from localization.trajectory import Trajectory
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Result of one trial on one log."""
+
+    model: str
+    estimator: str
+    trajectory: Trajectory
+    """Poses given the whole log (smoothed where the estimator smooths), with covariances where the estimator has them."""
+    twists: FloatArray
+    """(N, 3) vx, vy, wz in the body frame at the trajectory's stamps."""
+    twist_covariances: FloatArray
+    """(N, 3, 3); NaN where it has none."""
+    nis: FloatArray
+    """(N,) normalised innovation squared of the LiDAR's measurements, 3 degrees of freedom; NaN where there was none."""
+    parameters: Mapping[str, tuple[float, float]]
+    """Mean and sigma at the end of what was estimated besides the pose."""
+    counts: Mapping[str, int]
+    """Number of occurrences by name: scans, matched, searched, standing..."""
+    map_points: FloatArray
+    """(M, 2) points of the map, in the world [m]; (0, 2) without a LiDAR."""
+    warnings: Sequence[str]
+    """Problems of the sensors."""
+    seconds: float
+    """Computing time of this trial, without reading the log."""
+    corrections: str | None = None
+    """Form of the corrections to the motion model, or None where the estimator makes none."""
+    filtered: Trajectory | None = None
+    """Filtered poses, as they were estimated at each moment and published live, where ``trajectory`` is smoothed."""
+    lidar: LidarLosses | None = None
+    """How long the LiDAR was lost; None where no scans were matched to a map."""
+    keyframes: KeyframeMap | None = None
+    """The map as it can be saved, of an estimator with a map frame."""
+    localization: Mapping[str, Any] | None = None
+    """State, probability and times of the estimator that localizes in a saved map."""
+    in_space: Trajectory3 | None = None
+    """``trajectory`` in space, with height, roll and pitch: of an estimator in space, or where an IMU shows that the ground tilts."""
+    parameter_history: Mapping[str, FloatArray] = field(default_factory=dict)
+    """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
+    left_plane_ns: int | None = None
+    """Stamp after which poses are in space because the IMU shows that the ground tilts; None where that was not found, or not asked."""
+
+    @property
+    def in_space_from_s(self) -> float | None:
+        """Time after the first pose from which on poses are in space by choice [s]; None where there was none."""
+        return None if self.left_plane_ns is None else float(self.left_plane_ns - self.trajectory.stamps_ns[0]) * 1e-9
+
+    def __repr__(self) -> str:
+        return f"<Run {self.model} {self.estimator}: {self.trajectory!r}, {len(self.warnings)} warnings>"
+
+
+_PARAMETERS_EVERY_NS = 2_000_000_000
+"""Time between two samples of the estimated parameters, in `Run.parameter_history`."""
+_EQUAL_CHARACTERS = 60
+"""Number of first characters that are equal in warnings of one fault: its time and kind, up to the numbers."""
+
+
+def warnings_of(runs: Iterable[Run]) -> list[str]:
+    """Problems of the sensors in all ``runs``, each once: what several trials report alike is given with the names of all of them.
+
+    The sensor checks' warnings have no name, and their numbers depend on the estimate: of those of several runs that begin alike the first
+    is kept.
+    """
+    names: dict[str, list[str]] = {}
+    beginnings: set[str] = set()
+    for run in runs:
+        name = f"{run.estimator} ({run.model})"
+        for warning in run.warnings:
+            text = warning.removeprefix(f"{name}: ")
+            if text == warning and text not in names and warning[:_EQUAL_CHARACTERS] in beginnings:
+                continue
+            names.setdefault(text, []).extend([name] if text != warning else [])
+        beginnings |= {warning[:_EQUAL_CHARACTERS] for warning in run.warnings}
+    return [f"{', '.join(dict.fromkeys(found))}: {text}" if found else text for text, found in names.items()]
+
+
+def replay(
+    events: Iterable[Event],
+    trials: Sequence[Trial],
+    robot: Robot,
+    mounts: Mapping[str, Mount],
+    has_lidar: bool,
+    config: ReplayConfig | None = None,
+    on_event: Callable[[int], None] = lambda stamp_ns: None,
+) -> list[Run]:
+    """Run all ``trials`` over ``events``, which are read once; ``on_event`` is called with the stamp of each.
+
+    Estimators receive the same events in the same order as they would live. Only the trajectories grow with the log.
+    Raises `LogError` if the events give no motion, and what the log's iterator raises.
+    """
+    replays = [_Replay(trial, Pipeline(trial, robot, mounts, has_lidar, config, is_smoothing=True)) for trial in trials]
+    for event in events:
+        for one in replays:
+            one.process(event)
+        on_event(event.stamp_ns)
+    return [one.finish() for one in replays]
+
+
+class _Replay:
+    """One pipeline, and the table of its estimates."""
+
+    def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
+        self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
+        self._attitudes, self._in_space = AttitudeTable(), SpaceTable()
+        self._parameters: dict[str, list[tuple[float, float, float]]] = {}
+        self._next_ns = 0
+
+    def process(self, event: Event) -> None:
+        begin = time.perf_counter()
+        self._add(self._pipeline.stream(event))
+        self._seconds += time.perf_counter() - begin
+
+    def _add(self, estimates: Iterator[Estimate]) -> None:
+        for estimate in estimates:
+            self._table.add(estimate)
+            if estimate.stamp_ns >= self._next_ns:
+                self._next_ns = estimate.stamp_ns + _PARAMETERS_EVERY_NS
+                for name, (mean, sigma) in self._pipeline.estimator.parameters().items():
+                    self._parameters.setdefault(name, []).append((estimate.stamp_ns * 1e-9, mean, sigma))
+            attitude = self._pipeline.attitude
+            if estimate.in_space is not None:
+                self._in_space.add(estimate.stamp_ns, estimate.in_space)
+            elif attitude is not None:
+                self._attitudes.add(estimate.stamp_ns, attitude)
+
+    def finish(self) -> Run:
+        begin = time.perf_counter()
+        self._add(self._pipeline.stream_rest())
+        stamps, table = self._table.stamps(), self._table.rows()
+        if not len(stamps):
+            raise LogError("no two wheel samples or scans span an interval of time. Check the log's length and options of topics.")
+        filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
+        smoothed = estimator.finish(filtered)
+        smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)
+        attitude, final = self._pipeline.attitude, filtered if smoothed is None else smoothed
+        in_space = self._attitudes.lift(final) if attitude is not None and attitude.is_tilting and len(self._attitudes) else None
+        in_space = self._in_space.trajectory(in_space) if len(self._in_space) else in_space
+        plane = self._pipeline.plane
+        self._seconds += time.perf_counter() - begin
+        return Run(
+            self._trial.model.name,
+            self._trial.estimator,
+            final,
+            table[:, TWIST],
+            table[:, TWIST_COV].reshape(-1, 3, 3),
+            table[:, NIS],
+            estimator.parameters(),
+            {**estimator.counts(), **self._pipeline.checks.counts()},
+            estimator.map_points(),
+            self._pipeline.warnings(),
+            self._seconds,
+            self._trial.corrections if self._trial.estimator in ESTIMATORS_WITH_CORRECTIONS else None,
+            None if smoothed is None else filtered,
+            self._pipeline.lidar,
+            estimator.keyframe_map(),
+            estimator.localization(),
+            in_space,
+            {name: np.array(rows) for name, rows in self._parameters.items()},
+            None if plane is None else plane.left_ns,
+        )
