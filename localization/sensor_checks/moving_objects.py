@@ -107,8 +107,9 @@ class MovingObjects(Check):
     def apply(self, step: Step) -> Step:
         """``step`` whose scan has the still world alone, while more than a few objects move."""
         self._add_motion(step)
-        if any(fault in self._faults.declared for fault in _EXPLAINING if fault not in self._explained):
-            self._explained = tuple(fault for fault in _EXPLAINING if fault in self._faults.declared)
+        declared = self._faults.declared
+        if declared and any(fault in declared for fault in _EXPLAINING if fault not in self._explained):
+            self._explained = tuple(fault for fault in _EXPLAINING if fault in declared)
             self._faults.retract(MOVING_OBJECTS)
             self._since, self.report = None, _Report(self._faults)
             self._restart()
@@ -214,7 +215,7 @@ class MovingObjects(Check):
         if lidar.is_active:
             self.report.add(scene.moved_share)
             self._since = found.view if self._since is None else self._since
-        elif not any(other.is_active for other in self._lidars.values()):
+        elif self._since is not None and not any(other.is_active for other in self._lidars.values()):
             self._end()
 
     def _end(self) -> None:
