@@ -428,12 +428,13 @@ def unit_of(name: str) -> str:
 
 def correctable_findings(d: Diagnosis) -> list[Finding]:
     """Findings that a robot may be corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing
-    whose size depends on one of these; where a part stays unexplained, only what by itself improves windows that it was not fitted to."""
+    whose size depends on one of these; where a part stays unexplained, only what by itself improves windows that it was not fitted to, and
+    nothing that begins or ends within the drive: it may be a step in the place of an unknown change."""
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
     contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
     contested |= {f.cause for f in estimated if not f.is_plausible}
     if d.verdict == "unexplained":
-        contested |= {f.cause for f in estimated if f.gain.low <= 0.0}
+        contested |= {f.cause for f in estimated if f.gain.low <= 0.0 or f.definition.spell is not None}
     return [f for f in estimated if f.cause not in contested and f.is_independent_of(contested)]
 
 

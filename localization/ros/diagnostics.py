@@ -429,7 +429,7 @@ def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
         values[f"finding_{i}"] = f"{finding.cause} {finding.size:+.4g} +- {finding.sigma:.2g} {finding.definition.unit}"
         if finding.aliases:
             values[f"or_{i}"] = describe_sizes(finding.aliases)
-        if finding in corrected or finding.cause == MISSING_MESSAGES.id:
+        if (finding in corrected and finding.definition.spell is None) or finding.cause == MISSING_MESSAGES.id:
             values[f"remedy_{i}"] = finding.definition.remedy.format(g=robot.geometry, c=robot.clock, r=robot)
             remedies.append(f"{finding.definition.label}: {values[f'remedy_{i}']}.")
     is_good = d.verdict in ("consistent", "undecidable") and not d.findings
