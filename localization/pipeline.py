@@ -78,7 +78,7 @@ class Pipeline:
         name = trial.estimator if trial.prior is None else "ekf"
         self.estimator: Estimator
         if is_in_space:
-            self.estimator = SpaceFusion(robot, self.mounts, config.estimator.lidar, config.estimator.space)
+            self.estimator = SpaceFusion(robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space)
         else:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
@@ -86,7 +86,7 @@ class Pipeline:
         self.plane: Plane | None = None
         """The choice between plane and space; None where there is none."""
         if trial.estimator == "ekf" and config.step.planar is None and has_lidar:
-            self.plane = Plane(robot, self.mounts, config.estimator.lidar, config.estimator.space)
+            self.plane = Plane(robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""

@@ -110,7 +110,7 @@ class Synchronizer:
         """The vertical; None for models of robots that do not skid, and where `StepConfig.slopes` is off."""
         has_slopes = self.config.slopes and model.traits.is_level
         self._slope_effect = SlopeEffect.from_robot(robot) if has_slopes else None
-        self._robot, self._mounts = robot, mounts
+        self._imu = robot.gyro_noise, mounts, robot.geometry.wheel_radius_m  # of which attitude and body rates are made
         self._body_rates: BodyRates | None = None
         if has_slopes:
             self._measure_attitude()
@@ -141,12 +141,12 @@ class Synchronizer:
     def measure_in_space(self) -> None:
         """Measure attitude and turns about all three axes from here on, as poses in space need them."""
         if self._body_rates is None:
-            self._body_rates = BodyRates(self._robot.gyro_noise, self._mounts)
+            self._body_rates = BodyRates(*self._imu[:2])
         if self.attitude is None:
             self._measure_attitude()
 
     def _measure_attitude(self) -> None:
-        self.attitude = AttitudeFilter(self._robot.gyro_noise, self._mounts, self._robot.geometry.wheel_radius_m)
+        self.attitude = AttitudeFilter(*self._imu)
 
     def restart_gap(self) -> None:
         """Restart the gap in the wheel data: a matched scan measured the pose, so the unknown velocity acts only from here on."""

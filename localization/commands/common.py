@@ -96,7 +96,7 @@ def print_table(console: Console, table: Table) -> None:
     if console.is_terminal:
         console.print(table)
     else:
-        Console(file=console.file, width=WIDE, highlight=False).print(table)
+        PlainConsole(file=console.file, width=WIDE, highlight=False).print(table)
 
 
 def print_line(console: Console, text: str) -> None:

@@ -162,7 +162,7 @@ def _describe_day(day: str, rows: Sequence[Row], learned: Sequence[Row]) -> Day:
 
 
 def _column(rows: Sequence[Row], name: str) -> FloatArray:
-    return np.array([row[name] for row in rows], dtype=float)
+    return np.array([row.get(name) for row in rows], dtype=float)
 
 
 def _means(rows: Sequence[Row], x: str, y: str) -> tuple[float, float] | None:

@@ -26,7 +26,7 @@ from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans,
 from localization.lidar.cloud_map import CloudMap, thin
 from localization.lifting import Lifting, Pose3, aligning
 from motion_models import se3
-from motion_models.robot import Mount, Robot
+from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray, Points2
 from motion_models.se3 import Transform3
 
@@ -48,9 +48,9 @@ class SpaceFusion(Estimator):
     Until gravity is measured for the first time, nothing is matched.
     """
 
-    def __init__(self, robot: Robot, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
-        self._gyro, self._mounts, self._lidar, self._config = robot.gyro_noise, mounts, lidar, config
-        self.state = initial_space_state(robot.gyro_noise, _BIAS_SIGMA, config)
+    def __init__(self, gyro: GyroNoise, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
+        self._gyro, self._mounts, self._lidar, self._config = gyro, mounts, lidar, config
+        self.state = initial_space_state(gyro, _BIAS_SIGMA, config)
         self._has_vertical = False
         self._map: CloudMap | None = None
         self._odom_T_map = np.eye(4)
@@ -62,10 +62,10 @@ class SpaceFusion(Estimator):
 
     @classmethod
     def continuing(
-        cls, planar: Estimator, pose: Pose3, robot: Robot, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig
+        cls, planar: Estimator, pose: Pose3, gyro: GyroNoise, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig
     ) -> SpaceFusion:
         """In space from ``pose`` on, to which the estimator ``planar`` has come in the plane."""
-        made = cls(robot, mounts, lidar, config)
+        made = cls(gyro, mounts, lidar, config)
         made.state = start_at(made.state, pose.position, pose.rotation, pose.covariance)
         made._counts = {**planar.counts(), **{name: planar.counts().get(name, 0) for name in made._counts}}
         made._lost = planar.lost or made._lost
@@ -216,9 +216,9 @@ class Plane:
     Without a 3D LiDAR they stay in the plane, whatever the ground does: planar scans are not matched in space.
     """
 
-    def __init__(self, robot: Robot, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
+    def __init__(self, gyro: GyroNoise, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
         """As `SpaceFusion`."""
-        self._of_space, self._lifting = (robot, mounts, lidar, config), Lifting()
+        self._of_space, self._lifting = (gyro, mounts, lidar, config), Lifting()
         self._pose: Pose3 | None = None
         self.has_clouds = False
         """A 3D LiDAR has measured: from the first cloud on there is a choice."""

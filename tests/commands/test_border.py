@@ -39,6 +39,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
         "{out}.map",
     ),
     "compare": ("compare", "{nothing}", *COMMON, "--out", "{out}.csv", "--processes", "1"),
+    "table": ("table", "{results}", "--json", "{out}.json"),
     "calibrate": ("calibrate", "{log}", *COMMON, "--out", "{out}.toml", "--json", "{out}.json"),
     "diagnose": ("diagnose", "{log}", *COMMON, "--model", "skid_steer", "--out", "{out}"),
     "weigh": ("weigh", "{log}", *COMMON, "--out", "{out}.toml"),
@@ -55,6 +56,8 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "simulate folder": ("simulate", "short", *COMMON, "--out", "{out}"),
 }
 """Each command with each kind of file that it writes."""
+RESULTS = "log,model,estimator,corrections,key,status,error,robot,k,k_sigma\na.mcap,skid_steer,ekf,constant,0,ok,,vaultbot,0.5,0.01\n"
+"""A table of one run."""
 
 
 class Inputs:
@@ -62,12 +65,13 @@ class Inputs:
 
     def __init__(self, folder: Path) -> None:
         self.log = bags.write_mcap(folder / "run.mcap", drive(4.0))
-        self.map, self.nothing = folder / "hall.map", folder / "nothing.mcap"
+        self.map, self.nothing, self.results = folder / "hall.map", folder / "nothing.mcap", folder / "results.csv"
+        self.results.write_text(RESULTS)
         assert main([*self.arguments("replay --save-map", folder / "o"), "--json", str(folder / "m.json")]) == 0
         (folder / "o.map").rename(self.map)
 
     def arguments(self, writer: str, out: Path, robot: str = "vaultbot") -> list[str]:
-        return [part.format(log=self.log, map=self.map, nothing=self.nothing, out=out, robot=robot) for part in WRITERS[writer]]
+        return [part.format(**vars(self), out=out, robot=robot) for part in WRITERS[writer]]
 
 
 @pytest.fixture(scope="module")

@@ -83,8 +83,8 @@ def test_cloud_match_to_single_rings_on_the_ground_says_nothing_along_it():
 
 def test_cloud_map_share_falls_with_the_clouds_before():
     cloud, made = yard(np.random.default_rng(5)), CloudMap(CELL_M, NOISE_M)
-    shares = [made.insert(np.eye(4), cloud) for _ in range(3)]
-    np.testing.assert_allclose(shares, [1.0, 0.5, 1.0 / 3.0], atol=1e-9)
+    found = [made.insert(np.eye(4), cloud) for _ in range(3)]
+    np.testing.assert_allclose(found, [(1.0, 1.0), (0.5, 0.0), (1.0 / 3.0, 0.0)], atol=1e-9)
 
 
 def test_cloud_map_grows_beyond_its_first_size():
@@ -92,7 +92,9 @@ def test_cloud_map_grows_beyond_its_first_size():
     points = np.random.default_rng(6).uniform(-20.0, 20.0, (30_000, 3))
     made.insert(np.eye(4), points)
     np.testing.assert_allclose(np.sort(made.points()[:, 0])[[0, -1]], [-20.0, 20.0], atol=0.01)
-    assert made.insert(np.eye(4), points) == pytest.approx(0.5, abs=0.01)
+    share, new = made.insert(np.eye(4), points)
+    assert share == pytest.approx(0.5, abs=0.01)
+    assert new == 0.0
 
 
 def test_thin_keeps_one_point_per_cube():

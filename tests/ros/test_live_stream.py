@@ -143,7 +143,7 @@ def test_node_subscribes_as_sensor_data_but_to_tf_static(calm):
     commands = {
         "/set_pose",
         "/initialpose",
-        *(f"/skidloc/{name}" for name in ("reset", "pause", "tare_payload", "payload", "relocalize", "save_map")),
+        *(f"/skidloc/{name}" for name in ("reset", "pause", "tare_payload", "payload", "relocalize", "save_map", "load_map")),
     }
     assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf", *commands}  # unused topics cost nothing
 

@@ -119,7 +119,7 @@ def _exact_normals(*arguments: Any) -> VoxelGrid:
 
 def _align_freely(grid: VoxelGrid, points: Any, prior: Any, cov: Any, guess: Any, first: Any = None) -> Any:
     """The prior sets the reach of associations but does not pull."""
-    error = registration._prior_error_at_points(points, cov) if first is None else first
+    error = registration.prior_error_at_points(points, cov) if first is None else first
     return _align_points(grid, points, prior, _NO_PRIOR, guess, error)
 
 
