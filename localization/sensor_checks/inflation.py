@@ -37,7 +37,7 @@ class CovarianceInflation:
         self.ongoing_scene: FloatArray | None = None
         """(3,) difference of wheels and scans while objects move in these."""
         self.possible: FloatArray | None = None
-        """(3,) the same while that is not decided: no fault yet."""
+        """(3,) the same while that is not decided: no fault yet. A disagreement that lasts, and is larger, has it."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -95,8 +95,9 @@ class CovarianceInflation:
             A = se2.adjoint(se2.inverse(delta))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
-        if estimate.covariance is not None and self.possible is not None:
-            estimate = _widen(estimate, np.outer(self.possible, self.possible))
+        possible, ongoing = self.possible, self.ongoing
+        if estimate.covariance is not None and possible is not None and (ongoing is None or possible @ possible > ongoing @ ongoing):
+            estimate = _widen(estimate, np.outer(possible, possible))
         if estimate.covariance is None or not self.is_inflating:
             return estimate
         spread = self.total

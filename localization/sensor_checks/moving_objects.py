@@ -43,6 +43,8 @@ _MIN_UNSURE = 0.06
 _MIN_OFF_M, _MAX_OFF_M = 0.08, 0.25
 """Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
 from where on labels show whether they do [m]."""
+_MAX_NIS = 16.3
+"""NIS of a matched scan that contradicts the wheels: one of 1,000 by chance (chi^2 of 3 degrees of freedom)."""
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
 """Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
 Wheels that slip in a still scene explain 14 to 33 % by chance where they turn otherwise (fr079 at 168 to 185 s), else 15 to 20 %."""
@@ -62,8 +64,8 @@ class _View(NamedTuple):
     """A scan, and where it was taken by two odometries."""
 
     at_s: float
-    by_wheels: Pose2
-    by_estimate: Pose2
+    poses: FloatArray
+    """(2, 3) by the wheels, and by the estimate."""
     profile: Profile
 
 
@@ -87,17 +89,22 @@ class MovingObjects(Check):
     A scan is compared with one from before under the motion by wheels and gyro. Where one other motion explains all of it, as with wheels
     that slip, nothing is left out: the matcher finds it. Where the points that the wheels do not explain need a motion that does not
     explain those which they do, the scene has two motions, and that of the wheels is the still world's. Until that is decided, and while
-    objects move, the covariance has the distance of the estimate from the motion by wheels and gyro.
+    objects move, the covariance has the distance of the estimate from the motion by wheels and gyro; all of it since labels first showed
+    that either happens, however old the view is by now.
     """
 
     def __init__(self, faults: FaultLog, window: Window) -> None:
         self._faults, self._window = faults, window
-        self._by_wheels, self._by_estimate = np.zeros(3), np.zeros(3)
+        self._poses = np.zeros((2, 3))  # by the wheels, and by the estimate
         self._lidars: dict[str, _Lidar] = {}
         self._compared: _View | None = None
         """With which the last scan was compared."""
         self._is_unsure = False
         """Objects may move, or the wheels slip."""
+        self._suspected: _View | None = None
+        """Before labels began to show that either happens."""
+        self._suspected_s = -math.inf
+        """Time of the last labels that showed it [s]."""
         self._since: _View | None = None
         """Before objects began to move."""
         self._explained: tuple[Fault, ...] = ()
@@ -118,7 +125,9 @@ class MovingObjects(Check):
             self._restart()
         if scan is None or not scan.is_planar or not step.has_wheels:
             return step
-        lidar = self._lidars.setdefault(scan.frame_id, _Lidar())
+        lidar = self._lidars.get(scan.frame_id)
+        if lidar is None:
+            lidar = self._lidars[scan.frame_id] = _Lidar()
         if lidar.standing is not None and not self._is_near(lidar.standing):
             lidar.standing = None
         is_due = scan is self._window.registered
@@ -136,7 +145,7 @@ class MovingObjects(Check):
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
                 step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
         if is_due:
-            view = _View(now_s, self._by_wheels, self._by_estimate, profile)
+            view = _View(now_s, self._poses.copy(), profile)
             lidar.views.append(view)
             if step.is_standing and lidar.standing is None:
                 lidar.standing = view
@@ -144,25 +153,25 @@ class MovingObjects(Check):
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
-        self._by_estimate = se2.compose(self._by_estimate, delta)
-        inflation, view = self._faults.inflation, self._compared
+        self._poses[1] = se2.compose(self._poses[1], delta)
+        inflation, view = self._faults.inflation, self._compared if self._suspected is None else self._suspected
         inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
         inflation.possible = None
-        if self._since is None and view is not None and self._is_near(view):
+        if self._since is None and view is not None and (self._suspected is not None or self._is_near(view)):
             off = self._distance(view)
-            is_off = self._is_unsure or _MIN_OFF_M < math.hypot(off[0], off[1]) < _MAX_OFF_M
+            is_off = self._is_unsure or _MIN_OFF_M < math.hypot(off[0], off[1]) < _MAX_OFF_M or (nis is not None and nis > _MAX_NIS)
             inflation.possible = off if is_off else None
 
     def _distance(self, view: _View) -> FloatArray:
         """(3,) of the motion by the wheels since ``view`` from that by the estimate."""
-        by_estimate, by_wheels = se2.between(view.by_estimate, self._by_estimate), se2.between(view.by_wheels, self._by_wheels)
-        return se2.log(se2.between(by_estimate, by_wheels))
+        by_wheels, by_estimate = se2.between(view.poses, self._poses)
+        return se2.local(by_estimate, by_wheels)
 
     def _add_motion(self, step: Step) -> None:
         delta = step.predicted.delta
         if step.turn is not None and not step.is_standing:
             delta = np.array([delta[0], delta[1], step.turn.angle])
-        self._by_wheels = se2.compose(self._by_wheels, delta)
+        self._poses[0] = se2.compose(self._poses[0], delta)
 
     def _references(self, lidar: _Lidar) -> list[_View]:
         """The oldest view from which wheels and estimate have hardly moved, and the middle one of those after it."""
@@ -174,47 +183,43 @@ class MovingObjects(Check):
         return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
 
     def _is_near(self, view: _View) -> bool:
-        for start, end in ((view.by_wheels, self._by_wheels), (view.by_estimate, self._by_estimate)):
-            x, y, turn = se2.between(start, end).tolist()
-            if math.hypot(x, y) >= _MAX_WAY_M or abs(turn) >= _MAX_TURN_RAD:
-                return False
-        return True
+        (x, y, turn), (u, v, other_turn) = se2.between(view.poses, self._poses).tolist()
+        return max(math.hypot(x, y), math.hypot(u, v)) < _MAX_WAY_M and max(abs(turn), abs(other_turn)) < _MAX_TURN_RAD
 
     def _label(self, view: _View, profile: Profile, points: Points2) -> _Comparison:
         """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``."""
-        a, b = (np.array([*p.center, 0.0]) for p in (view.profile, profile))
-
-        def of_lidar(start: Pose2, end: Pose2) -> Pose2:
-            return se2.compose(se2.compose(se2.inverse(a), se2.between(start, end)), b)
-
-        motion = refine(view.profile, points, of_lidar(view.by_wheels, self._by_wheels))
-        scene = label(view.profile, profile, points, motion)
-        return _Comparison(view, profile, points, scene, of_lidar(view.by_estimate, self._by_estimate))
+        a, b = np.append(view.profile.center, 0.0), np.append(profile.center, 0.0)
+        by_wheels, by_estimate = se2.compose(se2.compose(se2.inverse(a), se2.between(view.poses, self._poses)), b)  # of the LiDAR
+        scene = label(view.profile, profile, points, refine(view.profile, points, by_wheels))
+        return _Comparison(view, profile, points, scene, by_estimate)
 
     def _update(self, step: Step, lidar: _Lidar, found: _Comparison) -> None:
         """Whether objects move now."""
         self._compared = found.view
-        scene, now_s, is_standing = found.scene, self._faults.now_s, step.rested_s > 0.0
+        moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
         off = self._distance(found.view)
         distance = math.hypot(off[0], off[1])
         is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
-        is_moving = scene.moved_share >= _MIN_UNSURE and is_standing
-        if not is_standing and (scene.moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
+        is_moving = moved_share >= _MIN_UNSURE and is_standing
+        if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
-            is_unsure |= unique >= _KEPT_UNIQUE
+            if unique >= _KEPT_UNIQUE:
+                self._suspected, self._suspected_s = self._suspected or found.view, now_s
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
-            is_moving = unique >= least and (has_turn or scene.moved_share >= _MIN_MOVED_WITHOUT_GYRO)
-        is_moving &= scene.moved_share >= _MIN_MOVED
+            is_moving = unique >= least and (has_turn or moved_share >= _MIN_MOVED_WITHOUT_GYRO)
+        is_moving &= moved_share >= _MIN_MOVED
         lidar.shown = lidar.shown + 1 if is_moving else 0
         if is_moving:
             lidar.last_s = now_s
         again = 1 if is_standing else _AGAIN if step.turn is not None else _AGAIN_WITHOUT_GYRO
         lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
-        self._is_unsure = is_unsure
+        if now_s - self._suspected_s >= _CALM_S:
+            self._suspected = None
+        self._is_unsure = is_unsure or self._suspected is not None
         if lidar.is_active:
-            self.report.add(scene.moved_share)
-            self._since = found.view if self._since is None else self._since
+            self.report.add(moved_share)
+            self._since = self._since or self._suspected or found.view
         elif self._since is not None and not any(other.is_active for other in self._lidars.values()):
             self._end()
 
@@ -222,13 +227,13 @@ class MovingObjects(Check):
         """No objects move any more: what the estimate is off by stays."""
         if self._since is not None:
             self._faults.inflation.add(self._distance(self._since))
-            self._since = None
+            self._since = self._suspected = None
 
     def _restart(self) -> None:
         """The wheels' motion is not known: scans are compared from here on."""
         self._end()
         self._lidars.clear()
-        self._compared = None
+        self._compared = self._suspected = None
 
 
 class _Report:
