@@ -48,6 +48,7 @@ def husky(tmp_path_factory):
     return out
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("aces")
 def test_replay_aces_fused_error_is_below_each_part(aces):
     found, metrics = results(aces)

@@ -34,6 +34,7 @@ def turned(log: Log, degrees: float) -> Log:
     return log
 
 
+@pytest.mark.extended
 def test_lidar_yaw_of_180_deg_is_named_and_corrected() -> None:
     """Four scans of 80 beams a second."""
     log = opened()

@@ -37,6 +37,7 @@ def _span(seed: int, noise: float = 0.012, bias: float = 0.0) -> Span:
     return found[0]
 
 
+@pytest.mark.extended
 def test_the_slope_of_ranges_is_what_longer_ranges_do_to_the_measured_motion():
     true = (_span(0, 0.0, 0.1).measured - _span(0, 0.0, -0.1).measured) / 0.2
     slopes = np.array([s.range_slope for s in map(_span, range(40)) if s.range_slope is not None])

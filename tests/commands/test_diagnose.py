@@ -71,12 +71,13 @@ def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> No
     assert not {"diagonal_load", "track_width"} & after
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("given", "effect"),
     [
         ("vaultbot", {"payload": 8.0}),
-        pytest.param("vaultbot", {"cg_offset_x": 0.02}, marks=pytest.mark.extended),
-        pytest.param("husky_a200", {"wheel_radius_scale": 0.05}, marks=pytest.mark.extended),
+        ("vaultbot", {"cg_offset_x": 0.02}),
+        ("husky_a200", {"wheel_radius_scale": 0.05}),
     ],
 )
 def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float], tmp_path: Path) -> None:

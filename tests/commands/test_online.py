@@ -11,6 +11,7 @@ from rich.console import Console
 
 from localization.commands.online import terminal_view
 from localization.ros.diagnostics import ERROR, WARN, Status
+from tests.helpers.extended import cases
 from tests.helpers.online import LogTransport, drive_log, run_node
 
 pytestmark = pytest.mark.xdist_group("online")
@@ -33,7 +34,7 @@ def drawn(width):
     return console.file.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("width", [16, 30, 45, 80, 132, 300])
+@pytest.mark.parametrize("width", cases([16, 30, 45, 80, 132, 300], ("45",)))
 def test_terminal_view_fits_any_width_and_loses_nothing(width):
     lines = drawn(width)
     assert max(cell_len(line) for line in lines) <= width

@@ -85,6 +85,7 @@ def test_compare_numbers_are_those_of_replay(table, tmp_path):
         assert row["status"] == "ok"
 
 
+@pytest.mark.extended
 def test_compare_table_does_not_depend_on_the_processes(table, tmp_path):
     assert compare(tmp_path / "one.csv") == 0
     assert (tmp_path / "one.csv").read_bytes() == table.read_bytes()
@@ -125,6 +126,7 @@ def test_compare_again_skips_finished_logs(table, tmp_path, asked, capsys):
     assert len(asked) == 3
 
 
+@pytest.mark.extended
 def test_compare_log_under_several_names_counts_once(table, tmp_path, monkeypatch, capsys):
     copy, linked = tmp_path / "copy.mcap", tmp_path / "linked.mcap"
     copy.write_bytes(logs(3)[1].read_bytes())
@@ -137,6 +139,7 @@ def test_compare_log_under_several_names_counts_once(table, tmp_path, monkeypatc
     assert printed == [f"{other} is the same log as {first}: counted once." for other, first in zip(otherwise, logs(3), strict=True)]
 
 
+@pytest.mark.extended
 def test_compare_half_a_table_is_completed(table, tmp_path):
     lines = table.read_text().splitlines(keepends=True)
     out = tmp_path / "table.csv"
@@ -163,6 +166,7 @@ def test_compare_broken_log_is_reported_and_the_others_finished(table, tmp_path,
     assert "none of 1 logs could be compared" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.extended
 def test_compare_warnings_of_a_log_are_reported(tmp_path, capsys):
     """A truncated log counts, and is reported beside the means."""
     cut = tmp_path / "cut.mcap"
@@ -192,6 +196,7 @@ def test_compare_bug_in_one_log_does_not_stop_the_others(monkeypatch):
     assert {row["error"] for row in rows} == {"ZeroDivisionError: a bug"}
 
 
+@pytest.mark.extended
 def test_compare_worker_in_another_folder_finds_the_given_paths(tmp_path, monkeypatch):
     """As those of a cluster: log and reference are relative to the folder of the command."""
     (tmp_path / "elsewhere").mkdir()

@@ -35,7 +35,7 @@ def diagnosed(tmp_path: Path) -> Diagnosed:
 
 @pytest.mark.parametrize(
     ("cause", "size", "seed"),
-    cases(CASES, ("payload", "track_width")),
+    cases(CASES, ("payload",)),
 )
 def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, cause: str, size: float, seed: int) -> None:
     found = diagnosed({cause: size}, seed, "vaultbot")

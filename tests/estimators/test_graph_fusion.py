@@ -228,6 +228,7 @@ def test_keyframe_motion_is_that_of_one_set_of_corrections() -> None:
     assert np.abs(off).max() < 0.1 * np.abs(as_predicted).max()
 
 
+@pytest.mark.extended
 def test_graph_smoothed_has_consistent_nees() -> None:
     """The middle and the end of five drives, of 3 degrees of freedom each; slip is far less than assumed (`QUIET`)."""
     found = []

@@ -199,6 +199,7 @@ def test_node_publishes_lateral_velocity_corrections_and_diagnostics(followed):
     assert float(last["skidloc: lidar"]["nis_mean"]) < 8.0
 
 
+@pytest.mark.extended
 def test_node_without_a_robot_reports_where_it_listens_and_ends():
     """By SIGTERM, in the domain of ROS's environment."""
     node = start_node("--node.wait-s", "0.5")

@@ -153,6 +153,7 @@ def test_doctor_explained_drive_names_contradictions_as_well(tmp_path: Path) -> 
     assert "of standing by the wheels" in status.message
 
 
+@pytest.mark.extended
 def test_doctor_unexplained_drive_gets_no_remedy(tmp_path: Path) -> None:
     """A left tyre that loses 4 % of its radius as the robot drives is in no catalogue: nothing is to be set in its place."""
     robot = load_robot("husky_a200")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import sys
 from numba.core.registry import CPUDispatcher
@@ -38,6 +40,7 @@ for estimator, model in (("ekf", "skid_steer"), ("graph", "friction")):
 """
 
 
+@pytest.mark.extended
 def test_node_compiles_nothing_after_the_warm_up():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr

@@ -82,7 +82,9 @@ def test_live_node_gives_the_numbers_of_a_replay(calm):
     assert node.warnings() == []
 
 
-@pytest.mark.parametrize("topic", ["/scan", "/joint_states", "/imu/data"])
+@pytest.mark.parametrize(
+    "topic", ["/scan", pytest.param("/joint_states", marks=pytest.mark.extended), pytest.param("/imu/data", marks=pytest.mark.extended)]
+)
 def test_live_node_old_first_message_is_as_a_lost_one(topic):
     """As a latched topic or a driver's buffer sends it."""
 
@@ -148,7 +150,10 @@ def test_node_subscribes_as_sensor_data_but_to_tf_static(calm):
     assert calm[0].kept == {"/joint_states", "/scan", "/imu/data", "/tf_static", "/tf", *commands}  # unused topics cost nothing
 
 
-@pytest.mark.parametrize(("estimator", "seed"), [("ekf", 0), ("ekf", 1), ("graph", 2)])
+@pytest.mark.parametrize(
+    ("estimator", "seed"),
+    [("ekf", 0), pytest.param("ekf", 1, marks=pytest.mark.extended), pytest.param("graph", 2, marks=pytest.mark.extended)],
+)
 def test_lost_doubled_and_late_messages_move_the_pose_within_sigma(estimator, seed):
     faulty = LogTransport(drive_log(), lambda messages: shaken(messages, seed))
     node, _ = run_node(faulty, estimator)
@@ -201,7 +206,7 @@ def test_clock_jump_of_all_sensors_moves_the_pose_within_sigma(jump_s, calm):
     assert np.all(np.abs(_wrapped(found[0] - truth[0])) < most)
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+@pytest.mark.parametrize("estimator", ["ekf", pytest.param("graph", marks=pytest.mark.extended)])
 def test_burst_after_a_silent_network_leaves_the_clocks(estimator):
     """For six seconds nothing comes, then all that its queues could keep: of wheels and IMU the newer half."""
 

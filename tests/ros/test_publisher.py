@@ -39,7 +39,7 @@ def driven(tmp_path_factory):
     return drive
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+@pytest.mark.parametrize("estimator", ["ekf", pytest.param("graph", marks=pytest.mark.extended)])
 def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator, driven):
     stamps = np.array([stamp_of(m) for m in published(driven(estimator, True)[0], PREDICTED_ODOMETRY)])
     assert (np.diff(stamps) > 0).all()
@@ -49,7 +49,7 @@ def test_odometry_is_published_at_the_rate_of_the_wheels_in_order(estimator, dri
     assert len(stamps) > 3 * len(published(driven(estimator, False)[0], ODOMETRY))
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+@pytest.mark.parametrize("estimator", ["ekf", pytest.param("graph", marks=pytest.mark.extended)])
 def test_estimates_are_the_same_to_the_last_bit_with_prediction(estimator, driven):
     with_prediction, without = (track(driven(estimator, predict)[0]) for predict in (True, False))
     assert list(with_prediction) == list(without)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 CODE = """
 import signal, sys
 from localization.ros.node import StopSignal
@@ -28,6 +30,7 @@ print("awake")
 """
 
 
+@pytest.mark.extended
 def test_signal_at_any_line_of_a_sleep_does_not_block_it() -> None:
     """`Event.set` in a signal's handler waits forever where the signal came while `Event.wait` held its lock."""
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=60)

@@ -29,6 +29,7 @@ def tilted(pitch, scans: int = 24) -> LidarTilt:
     return found
 
 
+@pytest.mark.extended
 def test_lidar_tilt_of_tilted_clouds_is_reported() -> None:
     assert tilted(lambda k: math.radians(0.4)).warnings() == []
     (note,) = tilted(lambda k: math.radians(3.0)).warnings()

@@ -26,13 +26,13 @@ TURNS_DIFFER = DIFFERENCES[GYRO_WHEELS]
 ROBOTS = ("vaultbot", "husky_a200", "jackal", "pioneer_3at", "leo", "rosbot")
 
 
-@pytest.mark.parametrize("robot", cases(ROBOTS, usual=["husky_a200", "vaultbot"]))
+@pytest.mark.parametrize("robot", cases(ROBOTS, usual=["husky_a200"]))
 @pytest.mark.parametrize("model", cases(["skid_steer", "diff_drive"], usual=["skid_steer"]))
 def test_healthy_drive_is_not_reported(robot: str, model: str) -> None:
     assert run(without_lidar(robot), None, model).warnings == []
 
 
-@pytest.mark.parametrize("name", cases(faults_of_turns(), usual=["gyro saturated at 20 deg/s", "left ticks lost"]))
+@pytest.mark.parametrize("name", cases(faults_of_turns(), usual=["gyro saturated at 20 deg/s"]))
 def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> None:
     drive = without_lidar("husky_a200")
     outcome = run(drive, faults_of_turns(upright_axis(drive))[name], "skid_steer")
@@ -51,7 +51,7 @@ def test_wrong_stamps_of_scans_are_reported_and_in_the_covariance(name: str) -> 
     assert not outcome.is_silent
 
 
-@pytest.mark.parametrize("number", cases(range(3), usual=["0"]))
+@pytest.mark.parametrize("number", cases(range(3), usual=[]))
 def test_healthy_tour_of_a_room_is_not_reported(number: int) -> None:
     assert run(in_room(number)).warnings == []
 

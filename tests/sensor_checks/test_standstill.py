@@ -132,7 +132,7 @@ def test_unknown_wheels_of_a_fast_robot_are_as_fast() -> None:
     assert math.sqrt(total) == pytest.approx(1.5 * 2.0, rel=0.05)
 
 
-@pytest.mark.parametrize("parked_s", [0.0, 30.0])
+@pytest.mark.parametrize("parked_s", [0.0, pytest.param(30.0, marks=pytest.mark.extended)])
 def test_dead_encoders_lose_no_scan(parked_s: float) -> None:
     """Wheels read zero from 5 s on, with or without a time in which the robot is parked: matched scans measure the pose all the while."""
     walls = np.vstack([world.box(-4, -3, 6, 5), world.box(1.0, 1.5, 2.0, 2.2)])

@@ -21,6 +21,7 @@ def test_ekf_in_unknown_building_stays_within_30_cm(name: str, seconds: float, m
     assert not run.lidar.is_long
 
 
+@pytest.mark.extended
 def test_wheels_alone_in_csail_err_by_metres() -> None:
     """The bounds above are not those of the wheels: the log is hard."""
     drive = BUILDINGS["csail"].open()

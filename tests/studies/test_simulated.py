@@ -71,6 +71,7 @@ def test_skid_steer_on_gentle_arcs_does_not_win(drives):
         assert drives[trajectory].wins("simulated") <= 4
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("simulated_controllers")
 def test_controller_scores_have_the_size_of_table_5_2(drives):
     rotate = drives["rotate"]
