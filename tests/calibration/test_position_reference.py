@@ -118,7 +118,7 @@ def test_positions_of_metres_are_refused_with_the_length_that_they_need() -> Non
         _fitted(1, sigma_m=1.0, duration_s=60.0)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_intervals_of_positions_alone_hold_the_truth_as_often_as_claimed() -> None:
     """95 % intervals over 30 drives: of each parameter at least 24 hold, which binomial numbers miss once in 3,000."""
     errors = [_errors(_fitted(seed)) for seed in range(30)]

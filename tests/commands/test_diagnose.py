@@ -76,8 +76,8 @@ def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> No
     ("given", "effect"),
     [
         ("vaultbot", {"payload": 8.0}),
-        ("vaultbot", {"cg_offset_x": 0.02}),
-        ("husky_a200", {"wheel_radius_scale": 0.05}),
+        pytest.param("vaultbot", {"cg_offset_x": 0.02}, marks=pytest.mark.slow),
+        pytest.param("husky_a200", {"wheel_radius_scale": 0.05}, marks=pytest.mark.slow),
     ],
 )
 def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float], tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float]
     assert errors["after"] < 0.6 * errors["before"]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """diff_drive has no parameter for either: the file's [geometry] and [clock] hold them for every model."""
     log = bag(tmp_path / "drive.mcap", {"wheel_radius_difference": 0.04, "wheel_time_offset": 0.06}, 1, "husky_a200")

@@ -33,9 +33,16 @@ def diagnosed(tmp_path: Path) -> Diagnosed:
     return run
 
 
+OF_EACH_SENSOR = ("payload", "track_width", "lidar_yaw", "cg_offset_x", "gyro_scale", "wheel_radius_scale", "slope")
+"""Causes of wheels, LiDAR, gyro, load and ground; the others are slow."""
+
+
 @pytest.mark.parametrize(
     ("cause", "size", "seed"),
-    cases(CASES, ("payload",)),
+    [
+        *cases([case for case in CASES if case[0] in OF_EACH_SENSOR], ("payload",)),
+        *cases([case for case in CASES if case[0] not in OF_EACH_SENSOR], (), others=pytest.mark.slow),
+    ],
 )
 def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, cause: str, size: float, seed: int) -> None:
     found = diagnosed({cause: size}, seed, "vaultbot")
@@ -67,9 +74,9 @@ def test_diagnose_nothing_hidden_finds_nothing(diagnosed: Diagnosed, robot: str,
     ("true", "file", "route"),
     [
         ("vaultbot", "vaultbot_thesis", "tour"),
-        ("vaultbot_thesis", "vaultbot", "tour"),
-        ("husky_a200", "husky_a200_thesis", "random_4"),
-        ("husky_a200_thesis", "husky_a200", "random_4"),
+        pytest.param("vaultbot_thesis", "vaultbot", "tour", marks=pytest.mark.slow),
+        pytest.param("husky_a200", "husky_a200_thesis", "random_4", marks=pytest.mark.slow),
+        pytest.param("husky_a200_thesis", "husky_a200", "random_4", marks=pytest.mark.slow),
     ],
 )
 def test_diagnose_other_contact_law_is_named(diagnosed: Diagnosed, true: str, file: str, route: str) -> None:
@@ -184,7 +191,7 @@ def test_diagnose_nonlinear_cause_has_its_size(diagnosed: Diagnosed) -> None:
     assert len(found.findings) == 1
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_wet_patch_is_unexplained(diagnosed: Diagnosed) -> None:
     found = diagnosed({}, 433, route="slippery_patch")
     assert found.verdict == "unexplained"

@@ -49,7 +49,7 @@ def test_space_fusion_without_matches_is_by_wheels_gyro_and_gravity(rolled, amon
     assert pipeline.lidar.share == pytest.approx(1.0)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_space_fusion_over_seeds_has_the_nees_of_its_six_dimensions():
     """Biases of accelerometer and gyro, noise, scene and way differ. At the end of eight drives: chi-square with 48 degrees of freedom is
     between 26 and 79 in 99 %."""

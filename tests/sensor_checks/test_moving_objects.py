@@ -60,7 +60,13 @@ def test_people_who_walk_along_have_another_motion_than_the_room() -> None:
     assert np.hypot(*rest[:2]) < 0.15  # as if the robot stood
 
 
-@pytest.mark.parametrize("name", cases(SCENES, usual=["12 people walk off"]))
+@pytest.mark.parametrize(
+    "name",
+    [
+        *cases(["12 people walk off", "lift"], usual=["12 people walk off"]),
+        *cases([n for n in SCENES if n not in ("12 people walk off", "lift")], [], others=pytest.mark.slow),
+    ],
+)
 def test_scene_that_moves_is_in_the_covariance(name: str) -> None:
     drive = SCENES[name](0)
     if name == "12 people walk off":  # within the first seconds
