@@ -89,8 +89,7 @@ class MovingObjects(Check):
     A scan is compared with one from before under the motion by wheels and gyro. Where one other motion explains all of it, as with wheels
     that slip, nothing is left out: the matcher finds it. Where the points that the wheels do not explain need a motion that does not
     explain those which they do, the scene has two motions, and that of the wheels is the still world's. Until that is decided, and while
-    objects move, the covariance has the distance of the estimate from the motion by wheels and gyro; all of it since labels first showed
-    that either happens, however old the view is by now.
+    objects move, the covariance has the distance of the estimate from the motion by wheels and gyro, since labels showed it first.
     """
 
     def __init__(self, faults: FaultLog, window: Window) -> None:
@@ -125,9 +124,7 @@ class MovingObjects(Check):
             self._restart()
         if scan is None or not scan.is_planar or not step.has_wheels:
             return step
-        lidar = self._lidars.get(scan.frame_id)
-        if lidar is None:
-            lidar = self._lidars[scan.frame_id] = _Lidar()
+        lidar = self._lidars.setdefault(scan.frame_id, _Lidar())
         if lidar.standing is not None and not self._is_near(lidar.standing):
             lidar.standing = None
         is_due = scan is self._window.registered
@@ -197,8 +194,7 @@ class MovingObjects(Check):
         """Whether objects move now."""
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        off = self._distance(found.view)
-        distance = math.hypot(off[0], off[1])
+        distance = math.hypot(*self._distance(found.view)[:2])
         is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
         is_moving = moved_share >= _MIN_UNSURE and is_standing
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
