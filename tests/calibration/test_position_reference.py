@@ -200,7 +200,10 @@ def test_fixes_calibrate_and_diagnose_by_the_command_line(tmp_path: Path) -> Non
     found = json.loads((tmp_path / "calibrate.json").read_text())["parameters"]
     assert "lidar_offset_x" not in found
     assert found["k_0"]["value"] == pytest.approx(0.55, abs=3.0 * found["k_0"]["sigma"])
+    wide = tmp_path / "wide.toml"
+    wide.write_text(ROBOT_TOML.read_text().replace("wheel_radius_m = 0.165", "wheel_radius_m = 0.1733"))
+    common[2] = str(wide)
     assert main(["diagnose", *common, str(tmp_path / "diagnose.json")]) == 0
     (finding,) = json.loads((tmp_path / "diagnose.json").read_text())["findings"]
-    assert finding["cause"] == "longitudinal_slip_turning"  # as by the poses of /ground_truth/odom
-    assert finding["size"] == pytest.approx(-0.0756, abs=0.03)
+    assert finding["cause"] == "wheel_radius_scale"
+    assert finding["size"] == pytest.approx(0.165 / 0.1733 - 1.0, abs=3.0 * finding["sigma"])
