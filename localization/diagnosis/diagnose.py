@@ -232,6 +232,8 @@ def _p_value(linearization: Linearization, others: tuple[int, ...], i: int, rng:
 def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> DiagnosisResult:
     """Findings, the table with its attributions, and the verdict that follows from it."""
     predictor, first, linearization, error = searched
+    if error.is_shown:  # also about the best causes, not by the bent signature of a large one
+        error = find_model_error(predictor, linearization)
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
     reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
     excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
