@@ -52,10 +52,12 @@ def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[i
     tables and short drives."""
     if predictor.drive.kind != "log" or len(predictor.drive.maneuvers) < _FEWEST_WINDOWS:
         return ()
-    least = _cost(state, chosen)
+    least, spells = _cost(state, chosen), _spells(predictor)
     options: dict[str, _Option] = {}
-    bases = {(), chosen, *(tuple(j for j in chosen if j != i) for i in chosen)}
-    for option in itertools.chain.from_iterable(_options(predictor, state, base, _spells(predictor)) for base in sorted(bases)):
+    bases = sorted({(), chosen, *(tuple(j for j in chosen if j != i) for i in chosen)})
+    tried = [i for i, c in enumerate(state.causes) if c.id not in _OF_WHOLE_DRIVES and c.spell is None]
+    gains = spell_gains(predictor, state, bases, tried, spells)
+    for option in itertools.chain.from_iterable(_options(state, b, tried, spells, g) for b, g in zip(bases, gains, strict=True)):
         name = state.causes[option.cause].id
         if option.cost < min(least - _MARGIN, options[name].cost if name in options else math.inf):
             options[name] = option
@@ -88,48 +90,52 @@ def _spells(predictor: DrivePredictor) -> list[Spell]:
     return one + [Spell(float(starts[i]), float(starts[j])) for i, j in pairs if j - i >= _FEWEST_INSIDE]
 
 
-def _options(predictor: DrivePredictor, state: Linearization, base: tuple[int, ...], spells: Sequence[Spell]) -> list[_Option]:
-    """The best part of the drive for each cause beside those of ``base``."""
+def _options(
+    state: Linearization, base: tuple[int, ...], tried: Sequence[int], spells: Sequence[Spell], gains: FloatArray
+) -> list[_Option]:
+    """The best part of the drive for each cause beside those of ``base``, by the ``gains`` (tried, spells)."""
     problem, causes = state.problem, state.causes
     groups = {causes[i].group for i in base}
-    tried = [i for i, c in enumerate(causes) if c.id not in _OF_WHOLE_DRIVES and c.group not in groups and c.spell is None]
     log_n = math.log(max(problem.count, 2))
     parts = np.array([1.0 + (s.start_s > 0.0 and math.isfinite(s.end_s)) for s in spells])
     prices = 2.0 * math.log(len(spells)) + log_n * parts
-    gains = spell_gains(predictor, state, base, tried, spells)
     before = price(problem.count, len({c.group for c in causes}), len(base) + 1) - problem.gain(base)
     found = []
     for i, row in zip(tried, gains, strict=True):
-        best = int(np.argmin(prices - row))
-        found.append(_Option(before + float(prices[best] - row[best]), i, spells[best]))
+        if causes[i].group not in groups:
+            best = int(np.argmin(prices - row))
+            found.append(_Option(before + float(prices[best] - row[best]), i, spells[best]))
     return found
 
 
 def spell_gains(
-    predictor: DrivePredictor, state: Linearization, base: tuple[int, ...], tried: Sequence[int], spells: Sequence[Spell]
+    predictor: DrivePredictor, state: Linearization, bases: Sequence[tuple[int, ...]], tried: Sequence[int], spells: Sequence[Spell]
 ) -> FloatArray:
-    """(causes, spells) twice the log-evidence that each cause ``tried`` gains in each part of the drive, beside the causes ``base``; sizes
-    beyond its bounds gain nothing."""
+    """(bases, tried, spells) twice the log-evidence that each cause ``tried`` gains in each part of the drive, beside the causes of each of
+    ``bases``; sizes beyond its bounds gain nothing."""
     problem, noise = state.problem, state.noise
     shares = np.array([s.share(*predictor.window_times_s) for s in spells])
     S = noise.whiten(state.signatures).reshape(-1, len(state.causes)) * problem.scale
     y, z = noise.whiten(state.linear).ravel(), noise.whiten(state.nuisances).reshape(S.shape[0], -1)
     without = without_nuisances(z)
     measured, y, S = len(y), without(y), without(S)
-    variances = np.square(problem.tolerance)
-    variances[list(base)] = 1.0
-    A = S.T @ S + np.diag(1.0 / variances)
-    left = y - S @ np.linalg.solve(A, S.T @ y)
-    gains = np.zeros((len(tried), len(spells)))
-    for row, i in zip(gains, tried, strict=True):
+    fits = []
+    for base in bases:
+        variances = np.square(problem.tolerance)
+        variances[list(base)] = 1.0
+        A = S.T @ S + np.diag(1.0 / variances)
+        fits.append((A, y - S @ np.linalg.solve(A, S.T @ y)))
+    gains = np.zeros((len(bases), len(tried), len(spells)))
+    for k, i in enumerate(tried):
         columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, :]).reshape(measured, -1) * problem.scale[i]
         columns = without(columns)
-        u = columns.T @ left
-        v = np.sum(columns**2, axis=0) - np.sum((S.T @ columns) * np.linalg.solve(A, S.T @ columns), axis=0)
-        v = np.maximum(v, 0.0)
-        sizes = u / (v + 1.0) * problem.scale[i]
+        squares, shared = np.sum(columns**2, axis=0), S.T @ columns
         low, high = state.causes[i].bounds
-        row[:] = np.where((sizes >= low) & (sizes <= high), u**2 / (v + 1.0) - np.log1p(v), 0.0)
+        for row, (A, left) in zip(gains[:, k], fits, strict=True):
+            u = columns.T @ left
+            v = np.maximum(squares - np.sum(shared * np.linalg.solve(A, shared), axis=0), 0.0)
+            sizes = u / (v + 1.0) * problem.scale[i]
+            row[:] = np.where((sizes >= low) & (sizes <= high), u**2 / (v + 1.0) - np.log1p(v), 0.0)
     return gains
 
 
@@ -170,7 +176,7 @@ def _located(predictor: DrivePredictor, state: Linearization, others: tuple[int,
             continue
         moments = grid[grid < spell.end_s] if name == "start_s" else grid[grid > spell.start_s]
         tried = [spell._replace(**{name: float(t)}) for t in moments]
-        gains = spell_gains(predictor, state, others, [whole], tried)[0]
+        gains = spell_gains(predictor, state, [others], [whole], tried)[0, 0]
         weights = np.exp(0.5 * (gains - gains.max())) * np.gradient(moments)
         cumulative = np.cumsum(weights) / weights.sum()
         low, high = (float(moments[int(np.searchsorted(cumulative, q))]) for q in (_TAIL, 1.0 - _TAIL))
