@@ -6,11 +6,12 @@ never changed after they are made. The constructors raise `EventError` for array
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.errors import EventError
 from motion_models import se2
@@ -86,6 +87,10 @@ class Scan:
     def times_from_middle(self) -> FloatArray:
         """(N,) time of each point after the middle of the scan duration [s], or (0,) where the log has none."""
         return self.offsets - self.middle_s if len(self.offsets) else self.offsets
+
+    def select(self, kept: NDArray[np.bool_]) -> Scan:
+        """The scan with the points ``kept`` (N,) alone."""
+        return replace(self, points=self.points[kept], offsets=self.offsets[kept] if len(self.offsets) else self.offsets)
 
     def __post_init__(self) -> None:
         rows = np.shape(self.points)[:1]

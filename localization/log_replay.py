@@ -1,4 +1,4 @@
-"""A whole log through pipelines: every trial sees the same events in the same order, and each gives a `Run`."""
+"""A whole log through pipelines: every trial processes the same events in the same order, and returns a `Run`."""
 
 from __future__ import annotations
 

@@ -22,15 +22,14 @@ from motion_models.se2 import FloatArray
 _CELLS = (2, 3, 4)
 """Patches of floor along each side of the area that was driven, in grids."""
 _MIN_SIDE_M = 1.0
-"""Of an area in which places can be told apart."""
+"""Longer side of an area in which places can be distinguished [m]."""
 _MIN_TURNS = 3.0
-"""Of a wheel in the drive, for its angle to be told from time."""
+"""Turns of a wheel in a drive from which on effects of its angle can be separated from those of time."""
 _MIN_TILT_M_S2 = 0.05
 """Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
 _WARM_UP_SHARE = 0.25
 """Time constant of what warms up, over the drive's length."""
 _GRAVITY = 9.81
-_TWIST_UNITS = ("m/s", "m/s", "rad/s")
 _PRICE = 3.0
 """Of an effect that holds in this drive alone, in twice the log-odds beside terms."""
 
@@ -71,8 +70,7 @@ def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[FloatA
     table = np.column_stack([values for _, values in densities]) if densities else np.zeros((len(twist), 0))
     columns = np.zeros((len(batch.ends), len(CHANNELS), len(densities)))
     axes = [("vx", "vy", "wz").index(shape.component) for shape, _ in densities]
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
+    for i, inside in enumerate(batch.intervals()):
         moved = moved_by(twist[inside], batch.dt[inside], table[inside] * batch.dt[inside, None])
         columns[i, :3] = moved[:, axes, np.arange(len(densities))]
     return columns, [shape for shape, _ in densities]
@@ -225,8 +223,7 @@ def _means(predictor: DrivePredictor, twist: FloatArray) -> dict[str, FloatArray
     change = np.divide(np.diff(v, prepend=v[:1]), dt, out=np.zeros_like(v), where=dt > 0.0)
     parts = {"wz": wz, "dv": change, "vwz": v * wz, "|wz|": np.abs(wz), "wz|wz|": wz * np.abs(wz), "wz^2": wz**2, "|v|": np.abs(v)}
     found = {name: np.zeros(len(batch.ends)) for name in (*parts, "seconds")}
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
+    for i, inside in enumerate(batch.intervals()):
         weights = batch.dt[inside]
         found["seconds"][i] = weights.sum()
         for name, values in parts.items():

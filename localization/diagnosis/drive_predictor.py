@@ -365,8 +365,7 @@ def slip_columns(predictor: DrivePredictor) -> FloatArray:
     """
     batch, g = predictor.batch, predictor.drive.robot.geometry
     found = np.zeros((len(batch.ends), len(CHANNELS), 3 * _KINDS))
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
+    for i, inside in enumerate(batch.intervals()):
         ways = batch.wheels[inside] * batch.dt[inside, None] * g.wheel_radius_m
         direction = np.arctan2(ways[:, 1] - ways[:, 0], ways[:, 0] + ways[:, 1]) * (_KINDS / (2.0 * math.pi))
         apart = (direction[:, None] - np.arange(_KINDS) + 0.5 * _KINDS) % _KINDS - 0.5 * _KINDS
@@ -395,8 +394,7 @@ def give_columns(predictor: DrivePredictor) -> FloatArray:
     """(M, 6, 2) motion by contacts that give way while speed and turning rate change, for `_GIVE_S` seconds of the change."""
     batch, twist = predictor.batch, predictor.nominal_twist
     found = np.zeros((len(batch.ends), len(CHANNELS), 2))
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
+    for i, inside in enumerate(batch.intervals()):
         gains = np.diff(twist[inside], axis=0, prepend=twist[inside][:1])[:, [0, 2]] * _GIVE_S
         moved = moved_by(twist[inside], batch.dt[inside], gains)
         found[i, :3] = np.column_stack([moved[:, 0, 0], moved[:, 2, 1]])

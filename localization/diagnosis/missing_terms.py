@@ -152,8 +152,7 @@ def term_columns(
     expressions = list(dict.fromkeys(c.expression for c in candidates))
     shapes = np.column_stack([e.evaluate(values)[0] for e in expressions])
     moved = np.zeros((len(batch.ends), 3, 3, len(expressions)))
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
+    for i, inside in enumerate(batch.intervals()):
         moved[i] = moved_by(path[inside], batch.dt[inside], shapes[inside] * batch.dt[inside, None])
     columns = np.full((len(batch.ends), len(CHANNELS), len(candidates)), 0.0)
     for k, candidate in enumerate(candidates):

@@ -30,7 +30,8 @@ _MAX_LOG_ODDS = 7.0
 MuJoCo's contacts 74."""
 _MAX_SHARE = 0.01
 """Largest sigma of slips that a diagnosis tolerates, over the wheels' way; larger ones are an effect without a name."""
-_CG = ("cg_offset_x", "cg_offset_y")
+CG_OFFSETS = ("cg_offset_x", "cg_offset_y")
+"""Causes that move the centre of gravity, along x and y."""
 _LEAST_LEVER_M = 0.05
 _CG_SIGMA_SHARE, _MODEL_ERROR_SHARE = 0.25, 0.22
 _SHARES = np.geomspace(1e-3, 0.2, 20)
@@ -55,8 +56,12 @@ class ModelError(NamedTuple):
         """That the model does not describe the drive, in a sentence."""
         if not self.is_shown:
             return ()
-        gain = f"log-likelihood +{0.5 * self.log_odds:.0f}"
-        return (f"the contacts of this robot are not those of the friction model ({gain}): sizes have that error in their intervals.",)
+        return (f"the contacts of this robot are not those of the friction model ({self.gain}): sizes have that error in their intervals.",)
+
+    @property
+    def gain(self) -> str:
+        """What they gain, in words."""
+        return f"log-likelihood +{0.5 * self.log_odds:.0f}"
 
 
 def find_model_error(predictor: DrivePredictor, linearization: Linearization) -> ModelError:
@@ -99,15 +104,15 @@ def size_error(predictor: DrivePredictor, cause: Cause) -> float:
     """Error of a size where the friction model does not describe the drive, for loads: how far they move the centre of rotation depends on
     the contacts. In the cause's unit; 0 for others."""
     sigmas = cg_error_sigmas(predictor.drive.robot)
-    if cause.id in _CG:
-        return float(sigmas[_CG.index(cause.id)])
+    if cause.id in CG_OFFSETS:
+        return float(sigmas[CG_OFFSETS.index(cause.id)])
     arms = predictor.drive.payload_arms
     if cause.id != "payload" or not len(arms):
         return 0.0
     lever = np.mean(arms, axis=0)  # of a load m on a robot of mass M, the centre of gravity moves by m lever / (M + m)
-    direction = lever / max(float(np.linalg.norm(lever)), _LEAST_LEVER_M)
-    along = float(np.linalg.norm(direction * sigmas))
-    return predictor.drive.robot.geometry.mass_kg * along / max(float(np.linalg.norm(lever)), _LEAST_LEVER_M)
+    length = max(float(np.linalg.norm(lever)), _LEAST_LEVER_M)
+    along = float(np.linalg.norm(lever / length * sigmas))
+    return predictor.drive.robot.geometry.mass_kg * along / length
 
 
 def _twice_log_evidence(y: FloatArray, columns: FloatArray) -> float:

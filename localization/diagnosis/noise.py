@@ -82,9 +82,8 @@ class Noise:
 def variance_regressors(batch: Batch, wheel_radius: float, track: float) -> FloatArray:
     """(M, 3) what variances may grow with: constant, metres driven, radians by the wheels' difference."""
     driven, turned = np.zeros(len(batch.ends)), np.zeros(len(batch.ends))
-    for i, (end, owner) in enumerate(zip(batch.ends, batch.owner, strict=True)):
-        a = batch.first[owner] + batch.lead[owner]
-        ways = batch.wheels[a:end] * batch.dt[a:end, None] * wheel_radius
+    for i, inside in enumerate(batch.intervals()):
+        ways = batch.wheels[inside] * batch.dt[inside, None] * wheel_radius
         driven[i] = np.abs(ways.mean(axis=1)).sum()
         turned[i] = np.abs(ways[:, 1] - ways[:, 0]).sum() / track
     return np.column_stack([np.ones(len(driven)), driven, turned])

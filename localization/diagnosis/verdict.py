@@ -458,7 +458,7 @@ def _candidate_drives(predictor: DrivePredictor) -> Iterator[tuple[str, DrivePre
 
 
 def model_error_advice(findings: Sequence[Finding]) -> str:
-    """What to drive where the friction model does not describe the contacts: what tells its errors from the robot's."""
+    """What to drive where the friction model does not describe the contacts: what separates its errors from the robot's."""
     if any(f.cause in _LOADS for f in findings):
         return "Record a second drive with a known load: it shows how far a load moves this robot's centre of rotation."
     return "Record two minutes of arcs and turns of the healthy robot, and name them by --healthy: smaller faults will show beside them."

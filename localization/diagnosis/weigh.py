@@ -27,7 +27,7 @@ from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
-from localization.diagnosis.model_error import cg_error_sigmas, cg_prior_sigmas, find_model_error
+from localization.diagnosis.model_error import CG_OFFSETS, cg_error_sigmas, cg_prior_sigmas, find_model_error
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
@@ -37,7 +37,6 @@ from motion_models.se2 import FloatArray
 MIN_TURN_RAD = 2.0 * math.pi
 """Least turning, by the difference of the wheels: below it the sigma of the CG comes from the prior."""
 MIN_WINDOWS = 8
-_CG = ("cg_offset_x", "cg_offset_y")
 PRIOR_SIGMAS: Mapping[str, float] = {
     "wheel_radius_scale": 0.02,
     "wheel_radius_difference": 0.005,
@@ -113,7 +112,7 @@ class DrivenWeighing:
     @property
     def sizes(self) -> dict[Cause, float]:
         """The offset as sizes of causes, to correct a robot by."""
-        return {CAUSES[name]: float(size) for name, size in zip(_CG, self.offset, strict=True)}
+        return {CAUSES[name]: float(size) for name, size in zip(CG_OFFSETS, self.offset, strict=True)}
 
     @property
     def sigmas(self) -> FloatArray:
@@ -208,7 +207,7 @@ def estimate_map(predictor: DrivePredictor, causes: tuple[Cause, ...]) -> MapEst
     """All ``causes`` together, by Gauss-Newton on the drive of ``predictor``; their `Cause.plausible` are the priors' sigmas."""
     values, everything = np.zeros(len(causes)), tuple(range(len(causes)))
     scrub = next((i for i, cause in enumerate(causes) if cause.id == "scrub"), None)
-    is_cg = np.array([cause.id in _CG for cause in causes])
+    is_cg = np.array([cause.id in CG_OFFSETS for cause in causes])
     for _ in range(_ROUNDS):
         linearization = linearize(predictor, causes, dict(zip(causes, values.tolist(), strict=True)), tolerance=1.0)
         wanted, cov, _ = linearization.problem.fit(everything)
@@ -254,7 +253,7 @@ def _causes(predictor: DrivePredictor, robot: Robot) -> tuple[Cause, ...]:
     shown = candidate_causes(predictor, moments=0)
     stiffness = dataclasses.replace(slip_stiffness_cause(robot), prior_sigma=_SLIP_STIFFNESS_SIGMA)
     others = [dataclasses.replace(c, prior_sigma=PRIOR_SIGMAS[c.id]) for c in shown if c.id in PRIOR_SIGMAS]
-    return (*(dataclasses.replace(CAUSES[name], prior_sigma=s) for name, s in zip(_CG, cg, strict=True)), *others, stiffness)
+    return (*(dataclasses.replace(CAUSES[name], prior_sigma=s) for name, s in zip(CG_OFFSETS, cg, strict=True)), *others, stiffness)
 
 
 def _truncated(mean: FloatArray, cov: FloatArray, i: int, least: float) -> tuple[FloatArray, FloatArray]:
@@ -279,7 +278,7 @@ def _student_factor(linearization: Linearization) -> float:
 
 def _limited(step: FloatArray, causes: tuple[Cause, ...]) -> tuple[FloatArray, float]:
     """``step`` (p,) of Gauss-Newton shortened to where the friction model is about linear in the CG, and its share of the whole."""
-    limits = np.array([(_MAX_CG_STEP if cause.id in _CG else 1.0) * cause.plausible for cause in causes])
+    limits = np.array([(_MAX_CG_STEP if cause.id in CG_OFFSETS else 1.0) * cause.plausible for cause in causes])
     share = min(1.0, float(np.min(limits / np.maximum(np.abs(step), 1e-12))))
     return share * step, share
 
@@ -291,8 +290,8 @@ def _held(values: FloatArray, causes: tuple[Cause, ...], predictor: DrivePredict
     held = np.clip(values, *(sign * _MAX_PRIOR_SIGMAS * np.array([cause.plausible for cause in causes]) for sign in (-1.0, 1.0)))
     held = np.clip(held, *np.array([cause.limits for cause in causes]).T)
     for i, cause in enumerate(causes):
-        if cause.id in _CG:
-            axis = _CG.index(cause.id)
+        if cause.id in CG_OFFSETS:
+            axis = CG_OFFSETS.index(cause.id)
             held[i] = np.clip(given[axis] + values[i], -edge[axis], edge[axis]) - given[axis]
         elif cause.id == STIFFNESS_EXPONENT:
             held[i] = np.clip(values[i], 0.0, 1.0)
@@ -311,9 +310,8 @@ def _model_errors(predictor: DrivePredictor, estimate: MapEstimate, noise_ratio:
     found = []
     error = find_model_error(predictor, estimate.linearization)
     if error.is_shown:
-        gain = f"log-likelihood +{0.5 * error.log_odds:.0f}"
-        found.append(f"the robot does not turn as the friction model has it, alike in all motions of one kind ({gain}).")
-    sizes = {c: v / c.plausible for c, v in zip(estimate.causes, estimate.sizes.tolist(), strict=True) if c.id not in _CG}
+        found.append(f"the robot does not turn as the friction model has it, alike in all motions of one kind ({error.gain}).")
+    sizes = {c: v / c.plausible for c, v in zip(estimate.causes, estimate.sizes.tolist(), strict=True) if c.id not in CG_OFFSETS}
     far = [f"{c.id} {v * c.plausible:+.3g} ({v:+.1f} sigma)" for c, v in sizes.items() if abs(v) > _MAX_CORRECTION_SIGMAS]
     if far:
         found.append(f"{', '.join(far)}: more than robots differ by from their files; it may be a part of the load.")

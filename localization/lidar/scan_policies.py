@@ -74,7 +74,7 @@ class OpenPlace:
         """The scan at hand was not found from a wide prior: a place is still to be found."""
 
     def update(self, now_s: float, *, is_found: bool) -> None:
-        """Whether the scan at ``now_s`` [s] was matched, or its prior leaves no doubt of its place."""
+        """Whether the scan at ``now_s`` [s] was matched, or its prior is narrow enough to place it."""
         if is_found:
             self._since_s = None
         elif self._since_s is None:

@@ -25,8 +25,7 @@ def motion_in_windows(predictor: DrivePredictor) -> tuple[FloatArray, FloatArray
     """(M,) driven [m], turned [rad] and duration [s] before each measured pose, by wheels and the nominal friction model."""
     batch, twist = predictor.batch, predictor.nominal_twist
     parts = []
-    for end, owner in zip(batch.ends, batch.owner, strict=True):
-        inside = slice(batch.first[owner] + batch.lead[owner], end)
+    for inside in batch.intervals():
         moved = twist[inside].T @ batch.dt[inside]
         parts.append((moved[0], moved[2], batch.dt[inside].sum()))
     driven, turned, duration = np.array(parts).T

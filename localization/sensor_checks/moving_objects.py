@@ -51,7 +51,7 @@ Wheels that slip in a still scene explain 14 to 33 % by chance where they turn o
 _MAX_WHEEL_TURN_RAD = 0.1
 """Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
 _RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
-"""A rival leaves less than this share of what moves; and the least share of a scan that it is said not to explain."""
+"""A rival leaves less than this share of what moves; and the share of a scan that it leaves unexplained counts as this much at least."""
 _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
 """Successive comparisons that show it."""
 _CALM_S = 1.0
@@ -284,5 +284,4 @@ def _with_still(step: Step, is_still: BoolArray) -> Step:
     scan = step.scan
     if scan is None or is_still.sum() < _MIN_POINTS:
         return without_scan(step)
-    offsets = scan.offsets[is_still] if len(scan.offsets) else scan.offsets
-    return replace(step, scan=replace(scan, points=scan.points[is_still], offsets=offsets))
+    return replace(step, scan=scan.select(is_still))

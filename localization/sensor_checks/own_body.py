@@ -81,7 +81,7 @@ class OwnBodyFilter:
         if share < _MIN_BODY_SHARE:
             return scan
         self.share = max(self.share, share)
-        return replace(scan, points=points[~is_own], offsets=scan.offsets[~is_own] if len(scan.offsets) else scan.offsets)
+        return scan.select(~is_own)
 
 
 @kernel

@@ -48,11 +48,6 @@ class SceneMotion:
     """Bearings of the reference that are compared: in view, and not hidden."""
 
     @property
-    def still_share(self) -> float:
-        """Share of the points that are of the still world."""
-        return float(np.mean(self.labels == STILL))
-
-    @property
     def moved_share(self) -> float:
         """The larger one of the shares of points that appeared, and of surfaces that vanished."""
         return max(float(np.mean(self.labels == MOVED)), self.vanished / max(self.bearings, 1))

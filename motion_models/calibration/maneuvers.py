@@ -24,7 +24,7 @@ import csv
 import io
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,6 +118,11 @@ class Batch:
     """(N,) when each interval begins, after the drive's first wheel message [s]."""
     groups: tuple[str, ...]
     """Names of the groups, in order of their first maneuver."""
+
+    def intervals(self) -> Iterator[slice]:
+        """Of each measured pose, the intervals from its maneuver's start to it."""
+        for end, owner in zip(self.ends, self.owner, strict=True):
+            yield slice(self.first[owner] + self.lead[owner], end)
 
 
 def make_batch(maneuvers: Sequence[Maneuver]) -> Batch:

@@ -17,16 +17,6 @@ pytestmark = [
 _COMPILED_S = 240.0  # a first start compiles for half a minute, on a busy machine for several
 
 
-@pytest.fixture
-def running():
-    """Processes are added; what still runs at the end is killed."""
-    processes = []
-    yield lambda process: processes.append(process) or process
-    for process in processes:
-        if process.process.poll() is None:
-            process.kill()
-
-
 @pytest.mark.parametrize("distro", [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("kilted", "jazzy")])
 def test_rclpy_peer_saves_a_map_and_localizes_in_it(distro, running, tmp_path) -> None:
     try:

@@ -55,16 +55,6 @@ class _Waiting(NamedTuple):
 _waiting: dict[str, _Waiting] = {}
 
 
-@pytest.fixture
-def running():
-    """Processes are added; what still runs at the end is killed."""
-    processes = []
-    yield lambda process: processes.append(process) or process
-    for process in processes:
-        if process.process.poll() is None:
-            process.kill()
-
-
 def ros2_environment(domain):
     return {**clean_environment(), "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 

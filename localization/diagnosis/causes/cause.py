@@ -268,13 +268,17 @@ class Cause:
     @property
     def key(self) -> str:
         """Unique also among several moments of one change, and parts of the drive."""
-        text = self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
-        return text if self.spell is None else f"{text}[{self.spell.start_s:g}:{self.spell.end_s:g}]"
+        return self._change if self.spell is None else f"{self._change}[{self.spell.start_s:g}:{self.spell.end_s:g}]"
+
+    @property
+    def _change(self) -> str:
+        """The id, of a change on the way with its moment."""
+        return self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
 
     @property
     def group(self) -> str:
         """Name of the group of causes of which only one is tried at a time."""
-        return (self.id if self.at_s is None else f"{self.id}@{self.at_s:g}") if self.axis else self.id
+        return self._change if self.axis else self.id
 
     @property
     def plausible(self) -> float:
