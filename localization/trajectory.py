@@ -127,7 +127,7 @@ class Trajectory:
         if len(self) < 3 or not np.any(inside):
             return errors
         h = np.diff(self.stamps_ns)[:, None] * 1e-9
-        twists = se2.log(se2.between(self.poses[:-1], self.poses[1:])) / h
+        twists = se2.local(self.poses[:-1], self.poses[1:]) / h
         change = np.zeros((len(self), 3))  # of the twist at each pose, a second
         change[1:-1] = np.abs(np.diff(twists, axis=0)) / (0.5 * (h[1:] + h[:-1]))
         before, _, fraction = self._bracket(t[inside])
@@ -181,7 +181,7 @@ def through_nodes(
     mixed = (1.0 - w) * (A @ covs[k] @ A.swapaxes(-1, -2)) + w * (B @ covs[k + 1] @ B.swapaxes(-1, -2))
     noise = (1.0 - w) * covs_since
     noise[nodes] = 0.0
-    return se2.compose(forward, se2.exp(part[:, None] * se2.log(se2.between(forward, backward)))), mixed + noise
+    return se2.retract(forward, part[:, None] * se2.local(forward, backward)), mixed + noise
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:

@@ -315,7 +315,7 @@ class LidarMotionReference:
         if len(points) >= MIN_POINTS:
             match = matcher.match(points, prior, cov)
             if match is not None and gap > 0.0:
-                self._slip = (se2.log(se2.between(self._pose, match.pose)) - se2.log(motion.delta)) / gap
+                self._slip = (se2.local(self._pose, match.pose) - se2.log(motion.delta)) / gap
                 points = self._deskew(sweep, scan, wheels)
                 match = matcher.refine(points, prior, cov, match)
         self._unmatched += match is None

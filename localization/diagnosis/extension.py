@@ -209,7 +209,7 @@ def _with_effects(
 def _without(drive: Drive, predictor: DrivePredictor, removed: FloatArray) -> Drive:
     """``drive`` as it would have been measured without what effects ``removed`` (M, 6) in the discrepancies."""
     motions = [
-        dataclasses.replace(m, measured=se2.compose(m.measured, se2.exp(-row)))
+        dataclasses.replace(m, measured=se2.retract(m.measured, -row))
         for m, row in zip(drive.maneuvers, np.split(removed[:, :3], np.flatnonzero(np.diff(predictor.batch.owner)) + 1), strict=True)
     ]
     forces = None if drive.forces is None else drive.forces - removed[:, 4:]

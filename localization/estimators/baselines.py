@@ -77,7 +77,7 @@ class LidarOdometry(Estimator):
             if not np.isfinite(pose).all():
                 raise EstimatorError(f"KISS-ICP failed at stamp {step.end_ns} ns: its pose is not finite.")
             if self._n_scans and step.end_ns > self._stamp_ns:
-                self._twist = se2.log(se2.between(self._pose, pose)) / ((step.end_ns - self._stamp_ns) * 1e-9)
+                self._twist = se2.local(self._pose, pose) / ((step.end_ns - self._stamp_ns) * 1e-9)
             self._pose, self._stamp_ns = pose, step.end_ns
             self._n_scans += 1
         return Estimate(step.end_ns, self._pose, None, self._twist, None)

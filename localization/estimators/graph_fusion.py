@@ -337,9 +337,9 @@ def subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3)
     ratios, axes = np.linalg.eigh(whiten @ np.linalg.inv(cov) @ whiten.T)  # information with gyro and scans, over that of the wheels
     gained = np.maximum(ratios - 1.0, 1e-6)
     to_axes = axes.T @ root.T
-    off = to_axes @ se2.log(se2.between(prior, delta))
+    off = to_axes @ se2.local(prior, delta)
     shift = np.linalg.solve(to_axes, off / np.maximum(gained, 1.0))
-    return se2.compose(delta, se2.exp(shift)), (to_axes.T * gained) @ to_axes
+    return se2.retract(delta, shift), (to_axes.T * gained) @ to_axes
 
 
 def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:

@@ -226,7 +226,7 @@ def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) 
     def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
         D = wheels.by_corrections
         shift = D @ (values.atVector(corrections) - wheels.at) if has_corrections else np.zeros(3)
-        predicted = se2.compose(wheels.delta, se2.exp(shift))
+        predicted = se2.retract(wheels.delta, shift)
         residual, by_a, by_b = motion_residual(_array(values.atPose2(keys[0])), _array(values.atPose2(keys[1])), predicted)
         if H is not None:
             H[0], H[1] = np.asfortranarray(by_a), np.asfortranarray(by_b)

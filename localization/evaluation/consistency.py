@@ -229,7 +229,7 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
     estimate, part = match(trajectory, reference, max_gap_s)
     truth = part.poses
     d, r = se2.between(estimate[0], estimate[1:]), se2.between(truth[0], truth[1:])
-    errors, stamps = se2.log(se2.between(d, r)), part.stamps_ns[1:]
+    errors, stamps = se2.local(d, r), part.stamps_ns[1:]
     known = trajectory.covariances_at(part.stamps_ns)
     if known is None:
         return PoseErrors(stamps, errors, None, motions=d)

@@ -137,9 +137,7 @@ class Localizer:
     @property
     def covariance(self) -> Cov3:
         """(3, 3) of the right perturbation of `pose`, with the map's own; of a place that is not known, with the extent of the map."""
-        if self.state == "localized":
-            return np.asarray(self._cov + self.places.map_cov(self.pose))
-        if self.state == "searching" and self._is_reckoned:
+        if self.state == "localized" or (self.state == "searching" and self._is_reckoned):
             return np.asarray(self._cov + self.places.map_cov(self.pose))
         return self._cov if self._initial_left else np.asarray(self._cov + self.places.extent_cov)
 
@@ -201,8 +199,9 @@ class Localizer:
         if evidence < -_TRACK_GAIN:  # the odometry may be an outlier, as by slip in a turn
             wide = cov + prior_outlier_cov(cov)
             again = self.places.align(points, self.pose, wide)
-            if self._evidence(again, wide) >= _FITTING:
-                place, cov, evidence = again, wide, self._evidence(again, wide)
+            of_again = self._evidence(again, wide)
+            if of_again >= _FITTING:
+                place, cov, evidence = again, wide, of_again
         self._track_odds = min(self._track_odds + evidence, _MAX_LOG_ODDS)
         self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
         if self.state == "localized" and _sigmoid(self._track_odds) < _LOST:
@@ -212,7 +211,7 @@ class Localizer:
         measured, R = _measurement(place)
         if not self._is_outlier(measured, cov + R):
             K = np.linalg.solve(cov + R, cov).T
-            self.pose = se2.compose(self.pose, se2.exp(K @ se2.log(se2.between(self.pose, measured))))
+            self.pose = se2.retract(self.pose, K @ se2.local(self.pose, measured))
             self._cov = np.asarray((np.eye(3) - K) @ cov @ (np.eye(3) - K).T + K @ R @ K.T)
 
     def _evidence(self, place: Place, cov: Cov3) -> float:
@@ -306,7 +305,7 @@ def _is_partial(points: Points2) -> bool:
 def _measurement(place: Place) -> tuple[Pose2, Cov3]:
     """Pose (3,) that the scan alone gives in the map, and its covariance (3, 3)."""
     information = place.fit.information + _OPEN
-    measured = se2.compose(place.pose, se2.exp(-np.linalg.solve(information, place.fit.gradient)))
+    measured = se2.retract(place.pose, -np.linalg.solve(information, place.fit.gradient))
     return measured, np.asarray(np.linalg.inv(information)) * max(place.residual_variance, 1.0) + _BEND
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from localization.errors import TransportError
 from localization.estimators import Estimate
 from localization.events import Event, Scan
+from localization.logs.writer import odom_axes
 from localization.pipeline import Pipeline
 from localization.report.interactive import numbers
 from localization.report.page import Live, Page, Section, render
@@ -129,9 +130,7 @@ class Dashboard:
         """Set the present pose, its covariance in the world's axes, scan and map."""
         state: dict[str, Any] = {"pose": numbers(e.pose, 4)}
         if e.covariance is not None:
-            c, s = np.cos(e.pose[2]), np.sin(e.pose[2])
-            R = np.array([[c, -s], [s, c]])
-            cov = R @ e.covariance[:2, :2] @ R.T
+            cov = odom_axes(e.covariance, e.pose[2])
             state["cov"] = [float(cov[0, 0]), float(cov[0, 1]), float(cov[1, 1])]
         if self._scan is not None:
             state["scan"] = _columns(se2.transform(e.pose, thin_scan(self._scan, self._mounts, _MOST_SCAN_POINTS)))
