@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import difflib
 import importlib
 import io
@@ -10,8 +11,10 @@ import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Mapping, Sequence
+import typing
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib.metadata import version
+from typing import Any
 
 from localization.commands.common import PlainConsole
 from localization.commands.short_help import short_help
@@ -146,19 +149,30 @@ def _run(name: str, options: Sequence[str]) -> None:
     import tyro
 
     command = getattr(importlib.import_module(f"localization.commands.{name}"), COMMANDS[name][0])
-    options = _expand(options)
+    options = _expand(options, set(_three_state_options(command)))
     tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,)).run(PlainConsole(highlight=False))
 
 
-def _expand(options: Sequence[str]) -> list[str]:
-    """``options`` as tyro takes them: a flag of three states, on, off and not given, is a name with a value."""
+def _expand(options: Sequence[str], three_state: Collection[str]) -> list[str]:
+    """``options`` as tyro takes them: ``--a.b`` and ``--a.no-b`` of the ``three_state`` options become names with a value."""
     found: list[str] = []
     for option, following in zip(options, [*options[1:], ""], strict=False):  # one more where there is none
-        if option.endswith((".planar", ".no-planar")) and following not in ("True", "False", "None"):
-            found += [option.replace(".no-planar", ".planar"), str(not option.endswith(".no-planar"))]
+        on = ".".join(part.removeprefix("no-") for part in option.split("."))
+        if on in three_state and following not in ("True", "False", "None"):
+            found += [on, str(on == option)]
         else:
             found.append("--help" if option == "--help-all" else option)
     return found
+
+
+def _three_state_options(kind: Any, prefix: str = "--") -> Iterator[str]:
+    """Options of the dataclass ``kind`` that are on, off, or not given: its fields of type ``bool | None``, and those of its fields."""
+    for name, hint in typing.get_type_hints(kind).items():
+        option = prefix + name.replace("_", "-")
+        if hint == bool | None:
+            yield option
+        elif dataclasses.is_dataclass(hint):
+            yield from _three_state_options(hint, option + ".")
 
 
 if __name__ == "__main__":

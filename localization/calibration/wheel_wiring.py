@@ -149,10 +149,7 @@ def check_live(sensors: LiveSensors, signals: WheelSignals) -> WiringReport:
     rates = signals.joint_rates
     measured = correlations(signals, rates, base)
     if not _is_accepted(signals, rates, base):
-        found = _best(signals, rates, _alternatives(signals, base))
-        if len({wiring.signature for wiring in found}) > 1:
-            return _ambiguous(sensors, [wiring.text for wiring in found], measured)
-        return _certain(sensors, signals, found[0], measured) if found else WiringReport(sensors.robot, correlations=measured)
+        return _corrected(sensors, signals, base, measured)
     units = check_units(signals, sensors.robot)
     return WiringReport(units.robot, units.findings, units.keys, units.is_ambiguous, measured, units.ratios)
 
@@ -228,12 +225,17 @@ def _wiring_of(log: Log, signals: WheelSignals, is_clock_known: bool) -> tuple[W
     measured = correlations(signals, rates, base)
     if _is_accepted(signals, rates, base):
         return signals, WiringReport(log.robot, correlations=measured)
-    found = _best(signals, rates, _alternatives(signals, base))
+    return signals, _corrected(log, signals, base, measured)
+
+
+def _corrected(sensors: Log | LiveSensors, signals: WheelSignals, base: Wiring, measured: Mapping[str, float]) -> WiringReport:
+    """The wiring that agrees with all sensors where ``base`` does not: one, several of which none is certain, or none."""
+    found = _best(signals, signals.joint_rates, _alternatives(signals, base))
     if not found:
-        return signals, WiringReport(log.robot, correlations=measured)
-    if len({w.signature for w in found}) > 1:
-        return signals, _ambiguous(log, [wiring.text for wiring in found], measured)
-    return signals, _certain(log, signals, found[0], measured)
+        return WiringReport(sensors.robot, correlations=measured)
+    if len({wiring.signature for wiring in found}) > 1:
+        return _ambiguous(sensors, [wiring.text for wiring in found], measured)
+    return _certain(sensors, signals, found[0], measured)
 
 
 def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
