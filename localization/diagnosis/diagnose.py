@@ -200,6 +200,12 @@ def _choose_parts(
     if not spells:
         return linearization, chosen
     state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *spells), {}, TOLERANCE))
+    if not any(state.causes[i].spell for i in best):
+        return linearization, chosen
+    more = find_spells(predictor, state, best)
+    if more:
+        kept = [state.causes[i] for i in best if state.causes[i].spell]
+        state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *kept, *more), {}, TOLERANCE))
     located = with_intervals(predictor, state, best)
     if not located:
         return linearization, chosen

@@ -48,16 +48,22 @@ class _Option(NamedTuple):
 
 
 def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> tuple[Cause, ...]:
-    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes, which hold in the whole of it; none for
-    tables and short drives."""
+    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes does; none for tables and short drives.
+
+    Where one of those ``chosen`` holds in a part of the drive, others are tried in this part alone: one event may change several things, as
+    a tyre that loses air changes the mean of all radii and the difference of both sides.
+    """
     if predictor.drive.kind != "log" or len(predictor.drive.maneuvers) < _FEWEST_WINDOWS:
         return ()
-    least, spells = _cost(state, chosen), _spells(predictor)
+    least, known = _cost(state, chosen), [c.spell for c in (state.causes[i] for i in chosen) if c.spell is not None]
+    spells = list(dict.fromkeys(known)) or _spells(predictor)
+    moments = [0.0 if known else 1.0 + (s.start_s > 0.0 and math.isfinite(s.end_s)) for s in spells]
     options: dict[str, _Option] = {}
     bases = sorted({(), chosen, *(tuple(j for j in chosen if j != i) for i in chosen)})
     tried = [i for i, c in enumerate(state.causes) if c.id not in _OF_WHOLE_DRIVES and c.spell is None]
     gains = spell_gains(predictor, state, bases, tried, spells)
-    for option in itertools.chain.from_iterable(_options(state, b, tried, spells, g) for b, g in zip(bases, gains, strict=True)):
+    prices = 2.0 * math.log(len(spells)) + math.log(max(state.problem.count, 2)) * np.array(moments)
+    for option in itertools.chain.from_iterable(_options(state, b, tried, spells, prices - g) for b, g in zip(bases, gains, strict=True)):
         name = state.causes[option.cause].id
         if option.cost < min(least - _MARGIN, options[name].cost if name in options else math.inf):
             options[name] = option
@@ -91,20 +97,17 @@ def _spells(predictor: DrivePredictor) -> list[Spell]:
 
 
 def _options(
-    state: Linearization, base: tuple[int, ...], tried: Sequence[int], spells: Sequence[Spell], gains: FloatArray
+    state: Linearization, base: tuple[int, ...], tried: Sequence[int], spells: Sequence[Spell], costs: FloatArray
 ) -> list[_Option]:
-    """The best part of the drive for each cause beside those of ``base``, by the ``gains`` (tried, spells)."""
+    """The best part of the drive for each cause beside those of ``base``, by what each costs more than these (tried, spells)."""
     problem, causes = state.problem, state.causes
     groups = {causes[i].group for i in base}
-    log_n = math.log(max(problem.count, 2))
-    parts = np.array([1.0 + (s.start_s > 0.0 and math.isfinite(s.end_s)) for s in spells])
-    prices = 2.0 * math.log(len(spells)) + log_n * parts
     before = price(problem.count, len({c.group for c in causes}), len(base) + 1) - problem.gain(base)
     found = []
-    for i, row in zip(tried, gains, strict=True):
+    for i, row in zip(tried, costs, strict=True):
         if causes[i].group not in groups:
-            best = int(np.argmin(prices - row))
-            found.append(_Option(before + float(prices[best] - row[best]), i, spells[best]))
+            best = int(np.argmin(row))
+            found.append(_Option(before + float(row[best]), i, spells[best]))
     return found
 
 

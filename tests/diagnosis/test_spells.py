@@ -24,8 +24,9 @@ from tests.helpers.diagnosis_drives import TOUR, bag
 from tests.helpers.diagnosis_windows import drive_of_windows, windows
 
 MODEL, COUNT = "skid_steer", 40
-_PICKED_UP_BEFORE, _PICKED_UP_S = 7, 30.0
-"""Phase of the tour, whose halves are alike, and when it begins in a minute of windows."""
+_PICKED_UP_BEFORE, _PICKED_UP_NS = 7, 34_000_000_000
+"""Phase of the tour, whose halves are alike, and its stamp: the log begins at 1 s, the first half rests for 2 s, drives for 25 s and stops
+six times for a second."""
 
 
 def with_radii(robot: Robot, scale: float) -> Robot:
@@ -105,11 +106,12 @@ def test_diagnose_payload_taken_up_on_the_way_is_payload_from_then(tmp_path: Pat
     """The robot drives straight on before and after it takes the load up, which hardly shows it: the interval is these six seconds."""
     nominal = load_robot("husky_a200")
     log = bag(tmp_path / "drive.mcap", {}, 11, "husky_a200", Experiment("pick_up", "", "hall", (-4.0, 0.0, 0.0), _with_pick_up))
-    found = examine(drive_of_log(open_log(log, nominal)), make_model("friction", nominal)).diagnosis
+    drive = drive_of_log(open_log(log, nominal))
+    found = examine(drive, make_model("friction", nominal)).diagnosis
     (finding,) = found.findings
     assert finding.cause == "payload"
     assert finding.size == pytest.approx(8.0, abs=1.96 * finding.sigma)
     assert finding.definition.spell_95 is not None
     low, high = finding.definition.spell_95[0]
-    assert low <= _PICKED_UP_S <= high
+    assert low <= (_PICKED_UP_NS - int(drive.spans_ns[0, 0])) * 1e-9 <= high
     assert found.sentence.startswith("Correct payload from t = ")

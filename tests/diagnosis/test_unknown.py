@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from localization.diagnosis.diagnose import diagnose
@@ -34,8 +35,28 @@ def test_diagnose_reference_that_scatters_is_named_in_a_note(nominal: Drive, nam
     assert found.verdict == "unexplained" or any("motion reference states" in note for note in found.warnings)
 
 
+PUNCTURE = "puncture of the left tyres"
+_PUNCTURE_SHARE = -0.05 / 1.05
+"""Of the left radii: the left wheels turn 5 % faster for the same way."""
+
+
 @pytest.mark.extended
-@pytest.mark.parametrize("name", sorted(set(UNKNOWN) - set(OF_REFERENCE)))
+def test_diagnose_puncture_is_two_causes_from_one_moment(nominal: Drive) -> None:
+    """Tyres of one side that shrink on the way are a difference of both sides and half as much of the mean, from then on."""
+    found = diagnose(UNKNOWN[PUNCTURE](nominal), make_model("friction", nominal.robot))
+    by = {f.cause: f for f in found.findings}
+    assert found.verdict == "explained"
+    assert set(by) == {"wheel_radius_difference", "wheel_radius_scale"}
+    for cause, size in (("wheel_radius_difference", _PUNCTURE_SHARE), ("wheel_radius_scale", 0.5 * _PUNCTURE_SHARE)):
+        assert by[cause].size == pytest.approx(size, abs=2.5 * by[cause].sigma)
+        assert by[cause].definition.spell_95 is not None
+        low, high = by[cause].definition.spell_95[0]
+        assert low <= float(nominal.starts_s[np.searchsorted(nominal.starts_s, 0.5 * nominal.starts_s[-1], side="right")]) <= high
+    assert found.sentence.startswith("Correct wheel_radius_difference from t = 30 s")
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("name", sorted(set(UNKNOWN) - {*OF_REFERENCE, PUNCTURE}))
 def test_diagnose_effect_outside_catalogue_is_unexplained(nominal: Drive, name: str) -> None:
     found = diagnose(UNKNOWN[name](nominal), make_model("friction", nominal.robot))
     assert found.verdict == "unexplained"
