@@ -24,25 +24,9 @@ from localization.comparison.statistics import (
 )
 from localization.errors import OutputError
 from localization.output import write_text_file
+from localization.report import page as html
 from localization.report.figures import Axes, plain_logs, svg
 from localization.report.figures import Figure as Canvas
-from localization.report.page import (
-    COLOURS,
-    WIDTH_IN,
-    Block,
-    Bullets,
-    Cell,
-    Definitions,
-    Figure,
-    ListItem,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    bullets,
-    glossary,
-    render,
-)
 from localization.report.replay_page import MISSING, number
 from localization.report.runs import capitalize, estimator_colours
 
@@ -97,18 +81,18 @@ def comparison_page(head: CompareHead, found: Findings, is_interactive: bool = T
     styles = _styles(found)
     facts = f"{head.robot} · {found.metric} · {len(found.words)} combinations of motion model and estimator"
     sections = [
-        Section("Means over logs", [_means_figure(found, styles)]),
-        Section("The best against the others", [*_gains_figure(found, styles), *_tests(found, styles)]),
-        Section("Every run", [run_table(found, _names(found), styles), *run_charts(found, styles, _names(found))]),
-        Section("Every log", _by_log(found, styles)),
-        Section("Failures", _failures(found)),
-        Section("Problems of logs that did not fail", _problems(found)),
-        glossary(_TERMS),
-        Section("Sources and versions", [Definitions(_provenance(head, found))]),
+        html.Section("Means over logs", [_means_figure(found, styles)]),
+        html.Section("The best against the others", [*_gains_figure(found, styles), *_tests(found, styles)]),
+        html.Section("Every run", [run_table(found, _names(found), styles), *run_charts(found, styles, _names(found))]),
+        html.Section("Every log", _by_log(found, styles)),
+        html.Section("Failures", _failures(found)),
+        html.Section("Problems of logs that did not fail", _problems(found)),
+        html.glossary(_TERMS),
+        html.Section("Sources and versions", [html.Definitions(_provenance(head, found))]),
     ]
     sentences = [_unbroken(sentence) for sentence in (headline(found), *closing(found), *head.notes)]
-    page = Page(title, facts, sentences, sections)
-    return render(page if is_interactive else page.without_scripts())
+    page = html.Page(title, facts, sentences, sections)
+    return html.render(page if is_interactive else page.without_scripts())
 
 
 def _unbroken(sentence: str) -> str:
@@ -116,12 +100,12 @@ def _unbroken(sentence: str) -> str:
     return sentence.replace(" %", "\N{NO-BREAK SPACE}%").replace("p = ", "p\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
 
 
-def _means_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> Figure:
+def _means_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> html.Figure:
     caption = "Large: mean over logs, the line its 95 % interval. Small: each log. Colours are estimators, shapes are motion models."
-    return Figure(_means_svg(found, styles), f"Mean {found.measure} by combination", caption)
+    return html.Figure(_means_svg(found, styles), f"Mean {found.measure} by combination", caption)
 
 
-def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
+def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
     differences = [(mean, found.against_best(mean.name)) for mean in found.means[1:]]
     others: list[Mean] = [mean for mean, d in differences if d is not None and not math.isnan(d.relative)]
     if not others:
@@ -130,10 +114,10 @@ def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> lis
         "Lines are 95 % intervals of all pairs together; where one reaches 0, these logs do not show that the best is better. A hollow "
         "mark without a line: so few logs cannot show it, whatever they are."
     )
-    return [Figure(_gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
+    return [html.Figure(_gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
 
 
-def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
+def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
     digits = _digits(found)
     rows = []
     for mean in found.means:
@@ -142,18 +126,23 @@ def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block
         badge = _LOST if found.lost(mean.name) else _BEST if mean is found.best else _EQUAL if d is None or not found.is_shown(d) else ""
         cells = (MISSING,) * 3 if d is None else _cells(d, found)
         rows.append(
-            [_name(mean.name, found, styles, badge), Cell(number(mean.mean, digits), interval), Cell(str(mean.n)), *map(Cell, cells)]
+            [
+                _name(mean.name, found, styles, badge),
+                html.Cell(number(mean.mean, digits), interval),
+                html.Cell(str(mean.n)),
+                *map(html.Cell, cells),
+            ]
         )
     header = [
-        Cell("Estimator", "motion model"),
-        Cell("Mean", f"{found.unit or found.metric}, 95 %"),
-        Cell("Logs"),
-        Cell("Best is smaller by", "95 %"),
-        Cell("on"),
-        Cell("p"),
+        html.Cell("Estimator", "motion model"),
+        html.Cell("Mean", f"{found.unit or found.metric}, 95 %"),
+        html.Cell("Logs"),
+        html.Cell("Best is smaller by", "95 %"),
+        html.Cell("on"),
+        html.Cell("p"),
     ]
-    sentences = bullets([against_best(mean, found) for mean in found.means[1:]], "The same in words")
-    return [Table(header, rows), *sentences, *_all_pairs(found)]
+    sentences = html.bullets([against_best(mean, found) for mean in found.means[1:]], "The same in words")
+    return [html.Table(header, rows), *sentences, *_all_pairs(found)]
 
 
 def _cells(d: Difference, found: Findings) -> tuple[str, str, str]:
@@ -161,22 +150,22 @@ def _cells(d: Difference, found: Findings) -> tuple[str, str, str]:
     return f"{reverse}{percent(d, found.unit)}", f"{d.wins} of {d.n}", p_words(d.p_value)
 
 
-def _all_pairs(found: Findings) -> list[Block]:
+def _all_pairs(found: Findings) -> list[html.Block]:
     if len(found.means) < 3:
         return []
     rows = [
         [
-            Cell(f"{capitalize(found.words[d.better])} before {found.words[d.worse]}"),
-            Cell(percent(d, found.unit)),
-            Cell(f"{d.wins} of {d.n}"),
-            Cell(p_words(d.p_value)),
+            html.Cell(f"{capitalize(found.words[d.better])} before {found.words[d.worse]}"),
+            html.Cell(percent(d, found.unit)),
+            html.Cell(f"{d.wins} of {d.n}"),
+            html.Cell(p_words(d.p_value)),
         ]
         for d in found.tested
     ]
-    return [Table([Cell(title) for title in ("Pair", "Smaller by", "on", "p")], rows, "All pairs")]
+    return [html.Table([html.Cell(title) for title in ("Pair", "Smaller by", "on", "p")], rows, "All pairs")]
 
 
-def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Block]:
+def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
     numbers = by_combination(found.rows, found.metric)
     shown = [mean.name for mean in found.means]
     failed = {(r["log"], combination(r)) for r in found.failed}
@@ -184,35 +173,35 @@ def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[Bloc
     for log in _logs(found):
         values = [numbers[name].get(log) for name in shown]
         least = min((value for value in values if value is not None), default=None)
-        cells = [Cell(_short(log, found))]
+        cells = [html.Cell(_short(log, found))]
         for name, value in zip(shown, values, strict=True):
             text = ("failed" if (log, name) in failed else MISSING) if value is None else number(value, digits)
-            cells.append(Cell(text, is_bold=value is not None and value == least and len(shown) > 1))
+            cells.append(html.Cell(text, is_bold=value is not None and value == least and len(shown) > 1))
         rows.append(cells)
     unit = f" [{found.unit}]" if found.unit else ""
-    header = [Cell("Log"), *(_name(name, found, styles) for name in shown)]
-    return [Table(header, rows), Paragraph(f"{found.measure}{unit}. Bold: the smallest on its log.", is_small=True)]
+    header = [html.Cell("Log"), *(_name(name, found, styles) for name in shown)]
+    return [html.Table(header, rows), html.Paragraph(f"{found.measure}{unit}. Bold: the smallest on its log.", is_small=True)]
 
 
-def _failures(found: Findings) -> list[Block]:
+def _failures(found: Findings) -> list[html.Block]:
     reasons: dict[tuple[str, str], list[str]] = {}
     for r in found.failed:
         reasons.setdefault((r["log"], r["error"]), []).append(found.words[combination(r)])
     items = []
     for (log, reason), names in reasons.items():
         which = "everything" if len(names) == len(found.words) else ", ".join(names)
-        items.append(ListItem(reason, f"{_short(log, found)} ({which})"))
-    return [Bullets(items)] if items else []
+        items.append(html.ListItem(reason, f"{_short(log, found)} ({which})"))
+    return [html.Bullets(items)] if items else []
 
 
-def _problems(found: Findings) -> list[Block]:
+def _problems(found: Findings) -> list[html.Block]:
     notes = {r["log"]: r["notes"] for r in found.rows if r.get("notes")}
-    return [Bullets([ListItem(note, _short(log, found)) for log, note in notes.items()])] if notes else []
+    return [html.Bullets([html.ListItem(note, _short(log, found)) for log, note in notes.items()])] if notes else []
 
 
-def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> Cell:
+def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> html.Cell:
     estimator, _, model = found.words[name].partition(" with ")
-    return Cell(estimator, model, is_bold=True, badge=badge, mark=styles[name][0])
+    return html.Cell(estimator, model, is_bold=True, badge=badge, mark=styles[name][0])
 
 
 def _digits(found: Findings) -> int:
@@ -255,7 +244,7 @@ def _means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
         axes = figure.add_subplot()
         for row, mean in enumerate(found.means):
             colour, model = styles[mean.name]
-            axes.plot(values[mean.name], _spread(row, mean.n), ".", color=COLOURS[colour], alpha=0.45, markersize=4.0)
+            axes.plot(values[mean.name], _spread(row, mean.n), ".", color=html.COLOURS[colour], alpha=0.45, markersize=4.0)
             _interval(axes, row, mean.mean, (mean.low, mean.high), colour, _MARKERS[model % len(_MARKERS)])
         everything = np.concatenate([values[mean.name] for mean in found.means])
         least, most = everything.min(), everything.max()
@@ -267,7 +256,7 @@ def _means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
         _rows(axes, [found.words[mean.name] for mean in found.means])
         axes.set_xlabel(_with_unit(found))
 
-    return svg("means", WIDTH_IN, _ROW_HEIGHT_IN * len(found.means) + 0.75, draw)
+    return svg("means", html.WIDTH_IN, _ROW_HEIGHT_IN * len(found.means) + 0.75, draw)
 
 
 def _gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]]) -> str:
@@ -282,18 +271,18 @@ def _gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tup
             low, high = sorted(100.0 * sign * part for part in (d.relative_low, d.relative_high))
             colour, model = styles[mean.name]
             _interval(axes, row, 100.0 * sign * d.relative, (low, high), colour, _MARKERS[model % len(_MARKERS)])
-        axes.axvline(0.0, color=COLOURS["ink"], linewidth=0.9)
+        axes.axvline(0.0, color=html.COLOURS["ink"], linewidth=0.9)
         _rows(axes, [f"than {found.words[mean.name]}" for mean in others])
         axes.set_xlabel(f"smaller by [%]: {found.measure} of {found.words[found.best.name]}")
 
-    return svg("gains", WIDTH_IN, _ROW_HEIGHT_IN * len(others) + 0.75, draw)
+    return svg("gains", html.WIDTH_IN, _ROW_HEIGHT_IN * len(others) + 0.75, draw)
 
 
 def _interval(axes: Axes, row: int, value: float, interval: tuple[float, float], colour: str, marker: str) -> None:
     is_bounded = not np.isinf(interval).any()
     if is_bounded:
-        axes.plot(interval, [row, row], color=COLOURS[colour], linewidth=2.0, solid_capstyle="butt")
-    face, edge = (COLOURS[colour], COLOURS["ink"]) if is_bounded else ("none", COLOURS[colour])
+        axes.plot(interval, [row, row], color=html.COLOURS[colour], linewidth=2.0, solid_capstyle="butt")
+    face, edge = (html.COLOURS[colour], html.COLOURS["ink"]) if is_bounded else ("none", html.COLOURS[colour])
     axes.plot(value, row, marker, color=face, markersize=6.5, markeredgecolor=edge, markeredgewidth=0.6 if is_bounded else 1.4)
 
 

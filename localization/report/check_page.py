@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from localization.calibration.robot_check import NEXT_DRIVE, CheckRow, RobotCheck
-from localization.report.page import Block, Cell, Page, Paragraph, Section, Table, bullets, glossary, render, write_new
+from localization.report import page as html
 
 _MARKS = {"ok": "green", "contradiction": "red", "cannot be seen": "grey"}
 _FILES = {
@@ -24,7 +24,7 @@ _TERMS = {
 
 def write_check_page(path: str | Path, found: RobotCheck, files: dict[str, str]) -> None:
     """Write the page; ``files``: text of the files that stand beside it, by name. Raises `OutputError`."""
-    write_new(path, check_page(found, files).encode())
+    html.write_new(path, check_page(found, files).encode())
 
 
 def check_page(found: RobotCheck, files: dict[str, str]) -> str:
@@ -32,25 +32,27 @@ def check_page(found: RobotCheck, files: dict[str, str]) -> str:
     wrong = [row for row in found.rows if row.verdict == "contradiction"]
     unseen = [row for row in found.rows if row.verdict == "cannot be seen"]
     sections = [
-        Section("Contradictions", bullets([f"{row.quantity}: {row.advice}" for row in wrong])),
-        Section("All quantities", _table(found.rows)),
-        Section("To record or to drive", _to_drive(unseen)),
-        Section("Files beside this page", bullets([f"{name}: {_FILES.get(name, '')}" for name in files])),
-        glossary(_TERMS),
+        html.Section("Contradictions", html.bullets([f"{row.quantity}: {row.advice}" for row in wrong])),
+        html.Section("All quantities", _table(found.rows)),
+        html.Section("To record or to drive", _to_drive(unseen)),
+        html.Section("Files beside this page", html.bullets([f"{name}: {_FILES.get(name, '')}" for name in files])),
+        html.glossary(_TERMS),
     ]
     facts = f"{found.robot.name} · {found.duration_s:.0f} s · {len(found.rows)} quantities"
-    return render(Page(f"Check of {found.log}", facts, [found.sentence], sections))
+    return html.render(html.Page(f"Check of {found.log}", facts, [found.sentence], sections))
 
 
-def _table(rows: tuple[CheckRow, ...]) -> list[Block]:
-    header = [Cell(title) for title in ("Quantity", "Verdict", "Value", "Second source")]
+def _table(rows: tuple[CheckRow, ...]) -> list[html.Block]:
+    header = [html.Cell(title) for title in ("Quantity", "Verdict", "Value", "Second source")]
     cells = []
     for row in rows:
-        cells.append([Cell(row.quantity), Cell(row.verdict, mark=_MARKS[row.verdict]), Cell(row.value), Cell(row.second_source)])
-    return [Table(header, cells, is_text=True, is_sortable=True)]
+        cells.append(
+            [html.Cell(row.quantity), html.Cell(row.verdict, mark=_MARKS[row.verdict]), html.Cell(row.value), html.Cell(row.second_source)]
+        )
+    return [html.Table(header, cells, is_text=True, is_sortable=True)]
 
 
-def _to_drive(unseen: list[CheckRow]) -> list[Block]:
+def _to_drive(unseen: list[CheckRow]) -> list[html.Block]:
     if not unseen:
         return []
-    return [*bullets([f"{row.quantity}: {row.advice}" for row in unseen]), Paragraph(NEXT_DRIVE)]
+    return [*html.bullets([f"{row.quantity}: {row.advice}" for row in unseen]), html.Paragraph(NEXT_DRIVE)]

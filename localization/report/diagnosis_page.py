@@ -18,24 +18,10 @@ from localization.diagnosis.findings import (
     is_contesting,
     unit_of,
 )
+from localization.report import page as html
 from localization.report.diagnosis_charts import COMPONENTS, diagnosis_charts, motion_in_windows
 from localization.report.figures import Axes, svg
 from localization.report.figures import Figure as Canvas
-from localization.report.page import (
-    COLOURS,
-    WIDTH_IN,
-    Block,
-    Cell,
-    Figure,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    bullets,
-    glossary,
-    render,
-    write_new,
-)
 from motion_models.se2 import FloatArray
 
 _MAX_PANELS = 4
@@ -61,52 +47,52 @@ _TERMS = {
 
 def write_diagnosis_report(path: str | Path, found: DiagnosisResult, is_interactive: bool = True) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    write_new(path, diagnosis_page(found, is_interactive).encode())
+    html.write_new(path, diagnosis_page(found, is_interactive).encode())
 
 
 def diagnosis_page(found: DiagnosisResult, is_interactive: bool = True) -> str:
     """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     d = found.diagnosis
     sections = [
-        Section("Findings", _findings(d)),
-        Section("Components", _components(d)),
-        Section("Next drive", [Paragraph(d.next_drive)] if d.next_drive else []),
-        Section("Explore", diagnosis_charts(found)),
+        html.Section("Findings", _findings(d)),
+        html.Section("Components", _components(d)),
+        html.Section("Next drive", [html.Paragraph(d.next_drive)] if d.next_drive else []),
+        html.Section("Explore", diagnosis_charts(found)),
         *_figures(found),
-        Section("Corrected robot: before and after", _handover(d)),
-        Section("Within tolerance", bullets(describe_tolerated(d))),
-        Section("Contradictions", bullets(d.contradictions)),
-        Section("Left unexplained", bullets([t.text for t in d.trends if is_contesting(d, t)])),
-        Section("Left, and less than the noise", bullets([t.text for t in d.trends if not is_contesting(d, t)])),
-        Section("What this drive would show", _detectable(d)),
-        Section("About the log", bullets([*describe_outliers(d), *d.warnings])),
-        glossary(_TERMS),
+        html.Section("Corrected robot: before and after", _handover(d)),
+        html.Section("Within tolerance", html.bullets(describe_tolerated(d))),
+        html.Section("Contradictions", html.bullets(d.contradictions)),
+        html.Section("Left unexplained", html.bullets([t.text for t in d.trends if is_contesting(d, t)])),
+        html.Section("Left, and less than the noise", html.bullets([t.text for t in d.trends if not is_contesting(d, t)])),
+        html.Section("What this drive would show", _detectable(d)),
+        html.Section("About the log", html.bullets([*describe_outliers(d), *d.warnings])),
+        html.glossary(_TERMS),
     ]
     facts = f"{d.robot} · model {d.model} · reference {d.motion_reference} · {d.windows:,} windows"
-    page = Page(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]], sections)
-    return render(page if is_interactive else page.without_scripts())
+    page = html.Page(f"Diagnosis of {d.log}", facts, [d.sentence, _VERDICTS[d.verdict]], sections)
+    return html.render(page if is_interactive else page.without_scripts())
 
 
-def _figures(found: DiagnosisResult) -> list[Section]:
+def _figures(found: DiagnosisResult) -> list[html.Section]:
     """Discrepancies and gains, as far as there are any."""
     d, sections = found.diagnosis, []
     if found.residuals is not None:
         colours = "Red: as found; blue: once corrected."
-        over_time = Figure(
+        over_time = html.Figure(
             _discrepancy_svg(found), "Discrepancies over time", f"Measured minus predicted. {colours} The band is two sigmas of noise."
         )
-        by_motion = Figure(_dependence_svg(found), "Discrepancies by motion", f"One point for each window. {colours}")
+        by_motion = html.Figure(_dependence_svg(found), "Discrepancies by motion", f"One point for each window. {colours}")
         sections += [
-            Section("Discrepancies over time", [over_time], is_static=True),
-            Section("Discrepancies by motion", [by_motion], is_static=True),
+            html.Section("Discrepancies over time", [over_time], is_static=True),
+            html.Section("Discrepancies by motion", [by_motion], is_static=True),
         ]
     if d.findings:
         caption = "Each finding beside all others; the line is its 95 % interval, by bootstrap over blocks of windows."
-        sections.append(Section("Held-out gain", [Figure(_gain_svg(d), "Held-out gain of each finding", caption)]))
+        sections.append(html.Section("Held-out gain", [html.Figure(_gain_svg(d), "Held-out gain of each finding", caption)]))
     return sections
 
 
-def _findings(d: Diagnosis) -> list[Block]:
+def _findings(d: Diagnosis) -> list[html.Block]:
     if not d.findings:
         return []
     rows = []
@@ -114,32 +100,36 @@ def _findings(d: Diagnosis) -> list[Block]:
         unit = "" if f.definition.unit == "1" else f" {f.definition.unit}"
         others = describe_sizes(f.aliases) or "–"  # noqa: RUF001
         gain = f"{100 * f.gain.relative:.0f} % ({100 * f.gain.low:.0f} to {100 * f.gain.high:.0f})"
-        cause = Cell(f.definition.label, f"{f.description}; {f.evidence}", is_code=True)
-        rows.append([cause, Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), Cell(gain), Cell(f"{f.p_value:.1g}"), Cell(others)])
-    return [Table([Cell(title) for title in ("Cause", "Size", "Held-out gain", "p", "Or")], rows)]
+        cause = html.Cell(f.definition.label, f"{f.description}; {f.evidence}", is_code=True)
+        rows.append(
+            [cause, html.Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), html.Cell(gain), html.Cell(f"{f.p_value:.1g}"), html.Cell(others)]
+        )
+    return [html.Table([html.Cell(title) for title in ("Cause", "Size", "Held-out gain", "p", "Or")], rows)]
 
 
-def _components(d: Diagnosis) -> list[Block]:
+def _components(d: Diagnosis) -> list[html.Block]:
     rows = []
     for name, c in d.discrepancy.items():
         sizes = (f"{v:.3g}" for v in (c.rms, c.corrected_rms, c.unattributed_rms, c.expected_rms))
-        status = Cell(c.status, describe_row(c).removeprefix(c.status).strip(": "))
-        rows.append([*(Cell(text) for text in (name, c.unit, *sizes, describe_p(c.p_value))), status])
-    return [Table([Cell(title) for title in ("Component", "Unit", "RMS", "Corrected", "Left", "Noise", "p", "Attributed to")], rows)]
+        status = html.Cell(c.status, describe_row(c).removeprefix(c.status).strip(": "))
+        rows.append([*(html.Cell(text) for text in (name, c.unit, *sizes, describe_p(c.p_value))), status])
+    return [
+        html.Table([html.Cell(title) for title in ("Component", "Unit", "RMS", "Corrected", "Left", "Noise", "p", "Attributed to")], rows)
+    ]
 
 
-def _handover(d: Diagnosis) -> list[Block]:
+def _handover(d: Diagnosis) -> list[html.Block]:
     if d.handover is None:
         return []
     h = d.handover
-    rows = [[Cell(c), Cell(f"{h.before[c]:.4g}"), Cell(f"{h.after[c]:.4g}")] for c in h.before]
-    return [Paragraph(h.describe()), Table([Cell(title) for title in ("Component", "RMS before", "RMS after")], rows)]
+    rows = [[html.Cell(c), html.Cell(f"{h.before[c]:.4g}"), html.Cell(f"{h.after[c]:.4g}")] for c in h.before]
+    return [html.Paragraph(h.describe()), html.Table([html.Cell(title) for title in ("Component", "RMS before", "RMS after")], rows)]
 
 
-def _detectable(d: Diagnosis) -> list[Block]:
-    rows = [[Cell(name, is_code=True), Cell(f"{size:.3g}{unit_of(name)}")] for name, size in d.detectable_sizes.items()]
+def _detectable(d: Diagnosis) -> list[html.Block]:
+    rows = [[html.Cell(name, is_code=True), html.Cell(f"{size:.3g}{unit_of(name)}")] for name, size in d.detectable_sizes.items()]
     return (
-        [Table([Cell("Cause"), Cell("Smallest size that this drive would show (3 sigma, all else within tolerance)")], rows)]
+        [html.Table([html.Cell("Cause"), html.Cell("Smallest size that this drive would show (3 sigma, all else within tolerance)")], rows)]
         if rows
         else []
     )
@@ -158,12 +148,12 @@ def _discrepancy_svg(found: DiagnosisResult) -> str:
         panels = np.atleast_1d(figure.subplots(len(shown), 1, sharex=True))
         for axes, c in zip(panels, shown, strict=True):
             _band(axes, seconds, 2.0 * r.sigmas[:, c])
-            axes.plot(seconds, r.rows[:, c], ".", color=COLOURS["red"], markersize=4.0)
-            axes.plot(seconds, r.left[:, c], ".", color=COLOURS["blue"], markersize=3.0)
+            axes.plot(seconds, r.rows[:, c], ".", color=html.COLOURS["red"], markersize=4.0)
+            axes.plot(seconds, r.left[:, c], ".", color=html.COLOURS["blue"], markersize=3.0)
             axes.set_ylabel(f"{COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
         panels[-1].set_xlabel("time since the first window [s]" if found.diagnosis.windows and seconds.any() else "maneuver")
 
-    return svg("discrepancy", WIDTH_IN, 1.35 * len(shown) + 0.5, draw)
+    return svg("discrepancy", html.WIDTH_IN, 1.35 * len(shown) + 0.5, draw)
 
 
 def _dependence_svg(found: DiagnosisResult) -> str:
@@ -178,13 +168,13 @@ def _dependence_svg(found: DiagnosisResult) -> str:
         panels = np.reshape(figure.subplots(len(shown), 2, sharex="col", sharey="row", squeeze=False), (len(shown), 2))
         for row, c in enumerate(shown):
             for axes, along in zip(panels[row], (driven, turned), strict=True):
-                axes.plot(along, r.rows[:, c], ".", color=COLOURS["red"], markersize=4.0)
-                axes.plot(along, r.left[:, c], ".", color=COLOURS["blue"], markersize=3.0)
+                axes.plot(along, r.rows[:, c], ".", color=html.COLOURS["red"], markersize=4.0)
+                axes.plot(along, r.left[:, c], ".", color=html.COLOURS["blue"], markersize=3.0)
             panels[row][0].set_ylabel(f"{COMPONENTS[CHANNELS[c]]} [{CHANNEL_UNITS[c]}]")
         panels[-1][0].set_xlabel("driven in the window [m]")
         panels[-1][1].set_xlabel("turned in the window [rad]")
 
-    return svg("dependence", WIDTH_IN, 1.6 * len(shown) + 0.5, draw)
+    return svg("dependence", html.WIDTH_IN, 1.6 * len(shown) + 0.5, draw)
 
 
 def _gain_svg(d: Diagnosis) -> str:
@@ -194,16 +184,16 @@ def _gain_svg(d: Diagnosis) -> str:
         axes = figure.add_subplot()
         for row, f in enumerate(d.findings):
             gain, low, high = (100.0 * v for v in (f.gain.relative, f.gain.low, f.gain.high))
-            axes.barh(row, gain, height=0.5, color=COLOURS["green"])
-            axes.plot([low, high], [row, row], color=COLOURS["ink"], linewidth=1.0)
+            axes.barh(row, gain, height=0.5, color=html.COLOURS["green"])
+            axes.plot([low, high], [row, row], color=html.COLOURS["ink"], linewidth=1.0)
         axes.set(
             yticks=range(len(d.findings)), yticklabels=[f.definition.label for f in d.findings], xlabel="held-out discrepancy taken off [%]"
         )
         axes.invert_yaxis()
 
-    return svg("gain", WIDTH_IN, 0.4 * len(d.findings) + 0.7, draw)
+    return svg("gain", html.WIDTH_IN, 0.4 * len(d.findings) + 0.7, draw)
 
 
 def _band(axes: Axes, seconds: FloatArray, width: FloatArray) -> None:
-    axes.fill_between(seconds, -width, width, facecolor=COLOURS["band"], edgecolor="none", zorder=0.5)
-    axes.axhline(0.0, color=COLOURS["soft"], linewidth=0.6, zorder=0.6)
+    axes.fill_between(seconds, -width, width, facecolor=html.COLOURS["band"], edgecolor="none", zorder=0.5)
+    axes.axhline(0.0, color=html.COLOURS["soft"], linewidth=0.6, zorder=0.6)

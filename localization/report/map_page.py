@@ -13,8 +13,8 @@ import numpy as np
 from localization.maps.export import png
 from localization.maps.grid import Grid, draw_grid
 from localization.maps.keyframe_map import KeyframeMap
+from localization.report import page as html
 from localization.report.interactive import grid_layer, numbers
-from localization.report.page import Block, Definitions, Explorer, Figure, Page, Paragraph, Section, render
 from localization.trajectory import IntArray
 
 _RESOLUTION_M = 0.05
@@ -33,11 +33,11 @@ def map_page(name: str, mapped: KeyframeMap, sentences: Sequence[str], provenanc
     facts = f"{len(mapped.poses)} keyframes, {len(mapped.points)} points, {int(mapped.edge_is_loop.sum())} loop closures"
     known = {key: str(value) for key, value in provenance.items() if isinstance(value, (str, int, float))}
     sections = [
-        Section("Explore", [Explorer(json.dumps(_explorer_data(mapped, grid), separators=(",", ":"), allow_nan=False))]),
-        Section("Grid", [grid_figure(grid)], is_static=True),
-        Section("Where it comes from", [Definitions(known)] if known else []),
+        html.Section("Explore", [html.Explorer(json.dumps(_explorer_data(mapped, grid), separators=(",", ":"), allow_nan=False))]),
+        html.Section("Grid", [grid_figure(grid)], is_static=True),
+        html.Section("Where it comes from", [html.Definitions(known)] if known else []),
     ]
-    return render(Page(f"Map {name}", facts, sentences, sections))
+    return html.render(html.Page(f"Map {name}", facts, sentences, sections))
 
 
 def picture_grid(mapped: KeyframeMap) -> Grid:
@@ -47,7 +47,7 @@ def picture_grid(mapped: KeyframeMap) -> Grid:
     return draw_grid(mapped, _RESOLUTION_M * max(1.0, np.ceil(np.sqrt(area / _RESOLUTION_M**2 / _MOST_CELLS))))
 
 
-def grid_figure(grid: Grid, changes: Sequence[Mapping[str, Any]] = ()) -> Figure:
+def grid_figure(grid: Grid, changes: Sequence[Mapping[str, Any]] = ()) -> html.Figure:
     """``grid`` in metres of its frame, with a mark for each of ``changes`` (`kind`, `x`, `y`, `size_m`)."""
     height, width = (cells * grid.resolution for cells in grid.cells.shape)
     left, bottom = grid.origin
@@ -64,7 +64,7 @@ def grid_figure(grid: Grid, changes: Sequence[Mapping[str, Any]] = ()) -> Figure
     )
     named = " Squares: walls that are new in this drive (orange) and gone (blue)." if marks else ""
     caption = f"White is free, black a wall, grey unknown; {width:.1f} m x {height:.1f} m, cells of {grid.resolution:g} m.{named}"
-    return Figure(svg, "Occupancy grid of the map", caption)
+    return html.Figure(svg, "Occupancy grid of the map", caption)
 
 
 def data_url(grid: Grid) -> str:
@@ -72,14 +72,14 @@ def data_url(grid: Grid) -> str:
     return "data:image/png;base64," + base64.b64encode(png(grid)).decode()
 
 
-def change_blocks(found: Mapping[str, Any]) -> list[Block]:
+def change_blocks(found: Mapping[str, Any]) -> list[html.Block]:
     """What of the map has changed, in a sentence, by ``found`` of `Run.localization`."""
     places = found.get("changes", ())
     if not places:
         return []
     share = 100.0 * float(found["changed_share"])
     listed = "; ".join(f"{p['kind']} at x {p['x']:.1f} m, y {p['y']:.1f} m ({p['size_m']:.1f} m)" for p in places)
-    return [Paragraph(f"Of the saved map's walls that were seen, {share:.1f} % have changed: {listed}.")]
+    return [html.Paragraph(f"Of the saved map's walls that were seen, {share:.1f} % have changed: {listed}.")]
 
 
 def _explorer_data(mapped: KeyframeMap, grid: Grid) -> dict[str, Any]:

@@ -15,24 +15,9 @@ from scipy.stats import chi2
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report import figures
+from localization.report import page as html
 from localization.report.interactive import Scans, explorer
 from localization.report.map_page import change_blocks, grid_figure, picture_grid
-from localization.report.page import (
-    Block,
-    Cell,
-    Definitions,
-    Figure,
-    LegendItem,
-    Page,
-    Paragraph,
-    Row,
-    Section,
-    Table,
-    bullets,
-    glossary,
-    render,
-    write_new,
-)
 from localization.report.runs import MapView, PlottedRun, best_run, map_view, nis_means, plotted_runs, relation_bins, timeline
 from localization.report.summary import is_close, metres, verdict, verdict_sentences
 
@@ -95,14 +80,14 @@ def write_report(
     path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None, is_interactive: bool = True
 ) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    write_new(path, page(head, results, reference, is_interactive).encode())
+    html.write_new(path, page(head, results, reference, is_interactive).encode())
 
 
 def overview_png(path: str | Path, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
     """Write one picture: trajectories over the map beside a bar for each error. Raises `OutputError` as `write_report` does."""
     runs = plotted_runs(results)
     measure = "mean error of the relations [m]" if isinstance(reference, Relations) else "position error, ATE [m]"
-    write_new(path, figures.overview(runs, map_view(runs, reference), measure, head.log))
+    html.write_new(path, figures.overview(runs, map_view(runs, reference), measure, head.log))
 
 
 def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None, is_interactive: bool = True) -> str:
@@ -111,36 +96,38 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     sentences = verdict_sentences(results, reference)
     sections = [
         *(_sections(runs, reference, head.scans, is_interactive) if runs else []),
-        Section("About the log", bullets(head.warnings) or [Paragraph("No problem was found in it.")]),
-        glossary(_TERMS),
-        Section("Sources and versions", [Definitions(_provenance(head, reference))]),
-        Section("In short", [Paragraph(" ".join(sentences))]),
+        html.Section("About the log", html.bullets(head.warnings) or [html.Paragraph("No problem was found in it.")]),
+        html.glossary(_TERMS),
+        html.Section("Sources and versions", [html.Definitions(_provenance(head, reference))]),
+        html.Section("In short", [html.Paragraph(" ".join(sentences))]),
     ]
     facts = f"{head.robot} · {head.duration_s:,.1f} s from {head.start}"
-    return render(Page(f"Replay of {head.log}", facts, sentences, sections, [run.number for run in runs]))
+    return html.render(html.Page(f"Replay of {head.log}", facts, sentences, sections, [run.number for run in runs]))
 
 
 def _sections(
     runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, scans: Scans, is_interactive: bool
-) -> list[Section]:
+) -> list[html.Section]:
     """Numbers and figures."""
     best = best_run(runs) if reference is not None else None
     near = [run for run in runs if best is not None and run is not best and run.error is not None and is_close(run, best)]
     notes = " ".join(_about_reference(runs, reference))
     explore = [explorer(runs, reference, scans)] if is_interactive and any(len(run.result.run.trajectory) for run in runs) else []
     return [
-        Section("Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), Paragraph(notes, is_small=True)]),
-        Section("Explore", explore),
-        Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
-        Section("Map", _grid_blocks(runs)),
-        Section("Errors", _error_figure(runs, reference), is_static=bool(explore) and not isinstance(reference, Relations)),
-        Section("Innovations: are the covariances consistent?", _nis_figure(runs), is_static=bool(explore)),
-        Section("Estimated parameters", _with_note(parameter_table(runs), "Mean ± sigma at the end of the drive.")),
-        Section("Counts", _with_note(count_table(runs), "")),
+        html.Section(
+            "Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), html.Paragraph(notes, is_small=True)]
+        ),
+        html.Section("Explore", explore),
+        html.Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
+        html.Section("Map", _grid_blocks(runs)),
+        html.Section("Errors", _error_figure(runs, reference), is_static=bool(explore) and not isinstance(reference, Relations)),
+        html.Section("Innovations: are the covariances consistent?", _nis_figure(runs), is_static=bool(explore)),
+        html.Section("Estimated parameters", _with_note(parameter_table(runs), "Mean ± sigma at the end of the drive.")),
+        html.Section("Counts", _with_note(count_table(runs), "")),
     ]
 
 
-def _grid_blocks(runs: Sequence[PlottedRun]) -> list[Block]:
+def _grid_blocks(runs: Sequence[PlottedRun]) -> list[html.Block]:
     """The grid of the last map of a graph, or of a drive in a saved map; and what of the saved map has changed."""
     mapped = [run.result.run for run in runs if run.result.run.keyframes is not None and len(run.result.run.keyframes.points)]
     if not mapped or mapped[-1].keyframes is None:
@@ -149,10 +136,10 @@ def _grid_blocks(runs: Sequence[PlottedRun]) -> list[Block]:
     return [grid_figure(picture_grid(mapped[-1].keyframes), found.get("changes", ())), *change_blocks(found)]
 
 
-def _with_note(table: Table | None, note: str) -> list[Block]:
+def _with_note(table: html.Table | None, note: str) -> list[html.Block]:
     if table is None:
         return []
-    return [table, Paragraph(note, is_small=True)] if note else [table]
+    return [table, html.Paragraph(note, is_small=True)] if note else [table]
 
 
 def _about_reference(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> list[str]:
@@ -176,7 +163,7 @@ def _about_reference(runs: Sequence[PlottedRun], reference: ReferenceTrack | Rel
     return [*sentences, *dict.fromkeys(warning for a in scored for warning in a.warnings)]
 
 
-def _map_figure(runs: Sequence[PlottedRun], view: MapView) -> Figure:
+def _map_figure(runs: Sequence[PlottedRun], view: MapView) -> html.Figure:
     aligned = "Each run is aligned with the reference as a whole." if view.reference is not None else "All runs start at the same pose."
     sentences = [aligned]
     if view.map_of is not None:
@@ -188,14 +175,14 @@ def _map_figure(runs: Sequence[PlottedRun], view: MapView) -> Figure:
         sentences.append(f"{view.n_cut} of the runs leave{'s' if view.n_cut == 1 else ''} the picture.")
     legend = _legend(runs, has_boxes=len(runs) > 1)
     if view.reference is not None:
-        legend.append(LegendItem(symbol="rule", text="reference"))
+        legend.append(html.LegendItem(symbol="rule", text="reference"))
     if len(view.points):
-        legend.append(LegendItem(symbol="dots", text="LiDAR map"))
-    legend.append(LegendItem(symbol="ring", text="start"))
-    return Figure(figures.map_svg(runs, view), "Trajectories from above", " ".join(sentences), legend)
+        legend.append(html.LegendItem(symbol="dots", text="LiDAR map"))
+    legend.append(html.LegendItem(symbol="ring", text="start"))
+    return html.Figure(figures.map_svg(runs, view), "Trajectories from above", " ".join(sentences), legend)
 
 
-def _error_figure(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> list[Block]:
+def _error_figure(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> list[html.Block]:
     if isinstance(reference, Relations):
         scored = [run for run in runs if run.result.accuracy is not None]
         if not scored:
@@ -207,7 +194,7 @@ def _error_figure(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
             f"Relations in each point, from left: {numbers}."
         )
         return [
-            Figure(
+            html.Figure(
                 figures.relation_bins_svg(scored, binned), "Errors of the relations by the time that they span", caption, _legend(scored)
             )
         ]
@@ -219,10 +206,10 @@ def _error_figure(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
         "Each run is aligned with the reference as a whole, so errors at one time depend on those at others: large at both ends and small "
         "between is a path that bends."
     )
-    return [Figure(figures.timeline_svg(shown, series), "Errors over time", caption, _legend(shown))]
+    return [html.Figure(figures.timeline_svg(shown, series), "Errors over time", caption, _legend(shown))]
 
 
-def _nis_figure(runs: Sequence[PlottedRun]) -> list[Block]:
+def _nis_figure(runs: Sequence[PlottedRun]) -> list[html.Block]:
     shown, means = nis_means(runs, float(chi2.ppf(0.95, 3)))
     if not shown:
         return []
@@ -231,13 +218,13 @@ def _nis_figure(runs: Sequence[PlottedRun]) -> list[Block]:
         f"Each point is the mean of {means[0].group} successive scans. Above the band, scans and prediction differ by more than their "
         f"covariances allow; below it, by less. Single scans within their own 95 % limit: {inside} (95 % expected)."
     )
-    legend = [*_legend(shown), LegendItem(symbol="dots", colour="band", text="95 % band of a consistent filter")]
-    return [Figure(figures.nis_svg(shown, means), "Normalised innovations over time", caption, legend)]
+    legend = [*_legend(shown), html.LegendItem(symbol="dots", colour="band", text="95 % band of a consistent filter")]
+    return [html.Figure(figures.nis_svg(shown, means), "Normalised innovations over time", caption, legend)]
 
 
-def _legend(runs: Sequence[PlottedRun], has_boxes: bool = False) -> list[LegendItem]:
+def _legend(runs: Sequence[PlottedRun], has_boxes: bool = False) -> list[html.LegendItem]:
     """Labels hide and show their run in every figure; the boxes themselves stand in one legend only."""
-    return [LegendItem(run, has_boxes) for run in runs]
+    return [html.LegendItem(run, has_boxes) for run in runs]
 
 
 def _provenance(head: ReportHead, reference: ReferenceTrack | Relations | None) -> dict[str, str]:
@@ -326,7 +313,7 @@ def number(value: float | None, digits: int) -> str:
     return f"{value:,.{digits}f}".replace("-", _MINUS)
 
 
-def accuracy_tables(runs: Sequence[PlottedRun], best: PlottedRun | None, near: Sequence[PlottedRun]) -> list[Table]:
+def accuracy_tables(runs: Sequence[PlottedRun], best: PlottedRun | None, near: Sequence[PlottedRun]) -> list[html.Table]:
     """A row for each run; columns without any value are left out. The smallest error of a column is bold.
 
     ``near``: the runs practically as good as the best. A second table, of mean squares, follows for relations.
@@ -349,20 +336,20 @@ def with_values(columns: Sequence[Column], results: Sequence[Result]) -> list[Co
     return [c for c in columns if any(c.value(result) is not None for result in results)]
 
 
-def _accuracy_table(runs: Sequence[PlottedRun], columns: Sequence[Column], badges: Mapping[int, str], summary: str) -> Table:
+def _accuracy_table(runs: Sequence[PlottedRun], columns: Sequence[Column], badges: Mapping[int, str], summary: str) -> html.Table:
     values = {i: [v for run in runs if (v := c.value(run.result)) is not None] for i, c in enumerate(columns) if c.is_error}
     smallest = {i: min(column, default=None) for i, column in values.items()} if len(runs) > 1 else {}
     rows = []
     for run in runs:
         model = "any: it does not use wheels" if run.model is None else run.model
-        name = Cell(run.result.run.estimator, model, is_bold=True, badge=badges.get(run.number, ""), swatch=run)
+        name = html.Cell(run.result.run.estimator, model, is_bold=True, badge=badges.get(run.number, ""), swatch=run)
         cells = [name]
         for i, column in enumerate(columns):
             value = column.value(run.result)
             bar = _bar(run, value, values[0]) if i == 0 and column.is_error else None
-            cells.append(Cell(number(value, column.digits), is_bold=value is not None and value == smallest.get(i), bar=bar))
+            cells.append(html.Cell(number(value, column.digits), is_bold=value is not None and value == smallest.get(i), bar=bar))
         rows.append(cells)
-    return Table([Cell("Estimator", "motion model"), *(Cell(c.title, c.unit) for c in columns)], rows, summary)
+    return html.Table([html.Cell("Estimator", "motion model"), *(html.Cell(c.title, c.unit) for c in columns)], rows, summary)
 
 
 def _bar(run: PlottedRun, value: float | None, values: Sequence[float]) -> tuple[float, str] | None:
@@ -373,28 +360,28 @@ def _bar(run: PlottedRun, value: float | None, values: Sequence[float]) -> tuple
     return value / widest, run.colour
 
 
-def parameter_table(runs: Sequence[PlottedRun]) -> Table | None:
+def parameter_table(runs: Sequence[PlottedRun]) -> html.Table | None:
     """Mean and sigma of what was estimated besides the pose; None if nothing was."""
     cells = {run.number: {name: plus_minus(*value) for name, value in run.result.run.parameters.items()} for run in runs}
-    return _by_name(runs, cells, lambda name: Cell(name, unit_of(name), is_code=True))
+    return _by_name(runs, cells, lambda name: html.Cell(name, unit_of(name), is_code=True))
 
 
-def count_table(runs: Sequence[PlottedRun]) -> Table | None:
+def count_table(runs: Sequence[PlottedRun]) -> html.Table | None:
     """Number of occurrences by name; None if nothing was counted."""
-    cells = {run.number: {name: Cell(f"{count:,}") for name, count in run.result.run.counts.items()} for run in runs}
-    return _by_name(runs, cells, lambda name: Cell(name.replace("_", " ")))
+    cells = {run.number: {name: html.Cell(f"{count:,}") for name, count in run.result.run.counts.items()} for run in runs}
+    return _by_name(runs, cells, lambda name: html.Cell(name.replace("_", " ")))
 
 
-def plus_minus(mean: float, sigma: float) -> Cell:
+def plus_minus(mean: float, sigma: float) -> html.Cell:
     """``mean ± sigma`` to two digits of sigma, small numbers with a power of ten."""
     if not (math.isfinite(mean) and math.isfinite(sigma)):
-        return Cell(f"{number(mean, 4)} ± {number(sigma, 4)}")
+        return html.Cell(f"{number(mean, 4)} ± {number(sigma, 4)}")
     largest = max(abs(mean), abs(sigma))
     power = math.floor(math.log10(largest)) if 0.0 < largest < 1e-3 or largest >= 1e6 else 0
     mean, sigma = mean / 10.0**power, sigma / 10.0**power
     digits = min(max(1 - math.floor(math.log10(abs(sigma))), 0), 9) if sigma else 4
     text = f"{mean:z.{digits}f} ± {sigma:.{digits}f}".replace("-", _MINUS)
-    return Cell(text, power=str(power).replace("-", _MINUS)) if power else Cell(text)
+    return html.Cell(text, power=str(power).replace("-", _MINUS)) if power else html.Cell(text)
 
 
 def unit_of(name: str) -> str:
@@ -402,10 +389,12 @@ def unit_of(name: str) -> str:
     return next((unit for ending, unit in _UNITS if name.endswith(ending)), "")
 
 
-def _by_name(runs: Sequence[PlottedRun], cells: Mapping[int, Mapping[str, Cell]], title: Callable[[str], Cell]) -> Table | None:
+def _by_name(
+    runs: Sequence[PlottedRun], cells: Mapping[int, Mapping[str, html.Cell]], title: Callable[[str], html.Cell]
+) -> html.Table | None:
     names = list(dict.fromkeys(name for run in runs for name in cells[run.number]))
     shown = [run for run in runs if cells[run.number]]
     if not names:
         return None
-    rows: list[Row] = [[title(name), *(cells[run.number].get(name, Cell(MISSING)) for run in shown)] for name in names]
-    return Table([Cell(), *(Cell(run.label, swatch=run) for run in shown)], rows)
+    rows: list[html.Row] = [[title(name), *(cells[run.number].get(name, html.Cell(MISSING)) for run in shown)] for name in names]
+    return html.Table([html.Cell(), *(html.Cell(run.label, swatch=run) for run in shown)], rows)

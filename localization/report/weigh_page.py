@@ -12,22 +12,10 @@ from scipy.stats import chi2
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.weigh import PRIOR_SIGMAS, DrivenWeighing
+from localization.report import page as html
 from localization.report.charts import Chart, Series
 from localization.report.figures import Figure as Canvas
 from localization.report.figures import svg
-from localization.report.page import (
-    COLOURS,
-    Cell,
-    Figure,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    bullets,
-    glossary,
-    render,
-    write_new,
-)
 from motion_models.robot import Geometry
 from motion_models.se2 import FloatArray
 
@@ -77,7 +65,7 @@ def weigh_rows(found: DrivenWeighing, at: tuple[float, float] | None) -> list[We
 
 def write_weigh_page(path: Path, sentence: str, found: DrivenWeighing, geometry: Geometry, at: tuple[float, float] | None) -> None:
     """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    write_new(path, weigh_page(sentence, found, geometry, at).encode())
+    html.write_new(path, weigh_page(sentence, found, geometry, at).encode())
 
 
 def weigh_page(sentence: str, found: DrivenWeighing, geometry: Geometry, at: tuple[float, float] | None) -> str:
@@ -85,17 +73,17 @@ def weigh_page(sentence: str, found: DrivenWeighing, geometry: Geometry, at: tup
     ellipse = confidence_ellipse(found.position, found.covariance)
     wheels = np.array([[sx * geometry.wheelbase_m, sy * geometry.track_width_m] for sx in (0.5, -0.5) for sy in (0.5, -0.5)])
     caption = "From above, ahead to the right. The cross is where the robot file has the centre of gravity."
-    figure = Figure(_svg(found, ellipse, wheels, at), "Centre of gravity between the wheels", caption)
+    figure = html.Figure(_svg(found, ellipse, wheels, at), "Centre of gravity between the wheels", caption)
     sections = [
-        Section("Explore", [_cg_chart(found, ellipse, wheels, at)]),
-        Section("Centre of gravity", [figure], is_static=True),
-        Section("Result", [_table(found, at)]),
-        Section("Estimated with it", _corrections(found.corrections)),
-        Section("Remarks", bullets(found.warnings)),
-        glossary(_TERMS),
+        html.Section("Explore", [_cg_chart(found, ellipse, wheels, at)]),
+        html.Section("Centre of gravity", [figure], is_static=True),
+        html.Section("Result", [_table(found, at)]),
+        html.Section("Estimated with it", _corrections(found.corrections)),
+        html.Section("Remarks", html.bullets(found.warnings)),
+        html.glossary(_TERMS),
     ]
     about = f"{found.windows} windows · {found.turned_rad:.0f} rad of turning by the wheels · motion by {found.motion_reference}"
-    return render(Page(f"Weighing by {found.log}", f"{found.robot} · {about}", [sentence], sections))
+    return html.render(html.Page(f"Weighing by {found.log}", f"{found.robot} · {about}", [sentence], sections))
 
 
 def confidence_ellipse(centre: FloatArray, covariance: FloatArray, probability: float = _SHOWN) -> FloatArray:
@@ -126,23 +114,23 @@ def _cg_chart(found: DrivenWeighing, ellipse: FloatArray, wheels: FloatArray, at
 def _svg(found: DrivenWeighing, ellipse: FloatArray, wheels: FloatArray, at: tuple[float, float] | None) -> str:
     def draw(figure: Canvas) -> None:
         axes = figure.add_subplot()
-        axes.fill(*ellipse.T, facecolor=COLOURS["sky"], edgecolor=COLOURS["blue"], linewidth=1.0)
-        axes.plot(*wheels.T, "s", color=COLOURS["ink"], markersize=9.0)
-        axes.plot(*found.given, "x", color=COLOURS["grey"], markersize=8.0)
-        axes.plot(*found.position, "o", color=COLOURS["blue"], markersize=5.0)
+        axes.fill(*ellipse.T, facecolor=html.COLOURS["sky"], edgecolor=html.COLOURS["blue"], linewidth=1.0)
+        axes.plot(*wheels.T, "s", color=html.COLOURS["ink"], markersize=9.0)
+        axes.plot(*found.given, "x", color=html.COLOURS["grey"], markersize=8.0)
+        axes.plot(*found.position, "o", color=html.COLOURS["blue"], markersize=5.0)
         if at is not None:
-            axes.plot(*at, "^", color=COLOURS["orange"], markersize=7.0)
+            axes.plot(*at, "^", color=html.COLOURS["orange"], markersize=7.0)
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
     return svg("cg", _WIDTH_IN, 4.2, draw)
 
 
-def _table(found: DrivenWeighing, at: tuple[float, float] | None) -> Table:
+def _table(found: DrivenWeighing, at: tuple[float, float] | None) -> html.Table:
     titles = ("Quantity", "Unit", "Robot file", "Found", "Sigma", "95 % interval")
-    return Table([Cell(title) for title in titles], [[Cell(text) for text in row.texts] for row in weigh_rows(found, at)])
+    return html.Table([html.Cell(title) for title in titles], [[html.Cell(text) for text in row.texts] for row in weigh_rows(found, at)])
 
 
-def _corrections(corrections: Mapping[str, tuple[float, float]]) -> list[Table | Paragraph]:
+def _corrections(corrections: Mapping[str, tuple[float, float]]) -> list[html.Table | html.Paragraph]:
     """What else could turn the robot in the same way: size, sigma, and its share of what robots differ by."""
     rows = []
     for name, (size, sigma) in corrections.items():
@@ -150,8 +138,8 @@ def _corrections(corrections: Mapping[str, tuple[float, float]]) -> list[Table |
         in_prior = "" if prior is None else f"{size / prior:+.1f}"
         unit = CAUSES[name].unit if name in CAUSES else "1"
         cells = (f"{size:+.3g}", f"{sigma:.2g}", "" if unit == "1" else unit, in_prior)
-        rows.append([Cell(name, is_code=True), *map(Cell, cells)])
+        rows.append([html.Cell(name, is_code=True), *map(html.Cell, cells)])
     if not rows:
         return []
     titles = ("Quantity", "Size", "Sigma", "Unit", "In sigmas of its prior")
-    return [Table([Cell(title) for title in titles], rows, is_sortable=True)]
+    return [html.Table([html.Cell(title) for title in titles], rows, is_sortable=True)]
