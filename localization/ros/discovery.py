@@ -114,6 +114,11 @@ class TopicDiscovery:
                 report(text)
         raise KeyboardInterrupt
 
+    @property
+    def has_clouds(self) -> bool:
+        """Whether a cloud was received."""
+        return any(self.candidates[topic] == TYPES["points"] for topic in self._counts)
+
     def _receive(self, received: Received) -> None:
         if received.topic == self._tf_static:
             self._transforms.insert(received.data)

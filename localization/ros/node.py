@@ -104,7 +104,7 @@ class Node:
         # now: subscribers have found it by the first estimate
         publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
         needed = read_head(state_file).get("topics", []) if state_file is not None and state_file.exists() else []
-        discovered = discovery.discover(config.wait_s, needed, report, is_over, warming.is_done)
+        discovered = discovery.discover(config.wait_s, needed, report, is_over, lambda: warming.is_done(with_clouds=discovery.has_clouds))
         trial = run.make_trial(discovered.parts.sources.lidar is not None)
         for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)

@@ -72,7 +72,7 @@ def test_live_node_with_the_right_side_reversed_has_one_sentence_and_warns() -> 
         TopicOverrides(),
         node=NodeConfig(wait_s=0.0, predict=False),
     )
-    WarmUp(run).wait()
+    WarmUp(run).wait(with_clouds=False)
     node = Node.start(transport, run, reports.append)
     node.spin(transport.is_empty)
     assert sum("joints.reversed" in report for report in reports) == 1
