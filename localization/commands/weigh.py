@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -32,7 +33,8 @@ class Weigh:
     """Estimate the centre of gravity and an unknown load from how the robot turns."""
 
     log: tyro.conf.Positional[Path]
-    """Log (.bag, folder, .mcap) of about a minute: turns in place to both sides, then tight arcs, ahead and back, on level floor."""
+    """Log (.bag, folder, .mcap) of about a minute: turns in place to both sides, then tight arcs, ahead and back. On slopes of
+    5 to 10 degrees it shows the height of the centre of gravity and the floor's friction as well."""
     robot: str
     """Name of a shipped robot, or path of a robot TOML file: what it weighs, and where its centre of gravity would be without the load."""
     at: tuple[float, float] | None = None
@@ -70,8 +72,10 @@ class Weigh:
         if self.out is not None:
             new = correct_robot(predictor, found.sizes)
             (x, y), (sx, sy) = found.position, found.sigmas
+            height = "" if found.slope is None else f", {found.slope.height:.3f} +- {found.slope.height_sigma:.3f} m high"
             remarks = [
-                f"Weighed by skidloc on {found.log}, from {robot.name}: centre of gravity ({x:+.4f} +- {sx:.4f}, {y:+.4f} +- {sy:.4f}) m.",
+                f"Weighed by skidloc on {found.log}, from {robot.name}: centre of gravity ({x:+.4f} +- {sx:.4f}, {y:+.4f} +- {sy:.4f}) m"
+                f"{height}.",
                 *new.manual_steps,
             ]
             write_text_file(self.out, robot_toml(relocated(new.robot, self.out.parent), remarks="\n".join(remarks)))
@@ -113,6 +117,8 @@ def print_weighing(console: Console, found: DrivenWeighing, at: tuple[float, flo
     for row in weigh_rows(found, at):
         table.add_row(*row.texts)
     console.print(table)
+    if found.slope is not None:
+        console.print(f"on a slope of {math.degrees(found.slope.steepness_rad):.1f} deg", markup=False, soft_wrap=True)
     console.print("load moment: mass times distance from this centre of gravity", markup=False, soft_wrap=True)
     about = f"{found.windows} windows, {found.turned_rad:.0f} rad of turning by the wheels, motion by {found.motion_reference}"
     console.print(about, markup=False, soft_wrap=True)

@@ -20,7 +20,7 @@ from motion_models.calibration.prediction import predict, series_of
 from motion_models.compiled import kernel, subroutine
 from motion_models.extended_model import in_series
 from motion_models.friction import FrictionModel
-from motion_models.robot import DIFF_DRIVE
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 _DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
@@ -99,6 +99,7 @@ _GRAVITY = 9.81
 _GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
 _GYRO_SCALE_SIGMA = 0.03  # sensitivity tolerance of MEMS gyros (see `causes`)
 _MAX_CACHED_TWISTS = 100
+_LEAST_MU = 0.05  # ice
 _MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
 
@@ -289,7 +290,8 @@ class DrivePredictor:
         if drive.forces is not None:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)
-            sx, sy = _GRAVITY * math.sin(hypothesis.slope[0]), _GRAVITY * math.sin(hypothesis.slope[1])
+            turned = np.sinc(batch.measured[:, 2] / (2.0 * math.pi))  # mean of what turns with the body, over its value in the middle
+            sx, sy = (_GRAVITY * math.sin(rise) * turned for rise in hypothesis.slope)
             out[:, 4] = drive.forces[:, 0] - self.kinematic_forces[:, 0] - (c * sx + s * sy)
             out[:, 5] = drive.forces[:, 1] - self.kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
@@ -468,6 +470,7 @@ class _HypothesisModel:
             or b.friction_change
             or b.other_contact_law
             or b.split_friction
+            or b.cg_height
         )
         is_changed = is_changed or b.stiffness_exponent
         if not (is_changed or any(b.slope) or p.has_inertia):
@@ -480,6 +483,7 @@ class _HypothesisModel:
         params[6], params[7] = max(params[6], 0.0), max(params[7], 0.0)
         params[9] = min(max(params[9], -0.9), 0.9)
         params[1] = max(params[1], 0.2 * friction.nominal[1])
+        params[3] = max(params[3], _LEAST_MU)
         law = friction
         if b.other_contact_law:
             share = min(b.other_contact_law, _MAX_CONTACT_LAW)
@@ -545,19 +549,26 @@ class _HypothesisModel:
             b.stiffness_exponent,
             params.tobytes(),
             b.slope,
+            b.cg_height,
             *(self._load_key() if grip is not p.batch.cg else ()),
             "inertia",
         )
         if key not in p._twists:
             x, y = params[TRACKED[0]], params[TRACKED[1]]
             middle = settled + settled[:, 2:] * np.array([y, -x, 0.0])
-            batch = p.batch
+            batch, robot = p.batch, with_cg_height(p.drive.robot, b.cg_height)
             turned = np.r_[0.0, np.cumsum(settled[:, 2] * batch.dt)]
             headings = p.headings - (turned[batch.first[:-1] + batch.lead] - turned[batch.first[:-1]])
             drive = ManeuverSamples(batch.dt, rates, cg, grip, batch.first, p._last, headings, np.array(b.slope), b.stiffness_exponent)
-            twists = dynamic_twists(p.drive.robot, law, params, drive, middle)
+            twists = dynamic_twists(robot, law, params, drive, middle)
             p._twists[key] = np.asarray(twists - twists[:, 2:] * np.array([y, -x, 0.0]))
         return p._twists[key]
+
+
+def with_cg_height(robot: Robot, more: float) -> Robot:
+    """``robot`` whose centre of gravity lies higher by ``more`` [m], above the floor."""
+    g = robot.geometry
+    return robot if not more else dataclasses.replace(robot, geometry=dataclasses.replace(g, cg_height_m=max(g.cg_height_m + more, 0.0)))
 
 
 def _shifted_by_grip(cg: FloatArray, half: tuple[float, float], warp: float, split: float) -> tuple[FloatArray, float]:

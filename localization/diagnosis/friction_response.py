@@ -115,7 +115,7 @@ class ManeuverSamples(NamedTuple):
     headings: FloatArray
     """(W,) at the begin of each maneuver [rad]."""
     slope: FloatArray
-    """(2,) rise of the floor along the x and y axes in which headings count [rad]."""
+    """(2,) direction in which the floor rises, in the axes in which headings count, times its angle [rad]."""
     stiffness_exponent: float
     """Power of the wheels' speed with which the slip stiffness grows."""
 
@@ -128,6 +128,9 @@ def dynamic_twists(robot: Robot, model: FrictionModel, params: FloatArray, drive
     """
     check_parameters(drive.cg, params)
     dynamics = FrictionDynamics.from_robot(robot)
+    steep = math.hypot(*drive.slope.tolist())
+    if steep:  # gravity along the floor over that normal to it
+        drive = drive._replace(slope=drive.slope * (math.tan(steep) / steep))
     body = _Body(
         float(params[3]),
         float(params[8]),
@@ -135,7 +138,7 @@ def dynamic_twists(robot: Robot, model: FrictionModel, params: FloatArray, drive
         dynamics.mass,
         dynamics.inertia,
         dynamics.cg_height,
-        dynamics.gravity,
+        dynamics.gravity * math.cos(steep),
         _CREEP,
         dynamics.rest_speed,
     )

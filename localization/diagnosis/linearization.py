@@ -14,6 +14,7 @@ from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with
 from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, give_columns, mirrored, slip_columns
+from localization.diagnosis.floor_slope import find_floor_slope
 from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel
@@ -250,6 +251,7 @@ def setting_of(predictor: DrivePredictor, moments: int = 0) -> Setting:
         has_ranges=drive.range_slopes is not None,
         has_dropouts=predictor.has_dropouts,
         skids=is_skid_steer(drive.robot),
+        is_on_slope=find_floor_slope(predictor) is not None,
         is_friction_model=predictor.model.name == FrictionModel.name,
         change_times_s=tuple(float(drive.starts_s[-1]) * q for q in np.linspace(0.2, 0.8, moments)) if is_long else (),
     )

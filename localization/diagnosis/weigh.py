@@ -7,6 +7,8 @@ files, as one maximum a posteriori estimate by Gauss-Newton (Barfoot 2017, eqs. 
 motions, S their derivatives and R the noise of the drive:
 
     P = (S^T R^-1 S + diag(1 / sigma_i^2))^-1,    x = P S^T R^-1 z
+
+On a slope gravity pulls along the floor, over mu, and shifts the load downhill by the height of the CG: both are estimated there.
 """
 
 from __future__ import annotations
@@ -60,6 +62,15 @@ PRIOR_SIGMAS: Mapping[str, float] = {
 """How far robots, floors and mounts differ from their files, as a sigma in the cause's unit: what the weighing must not take for a load.
 
 Scrub cannot be negative: its prior is cut there (see `_truncated`)."""
+_ON_SLOPE = ("cg_height", "grip")
+"""Causes that show on slopes alone."""
+_SLOPE_SIGMA = math.radians(6.0)
+"""Sigma of the floor's slope where it is none of a level floor [rad]: hills have 5.8 degrees in the median."""
+_HEIGHT_SIGMA = 0.4
+"""Sigma of the height of the CG, over that of the robot file: loads are put on top."""
+_SLOPE_MODEL_ERROR = 0.1
+"""Error of height and mu, relative, where the friction model does not describe the drive: its slide on slopes is that of MuJoCo within 15 %
+(`tests.studies.hills`)."""
 _SLIP_STIFFNESS_SIGMA = 0.3
 """Sigma of the tyres' slip stiffness, relative: 7.7 to 13.3 on the robots of `tests.studies.contact_law`."""
 _MAX_PRIOR_SIGMAS = 4.0
@@ -76,6 +87,21 @@ _MAX_NOISE_RATIO = 3.0
 _MAX_CORRECTION_SIGMAS = 2.5
 """Over the sigma of its prior; beyond it a correction stands for something else, which may be a part of the load."""
 _WIDENED = "The interval has the errors in it that the model has on other contacts; run `skidloc diagnose`, or weigh on scales."
+
+
+class SlopeWeighing(NamedTuple):
+    """What turning on a slope shows."""
+
+    steepness_rad: float
+    height: float
+    """Of the centre of gravity above the floor [m]."""
+    height_sigma: float
+    given_height: float
+    """By the robot file [m]."""
+    mu: float
+    """Friction of this floor."""
+    mu_sigma: float
+    given_mu: float
 
 
 @dataclass(frozen=True)
@@ -103,6 +129,8 @@ class DrivenWeighing:
     model_errors: tuple[str, ...] = ()
     """Why the friction model does not describe this drive, in sentences; the covariance has the errors of such models in it."""
     warnings: tuple[str, ...] = ()
+    slope: SlopeWeighing | None = None
+    """What only a slope shows; None on a level floor."""
 
     @property
     def position(self) -> FloatArray:
@@ -112,7 +140,8 @@ class DrivenWeighing:
     @property
     def sizes(self) -> dict[Cause, float]:
         """The offset as sizes of causes, to correct a robot by."""
-        return {CAUSES[name]: float(size) for name, size in zip(CG_OFFSETS, self.offset, strict=True)}
+        found = {CAUSES[name]: float(size) for name, size in zip(CG_OFFSETS, self.offset, strict=True)}
+        return found if self.slope is None else {**found, CAUSES["cg_height"]: self.slope.height - self.slope.given_height}
 
     @property
     def sigmas(self) -> FloatArray:
@@ -159,6 +188,7 @@ class DrivenWeighing:
             "model_errors": list(self.model_errors),
             "corrections": {name: {"size": size, "sigma": sigma} for name, (size, sigma) in self.corrections.items()},
             "notes": list(self.warnings),
+            "slope": None if self.slope is None else self.slope._asdict(),
         }
 
 
@@ -187,8 +217,26 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
         corrections={c.key: (float(v), math.sqrt(s)) for c, v, s in zip(causes[2:], values[2:], np.diagonal(cov)[2:], strict=True)},
         model_errors=model_errors,
         warnings=(*model_errors, *drive.warnings),
+        slope=_slope_weighing(robot, estimate, bool(model_errors)),
     )
     return found, predictor
+
+
+def _slope_weighing(robot: Robot, estimate: MapEstimate, has_model_errors: bool) -> SlopeWeighing | None:
+    """Height of the CG and mu of an ``estimate`` on a slope; None on a level floor."""
+    by_id = {cause.id: i for i, cause in enumerate(estimate.causes)}
+    if not set(_ON_SLOPE) <= set(by_id):
+        return None
+    factor = _student_factor(estimate.linearization)
+    (more, log_mu), variances = (
+        values[[by_id[name] for name in _ON_SLOPE]] for values in (estimate.sizes, np.diagonal(estimate.covariance))
+    )
+    steep = math.hypot(*(s for c, s in zip(estimate.causes, estimate.sizes.tolist(), strict=True) if c.id == "slope"))
+    given = robot.geometry.cg_height_m, _nominal(robot, "mu")
+    height, mu = given[0] + float(more), given[1] * math.exp(float(log_mu))
+    systematic = _SLOPE_MODEL_ERROR * np.array([height, mu]) if has_model_errors else np.zeros(2)
+    sigmas = np.sqrt(variances * factor * [1.0, mu**2] + np.square(systematic))
+    return SlopeWeighing(steep, height, float(sigmas[0]), given[0], mu, float(sigmas[1]), given[1])
 
 
 class MapEstimate(NamedTuple):
@@ -248,11 +296,13 @@ def _check(drive: Drive) -> float:
 
 
 def _causes(predictor: DrivePredictor, robot: Robot) -> tuple[Cause, ...]:
-    """Offsets of the CG, and what else may turn the robot in the same way, with their priors."""
+    """Offsets of the CG, and what else may turn the robot in the same way, with their priors; on a slope what shows there as well."""
     cg = cg_prior_sigmas(robot)
-    shown = candidate_causes(predictor, moments=0)
+    shown, sigmas = candidate_causes(predictor, moments=0), dict(PRIOR_SIGMAS)
+    if any(cause.id in _ON_SLOPE for cause in shown):
+        sigmas |= {"slope": _SLOPE_SIGMA, "cg_height": _HEIGHT_SIGMA * robot.geometry.cg_height_m, "grip": CAUSES["grip"].plausible}
     stiffness = dataclasses.replace(slip_stiffness_cause(robot), prior_sigma=_SLIP_STIFFNESS_SIGMA)
-    others = [dataclasses.replace(c, prior_sigma=PRIOR_SIGMAS[c.id]) for c in shown if c.id in PRIOR_SIGMAS]
+    others = [dataclasses.replace(c, prior_sigma=sigmas[c.id]) for c in shown if c.id in sigmas]
     return (*(dataclasses.replace(CAUSES[name], prior_sigma=s) for name, s in zip(CG_OFFSETS, cg, strict=True)), *others, stiffness)
 
 

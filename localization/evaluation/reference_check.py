@@ -108,8 +108,7 @@ class ReferenceComparison:
                 f"{name}: its motion is not that of the robot's sensors at any offset of the clocks up to {_MAX_OFFSET_S:g} s (correlation"
                 f" {self.likeness:.2f} at best): it is of another run or another robot, or its clock is not set.",
             )
-        is_clear = 1.0 - self.unshifted > 2.0 * (1.0 - self.likeness) + 0.01
-        if has_times and abs(self.offset_s) >= _MIN_OFFSET_S and is_clear:
+        if has_times and abs(self.offset_s) >= _MIN_OFFSET_S and _is_clear(self.likeness, self.unshifted):
             leap = next((words for leap, words in _LEAPS_S if abs(abs(self.offset_s) - leap) < 0.25), "")
             way, undo = ("ahead of", "Subtract") if self.offset_s > 0 else ("behind", "Add")
             found.append(
@@ -139,6 +138,11 @@ class ReferenceComparison:
         )
 
 
+def _is_clear(likeness: float, unshifted: float) -> bool:
+    """Whether motions are clearly more alike at another offset of the clocks, by ``likeness``, than at none."""
+    return 1.0 - unshifted > 2.0 * (1.0 - likeness) + 0.01
+
+
 def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) -> ReferenceComparison | None:
     """None where the motion is too small or too even to be compared, or one of them too noisy."""
     start = int(trajectory.stamps_ns[0])
@@ -157,6 +161,8 @@ def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) 
     if not np.isfinite(scores).any():
         return None
     best = int(scores.argmax())
+    if not _is_clear(float(scores[best]), float(scores[n_offset])):  # the second half of a drive may mirror the first
+        best = n_offset
     part = _shifted(found, best, len(grid))
     use = np.isfinite(part.lengths) & np.isfinite(sensors.lengths)
     scale = float(np.sqrt(np.mean(part.lengths[use] ** 2) / np.mean(sensors.lengths[use] ** 2)))

@@ -60,6 +60,10 @@ def weigh_rows(found: DrivenWeighing, at: tuple[float, float] | None) -> list[We
         )
     for i, axis in enumerate("xy"):
         rows.append(WeighRow(f"load moment {axis}", "kg m", "0", float(found.moment[i]), float(found.mass_kg * found.sigmas[i]), 2))
+    if found.slope is not None:
+        s = found.slope
+        rows.append(WeighRow("height of the centre of gravity", "m", f"{s.given_height:.3f}", s.height, s.height_sigma, 3))
+        rows.append(WeighRow("friction of this floor", "", f"{s.given_mu:.2f}", s.mu, s.mu_sigma, 2))
     return rows if at is None else [*rows, WeighRow("load", "kg", "0", *found.payload(*at), 1)]
 
 

@@ -121,6 +121,10 @@ def _split(reality: TrueRobot, size: float) -> TrueRobot:
     return _body(reality, dataclasses.replace(reality.body, grip_split=reality.body.grip_split + size))
 
 
+def _height(reality: TrueRobot, size: float) -> TrueRobot:
+    return _body(reality, dataclasses.replace(reality.body, cg_height=reality.body.cg_height + size))
+
+
 def _slope(reality: TrueRobot, size: float) -> TrueRobot:
     return _body(reality, dataclasses.replace(reality.body, slope=reality.body.slope + size))
 
@@ -151,6 +155,8 @@ _ALL = (
     Fault("rolling_resistance", "1", "rolling resistance over load is more by this", 0.3, _param("rolling_resistance")),
     Fault("scrub", "m", "the contact patches oppose any turn by this, over mu m g, more", 0.1, _param("scrub")),
     Fault("slope", "rad", "the floor rises towards the world's +x by this angle", 0.4, _slope),
+    Fault("cg_height", "m", "the CG lies higher than in the robot file", 0.3, _height),
+    Fault("grip", "1", "the floor grips more in all directions by this share", 0.9, _param("mu", scaled=True)),
     Fault("encoder_dropout", "1", "share of time in which the front left encoder loses its counts", 0.9, _plain("encoder_lost")),
     Fault("gyro_bias", "rad/s", "the gyro turns about the body's z axis while nothing does", 1.0, _plain("gyro_bias")),
     Fault("gyro_scale", "1", "the gyro's rates are too large by this share", 0.5, _plain("gyro_scale")),

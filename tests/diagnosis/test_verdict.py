@@ -235,7 +235,7 @@ def test_correctable_findings_keep_what_the_contested_one_hardly_moves() -> None
 def test_track_width_twin_beyond_the_wheelbase_is_not_considered(robot: str, twin_m: float) -> None:
     """k goes with t / (t^2 + W^2), which t and W^2 / t share."""
     g, general = load_robot(robot).geometry, CAUSES["track_width"]
-    seen = Setting(load_robot(robot), "log", *(True,) * 6, is_friction_model=True)
+    seen = Setting(load_robot(robot), "log", *(True,) * 6, is_on_slope=True, is_friction_model=True)
     (cause,) = general.variants(general, seen)
     least, most = cause.bounds
     assert least == pytest.approx(min(g.wheelbase_m - g.track_width_m, -2.0 * cause.typical))

@@ -33,7 +33,7 @@ _FLATTENING = 0.0034
 _WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, -1.0))
 _PHYSICAL = frozenset(
     {"wheel_radius_scale", "wheel_radius_difference", "track_width", "payload", "cg_offset_x", "cg_offset_y", "split_friction", "scrub"}
-    | {"rolling_resistance", "slope", "wheel_radius_drift"}
+    | {"rolling_resistance", "slope", "wheel_radius_drift", "cg_height", "grip"}
 )
 _OF_SENSORS = frozenset(
     {"lidar_offset_x", "lidar_offset_y", "lidar_yaw", "lidar_time_offset", "wheel_time_offset", "gyro_bias", "gyro_scale"}

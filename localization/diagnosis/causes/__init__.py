@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import MutableMapping
 
-from localization.diagnosis.causes import floor, gyro_and_ranging, load, mounts_and_clocks, slips, wheels
+from localization.diagnosis.causes import floor, gyro_and_ranging, load, mounts_and_clocks, slips, slopes, wheels
 from localization.diagnosis.causes.cause import Cause
 
 CAUSES: MutableMapping[str, Cause] = {
@@ -48,6 +48,8 @@ CAUSES: MutableMapping[str, Cause] = {
     "rotation_scale": slips.ROTATION_SCALE,
     "rotation_slip_rate": slips.ROTATION_SLIP_RATE,
     "rotation_slip_curvature": slips.ROTATION_SLIP_CURVATURE,
+    "cg_height": slopes.CG_HEIGHT,
+    "grip": slopes.GRIP,
 }
 """All causes by id, in the order in which ties are decided."""
 MISSING_MESSAGES = wheels.MISSING_MESSAGES

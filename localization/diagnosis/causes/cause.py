@@ -77,6 +77,8 @@ class Hypothesis:
     """Power of the wheels' speed with which the slip stiffness grows (`friction_response`)."""
     cg: tuple[float, float] = _part("load", (0.0, 0.0))
     payload_kg: float = _part("load")
+    cg_height: float = _part("floor")
+    """Of the centre of gravity, more [m]."""
     split_friction: float = _part("load")
     """Grip of the left wheels less that of the right ones, over their mean."""
     lidar_offset: tuple[float, float, float] = _part("reference", (0.0, 0.0, 0.0))
@@ -155,6 +157,8 @@ class Setting:
     """An encoder lost counts somewhere."""
     skids: bool
     """The robot's wheels skid in turns; else it turns by its geometry."""
+    is_on_slope: bool
+    """The drive's floor is not level."""
     is_friction_model: bool
     """The diagnosed model has the floor's friction as its parameters."""
     change_times_s: tuple[float, ...] = ()

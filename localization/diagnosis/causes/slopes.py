@@ -1,0 +1,70 @@
+"""Causes that show where gravity pulls along the floor: the height of the centre of gravity, and the floor's grip.
+
+On a slope the line of gravity through the centre of gravity (CG) meets the floor h tan(tilt) farther downhill, and the pull along the
+floor counts over mu. On a level floor h shifts loads only while speeds change, and mu only scales the rolling resistance.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, Setting, add
+from motion_models.friction import FrictionModel
+
+_LEAST_HEIGHT = 0.2
+"""Least height of the CG, as a share of the file's."""
+_LOG_GRIP_SIGMA = 0.4
+"""Sigma of the logarithm of mu: from wet grass to dry concrete, .4 to .9 (Wong 2008, Theory of Ground Vehicles, table 1.3)."""
+_MU = FrictionModel.param_names.index("mu")
+
+
+def _height_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
+    """The height of a robot's CG, which lies above the floor."""
+    height = setting.robot.geometry.cg_height_m
+    return (dataclasses.replace(cause, limits=(-(1.0 - _LEAST_HEIGHT) * height, math.inf)),)
+
+
+def _correct_height(draft: Draft, size: float) -> Draft:
+    g = draft.robot.geometry
+    return draft.with_robot(geometry=dataclasses.replace(g, cg_height_m=g.cg_height_m + size))
+
+
+def _grip_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
+    """Grip of the floor, relative to the robot file's; as a logarithm, which keeps it positive."""
+    nominal = float(FrictionModel.from_robot(setting.robot).nominal[_MU])
+
+    def inject(b: Hypothesis, size: float) -> Hypothesis:
+        now = nominal + b.friction.get("mu", 0.0)
+        return dataclasses.replace(b, friction={**b.friction, "mu": now * math.exp(size) - nominal})
+
+    return (dataclasses.replace(cause, inject=inject),)
+
+
+def _correct_grip(draft: Draft, size: float) -> Draft:
+    own = dict(draft.robot.models[FrictionModel.name])
+    own["mu"] *= math.exp(size)
+    return draft.with_robot(models={**draft.robot.models, FrictionModel.name: own})
+
+
+CG_HEIGHT = Cause(
+    "cg_height",
+    *("m", "the centre of gravity lies higher than in the robot file; it shows on slopes", 0.1, 0.02, add("cg_height")),
+    ("the centre of gravity lies {} higher than the robot file has it", "the centre of gravity lies {} lower than the robot file has it"),
+    correct=_correct_height,
+    remedy="weigh the robot on a slope (`skidloc weigh`), or set cg_height_m = {g.cg_height_m:.3f}",
+    applies=lambda s: s.is_on_slope,
+    by_skidding=True,
+    variants=_height_of_robot,
+)
+GRIP = Cause(
+    "grip",
+    *("1", "the floor grips more in all directions, by this logarithm of mu; it shows on slopes", 0.3, 0.05, lambda b, s: b),
+    ("the floor grips {} more in all directions", "the floor grips {} less in all directions"),
+    correct=_correct_grip,
+    remedy="on this floor, set [models.friction] mu",
+    applies=lambda s: s.is_on_slope,
+    by_skidding=True,
+    variants=_grip_of_robot,
+    prior_sigma=_LOG_GRIP_SIGMA,
+)
