@@ -73,6 +73,8 @@ class LidarYawCheck:
         self._config = LidarConfig()
         self._moving_ns: int | None = None
         self._scans, self._next_scan, self._way_m = 0, 0, 0.0
+        self.contradicted_way_m = 0.0
+        """By the wheels since the start, while a LiDAR travels in another direction than they do [m]; else 0."""
         self.is_done = False
         """The mount agrees, or is certainly wrong, or a minute has passed."""
 
@@ -87,7 +89,11 @@ class LidarYawCheck:
             self._add_wheels(event)
         elif isinstance(event, Scan) and self.has_moved:
             self._scans += 1
-            _register(self._travels[event.frame_id], event, self._mounts.get(event.frame_id, Mount()), self._config)
+            travel = self._travels[event.frame_id]
+            intervals = len(travel.rows)
+            _register(travel, event, self._mounts.get(event.frame_id, Mount()), self._config)
+            is_contradicted = self._is_contradicted(event.frame_id) if len(travel.rows) > intervals else self.contradicted_way_m > 0.0
+            self.contradicted_way_m = self._way_m if is_contradicted else 0.0
             if self._way_m > _SURE_WAY_M and self._scans >= self._next_scan:
                 self._next_scan = self._scans + _SCANS_PER_RESULT
                 is_healthy = all(self._is_healthy(frame) for frame in self._travels)
@@ -114,6 +120,10 @@ class LidarYawCheck:
     def _is_healthy(self, frame: str) -> bool:
         direction = _direction(*self._compare(frame)[:2])
         return direction is not None and abs(direction) <= _MAX_SLIDE_RAD
+
+    def _is_contradicted(self, frame: str) -> bool:
+        by_wheels, by_scans, _ = self._compare(frame)
+        return len(by_wheels) > 0 and abs(float(np.angle(np.sum(by_scans * by_wheels.conj())))) > _MAX_SLIDE_RAD
 
     def _compare(self, frame: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Way of the sensor by the wheels and by the scans (n,) complex [m] on gentle arcs, and turns (m, 2) by wheels, up to a scale, and

@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from localization.events import ImuSample, Scan
 from localization.lidar import LidarConfig, Sweep
 from localization.logs import Log
-from localization.logs.clouds import cloud_decoder
-from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry, scan_decoder
+from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry
 from localization.logs.event_decoder import TopicDecoder, arc, late_ns
 from localization.logs.topic_names import is_other_estimate
 from localization.logs.topic_roles import TYPES
@@ -269,13 +268,29 @@ class LidarMotion(NamedTuple):
     """(n,) to the left [m/s]."""
 
 
-def lidar_motion(log: Log, signals: WheelSignals) -> LidarMotion | None:
+def bias_at_rest(wheels: FloatArray, other: FloatArray, largest: float) -> float:
+    """Mean of another rate (n,) while the ``wheels`` (n,) stand, up to ``largest``; 0 where they stand for fewer than three intervals."""
+    still = np.abs(wheels) <= 1e-3 * max(float(np.abs(wheels).max()), 1e-9)
+    bias = float(other[still].mean()) if still.sum() >= 3 else 0.0
+    return min(max(bias, -largest), largest)
+
+
+class ScanSource(Protocol):
+    """A log, or what a live LiDAR has measured so far."""
+
+    @property
+    def mounts(self) -> Mapping[str, Mount]:
+        """By frame."""
+
+    def scans(self) -> Iterable[Scan]:
+        """In order; none without a LiDAR."""
+
+
+def lidar_motion(source: ScanSource, signals: WheelSignals) -> LidarMotion | None:
     """Motion by consecutive scans, on the intervals of ``signals``; None without a LiDAR whose scans can be matched."""
-    if log.sources.lidar is None:
-        return None
     n = len(signals.rates)
     edges = np.asarray(signals.start_s + STEP_S * np.arange(n + 1), dtype=float)
-    rows = [row for row in _scan_steps(log, signals.first_ns, signals.start_s) if np.isfinite(row).all()]
+    rows = [row for row in _scan_steps(source, signals.first_ns, signals.start_s) if np.isfinite(row).all()]
     table = np.array(rows).reshape(-1, 5)
     place = np.searchsorted(edges, 0.5 * (table[:, 0] + table[:, 1])) - 1
     rates = np.full((n, 3), np.nan)
@@ -287,20 +302,16 @@ def lidar_motion(log: Log, signals: WheelSignals) -> LidarMotion | None:
     return LidarMotion(rates[:, 0], rates[:, 1], rates[:, 2])
 
 
-def _scan_steps(log: Log, first_ns: int, start_s: float) -> Iterator[FloatArray]:
+def _scan_steps(source: ScanSource, first_ns: int, start_s: float) -> Iterator[FloatArray]:
     """Begin, end [s], way forward [m], turn [rad] and way to the left [m] from scan to scan."""
-    source = log.sources.lidar
-    assert source is not None
-    decode = scan_decoder() if source.kind == "scan" else cloud_decoder(log.period_s.get(source.topic))
     odometry, config, last = ScanOdometry(), LidarConfig(), None
-    for scan in log.readings({source.topic: TopicDecoder(0, decode, late_ns(source.kind, log.robot.clock))}):
-        assert isinstance(scan, Scan)
+    for scan in source.scans():
         at = (scan.middle_ns - first_ns) * 1e-9
         if at < start_s:
             continue
         if at > start_s + _MAX_LIDAR_S:
             return
-        mount = log.mounts.get(scan.frame_id, Mount())
+        mount = source.mounts.get(scan.frame_id, Mount())
         sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
         motion = odometry.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
         if motion is not None and last is not None and motion.has_translation:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from localization.calibration.wheel_signals import WheelSignals
+from localization.calibration.wheel_signals import WheelSignals, bias_at_rest
 from motion_models.prior import skid_prior
 from motion_models.robot import DIFF_DRIVE, Joints, Robot
 from motion_models.se2 import FloatArray
@@ -28,6 +28,8 @@ _SIGMAS = 1.5
 """Largest distance of a measured unit from a unit with a name, in sigmas: beyond, a gear is as likely."""
 _MIN_CORRELATION = 0.9
 _MIN_INTERVALS = 12
+_MAX_BIAS = 3.0
+"""Of a gyro in deg/s: 0.05 rad/s."""
 _FASTEST_M_S = 3.0
 """Speed of such robots; velocities that mean more are no rad/s."""
 _SCALE_UNKNOWN_M2_PER_M = 0.2
@@ -135,6 +137,8 @@ def _ratio(wheels: FloatArray, other: FloatArray) -> float | None:
     """Factor from ``wheels`` (n,) to ``other``; None where they do not follow each other."""
     both = np.isfinite(wheels) & np.isfinite(other)
     a, b = wheels[both], other[both]
+    if len(a):
+        b = b - bias_at_rest(a, b, _MAX_BIAS)
     size = math.sqrt(float(a @ a) * float(b @ b)) if both.sum() >= _MIN_INTERVALS else 0.0
     if size == 0.0 or math.sqrt(float(b @ b) / len(b)) < 0.02 or float(a @ b) / size < _MIN_CORRELATION:
         return None

@@ -16,12 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.calibration.wheel_signals import STEP_S, WheelSignals, lidar_motion, read_signals
+from localization.calibration.wheel_signals import STEP_S, WheelSignals, bias_at_rest, lidar_motion, read_signals
 from localization.calibration.wheel_units import CORRECTED, UnitReport, check_units, expected_scaling, gyro_in_degrees, is_in_degrees
+from localization.events import Scan
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.topic_roles import Sources
 from motion_models.errors import CalibrationError
-from motion_models.robot import Robot
+from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _MIN_CORRELATION = 0.6
@@ -32,6 +33,8 @@ _MIN_TURN_RAD_S, _MIN_SPEED_M_S = 0.03, 0.02
 """Root mean square of motions that are compared."""
 _MIN_INTERVALS = 12
 """Six seconds."""
+_MIN_CLOCK_INTERVALS = 60
+"""Half a minute, of which offsets of up to a third are searched in a live drive."""
 _MAX_BIAS_RAD_S = 0.05
 _UNKNOWN_YAW_RAD2_PER_RAD, _UNKNOWN_WAY_M2_PER_M = 4.0 * math.pi, 40.0
 """Variance per radian turned and metre driven with an unknown sign: a heading of one radian, and a way of ten metres, may be the opposite
@@ -125,10 +128,7 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
         signals = read_signals(log) or signals
     if any(key.startswith("clock.") for key in found.keys):
         return _joined(found, check_wiring(log, is_clock_known=True))
-    units = check_units(signals, found.robot)
-    if units.is_ambiguous or (units.findings and log.sources.lidar is not None and "LiDAR" not in signals.speeds):
-        signals = with_lidar(log, signals)
-        units = check_units(signals, found.robot)
+    units = _units_of(log, signals, found.robot)
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     sentences = (*found.findings, *(text if text.startswith("the gyro") else f"{wheels}: {text}" for text in units.findings))
     robot = _with_unknown_signs(units.robot) if units.is_ambiguous else units.robot
@@ -137,28 +137,44 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
 
 @dataclass(frozen=True)
 class LiveSensors:
-    """A robot and its topics, where no log is."""
+    """A robot, its topics, and what its LiDAR has measured so far, where no log is."""
 
     robot: Robot
     sources: Sources
+    mounts: Mapping[str, Mount]
+    kept: list[Scan] = field(default_factory=list)
+
+    def scans(self) -> Iterable[Scan]:
+        """In order."""
+        return self.kept
 
 
-def check_live(sensors: LiveSensors, signals: WheelSignals) -> WiringReport:
-    """Signs, sides and units of live wheels against the gyro; `WiringReport.robot` is what to write."""
-    base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
-    rates = signals.joint_rates
-    measured = correlations(signals, rates, base)
-    if not _is_accepted(signals, rates, base):
-        return _corrected(sensors, signals, base, measured)
-    units = check_units(signals, sensors.robot)
-    return WiringReport(units.robot, units.findings, units.keys, units.is_ambiguous, measured, units.ratios)
+def check_live(sensors: LiveSensors, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
+    """Clock of the gyro, unless it ``is_clock_known``, then signs and sides, then units of live wheels against gyro and LiDAR.
+
+    The first of them that is wrong is reported; readings by `WiringReport.robot` show the next.
+    """
+    signals, found = _wiring_of(sensors, signals, is_clock_known or len(signals.rates) < _MIN_CLOCK_INTERVALS)
+    if found.findings:
+        return found
+    units = _units_of(sensors, signals, sensors.robot)
+    robot = _with_unknown_signs(units.robot) if units.is_ambiguous else units.robot
+    return WiringReport(robot, units.findings, units.keys, units.is_ambiguous, found.correlations, units.ratios)
+
+
+def _units_of(log: Log | LiveSensors, signals: WheelSignals, robot: Robot) -> UnitReport:
+    """Units of wheels and gyro; with the LiDAR, where they are wrong without it."""
+    units = check_units(signals, robot)
+    if units.is_ambiguous or (units.findings and log.sources.lidar is not None and "LiDAR" not in signals.speeds):
+        units = check_units(with_lidar(log, signals), robot)
+    return units
 
 
 def _joined(first: WiringReport, then: WiringReport) -> WiringReport:
     return replace(then, findings=(*first.findings, *then.findings), keys={**first.keys, **then.keys})
 
 
-def _other_clock(log: Log, signals: WheelSignals, offset_s: float) -> WiringReport:
+def _other_clock(log: Log | LiveSensors, signals: WheelSignals, offset_s: float) -> WiringReport:
     """A gyro whose stamps are later than the wheels' by ``offset_s``; the wheels' are wrong where a LiDAR has the gyro's."""
     signals = with_lidar(log, signals)
     by_lidar = None
@@ -214,7 +230,7 @@ def _with_unknown_signs(robot: Robot) -> Robot:
     return replace(robot, wheel_noise=noise)
 
 
-def _wiring_of(log: Log, signals: WheelSignals, is_clock_known: bool) -> tuple[WheelSignals, WiringReport]:
+def _wiring_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bool) -> tuple[WheelSignals, WiringReport]:
     base = Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints))))
     rates = signals.joint_rates
     offset_s = None if is_clock_known else clock_offset(_signed(rates, base)[1], signals.turns.get("gyro"))
@@ -291,7 +307,7 @@ def _check_multiplier(log: Log, ratio: float, measured: Mapping[str, float]) -> 
     return WiringReport(robot, (text,), {"driver.wheel_separation_multiplier": f"{value:g}"}, correlations=measured, ratios=ratios)
 
 
-def with_lidar(log: Log, signals: WheelSignals) -> WheelSignals:
+def with_lidar(log: Log | LiveSensors, signals: WheelSignals) -> WheelSignals:
     """``signals`` with the motion by scans, where there are any."""
     motion = lidar_motion(log, signals)
     if motion is None:
@@ -314,9 +330,7 @@ def correlation(a: FloatArray, b: FloatArray, least: float, max_bias: float) -> 
     if both.sum() < _MIN_INTERVALS:
         return None
     a, b = a[both], b[both]
-    still = np.abs(a) <= 1e-3 * max(float(np.abs(a).max()), 1e-9)
-    bias = float(b[still].mean()) if still.sum() >= 3 else 0.0
-    b = b - min(max(bias, -max_bias), max_bias)
+    b = b - bias_at_rest(a, b, max_bias)
     size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
     if size_b < least * math.sqrt(len(b)) or size_a == 0.0:
         return None

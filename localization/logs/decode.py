@@ -79,6 +79,10 @@ class MessageStats:
         """Count ``n`` messages of ``topic``."""
         self._counts[topic, oddity] += n
 
+    def clear(self) -> None:
+        """Forget all counts."""
+        self._counts.clear()
+
     def of(self, topic: str, oddity: Oddity) -> int:
         """Count of ``topic`` and ``oddity``."""
         return self._counts[topic, oddity]

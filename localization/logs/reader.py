@@ -16,7 +16,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from localization.errors import LogError, TopicError
-from localization.events import Event, Reference
+from localization.events import Event, Reference, Scan
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
 from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, plan_clocks
@@ -145,6 +145,13 @@ class Log:
         """Payloads of ``decoders`` (by topic) as they are, in order of stamps, by the same clocks as `events`."""
         stats = MessageStats()
         return merge(self._items(decoders, stats), self._clock_plan(list(decoders)), stats)
+
+    def scans(self) -> Iterator[Scan]:
+        """Scans or clouds of the LiDAR alone, with the ranges of its driver; none without a LiDAR."""
+        lidar = self.sources.lidar
+        if lidar is not None:
+            decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, MessageStats(), self.period_s)
+            yield from self.readings({lidar.topic: decoder.decoders[lidar.topic]})
 
     def references(self, topic: str) -> Iterator[Reference]:
         """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.

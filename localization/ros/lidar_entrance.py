@@ -29,6 +29,11 @@ class LidarEntrance:
             self._points -= _points(self._events.popleft())
         return self._check.is_done or self._points > _MAX_POINTS
 
+    @property
+    def largest_error_m(self) -> float:
+        """Of the position [m]: twice the way by the wheels, while the LiDAR travels in another direction; else 0."""
+        return 2.0 * self._check.contradicted_way_m
+
     def result(self) -> tuple[LidarYaw | None, Iterable[Event]]:
         """What was found, and the events since the start of the drive."""
         return self._check.result(), self._events

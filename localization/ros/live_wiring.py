@@ -1,60 +1,142 @@
-"""Signs, sides and units of live wheels and gyro: named once the drive shows them, with the keys of the robot file."""
+"""Signs, sides, units and clocks of live wheels and gyro: once the drive shows them, it is estimated anew with the right ones.
+
+Messages are kept as they came, since the start of the drive, until the sensors agree: what is wrong is the way in which they are read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 from localization.calibration.wheel_signals import signals_of_readings
 from localization.calibration.wheel_units import CORRECTED
-from localization.calibration.wheel_wiring import LiveSensors, check_live
-from localization.events import ImuSample
+from localization.calibration.wheel_wiring import LiveSensors, WiringReport, check_live
+from localization.events import ImuSample, Scan
 from localization.logs.decode import ArmReading, JointReading
-from motion_models.robot import Mount
+from localization.ros.transports.transport import Received
 
-_PERIOD_NS, _LAST_NS = 10_000_000_000, 120_000_000_000
-"""Time between two checks, and from the first motion to the last one: turns both ways come within a minute of driving."""
+_FIRST_NS, _LAST_NS, _LONGER = 6_000_000_000, 120_000_000_000, 1.5
+"""From the first motion to the first check and to the last one, and the factor from check to check: turns both ways come within a minute of
+driving, and what is read again stays twice the drive."""
+_STANDING_NS = 5_000_000_000
+"""Kept of a robot that has not moved: the gyro's bias is learned from it."""
 _MOVED = 0.02
-_NOW = "Not corrected live; write to the robot file and start again:"
+_AGREE = 0.95
+"""Correlation of a turn from where on wheels are as the robot file has them, and no more is read: healthy drives have more."""
+_LIDAR_S = 60.0
+_MAX_POINTS, _MAX_BYTES = 2_000_000, 150_000_000
+"""Of the scans and of the LiDAR's messages that are kept; beyond, its oldest messages are left out, and wheels and gyro bridge them."""
+_NOW = "Corrected from the start of the drive on; write to the robot file:"
 
 
 class LiveWiring:
-    """`add` the readings of a drive, as the drivers publish them; a sentence comes once wheels and gyro contradict the robot file."""
+    """`keep` each message and `add` its readings, until `is_done`; then `found` is what contradicts the robot file."""
 
-    def __init__(self, sensors: LiveSensors, mounts: Mapping[str, Mount], joints: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
-        """``mounts``: by frame; those that are added later are used as well. ``joints``: of the left and right wheels that come."""
-        self._sensors, self._mounts, self._joints = sensors, mounts, joints
-        self._wheels: list[JointReading] = []
-        self._gyro: list[ImuSample] = []
-        self._next_ns: int | None = None
-        self._last_ns = 0
+    def __init__(self, sensors: LiveSensors, joints: tuple[tuple[str, ...], tuple[str, ...]], is_clock_known: bool = False) -> None:
+        """``joints``: of the left and right wheels that come. ``is_clock_known``: do not compare the gyro's clock."""
+        self._sensors, self._joints, self._is_clock_known = sensors, joints, is_clock_known
+        self._messages = KeptMessages("" if sensors.sources.lidar is None else sensors.sources.lidar.topic)
+        self._wheels: deque[JointReading] = deque()
+        self._gyro: deque[ImuSample] = deque()
+        self._points = 0
+        self._moving_ns: int | None = None
+        self._next_ns = 0
+        self.found: WiringReport | None = None
+        """With the robot with which to go on."""
         self.is_done = False
-        """Something was found, or two minutes of driving have passed."""
+        """Something was found, the sensors agree, or two minutes of driving have passed."""
 
-    def add(self, reading: Any) -> tuple[str, ...]:
-        """Take a ``reading`` of any sensor; sentences on what contradicts the robot file, the first time that it is seen."""
+    @property
+    def messages(self) -> Sequence[Received]:
+        """Since the start of the drive."""
+        return self._messages.in_order()
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Sentences on what was found."""
+        return () if self.found is None else tuple(text.replace(CORRECTED, _NOW) for text in self.found.findings)
+
+    def keep(self, received: Received) -> None:
+        """Keep a message, before its readings are added."""
+        self._messages.add(received)
+        if self._moving_ns is None:
+            self._messages.forget(received.received_ns - _STANDING_NS)
+
+    def add(self, reading: Any) -> None:
+        """Take a ``reading`` of any sensor."""
+        if self.is_done:
+            return
         wheels = reading.wheels if isinstance(reading, ArmReading) else reading
         if isinstance(reading, ImuSample):
             self._gyro.append(reading)
+        elif isinstance(reading, Scan):
+            self._add_scan(reading)
         elif isinstance(wheels, JointReading):
             self._add_wheels(wheels)
-            if self._next_ns is not None and wheels.stamp_ns >= self._next_ns:
-                return self._check(wheels.stamp_ns)
-        return ()
+            if self._moving_ns is not None and wheels.stamp_ns >= self._next_ns:
+                self._check(wheels.stamp_ns, self._moving_ns)
+
+    def _add_scan(self, scan: Scan) -> None:
+        is_early = self._moving_ns is not None and scan.stamp_ns < self._moving_ns + _LIDAR_S * 1e9
+        if is_early and self._points < _MAX_POINTS:
+            self._points += len(scan.points)
+            self._sensors.kept.append(scan)
 
     def _add_wheels(self, sample: JointReading) -> None:
         first = self._wheels[0] if self._wheels else sample
         has_moved = bool((abs(sample.velocity) > _MOVED).any() or (abs(sample.position - first.position) > _MOVED).any())
-        if self._next_ns is None and has_moved:
-            self._next_ns, self._last_ns = sample.stamp_ns + _PERIOD_NS, sample.stamp_ns + _LAST_NS
-        elif self._next_ns is None:  # while it stands
-            self._wheels.clear()
-            self._gyro = self._gyro[-1:]
+        if self._moving_ns is None and has_moved:
+            self._moving_ns, self._next_ns = sample.stamp_ns, sample.stamp_ns + _FIRST_NS
         self._wheels.append(sample)
+        if self._moving_ns is None:  # while it stands
+            _forget(self._wheels, sample.stamp_ns - _STANDING_NS)
+            _forget(self._gyro, sample.stamp_ns - _STANDING_NS)
 
-    def _check(self, now_ns: int) -> tuple[str, ...]:
-        self._next_ns = now_ns + _PERIOD_NS
-        signals = signals_of_readings(self._wheels, self._gyro, self._mounts, self._joints)
-        found = () if signals is None else check_live(self._sensors, signals).findings
-        self.is_done = bool(found) or now_ns > self._last_ns
-        return tuple(text.replace(CORRECTED, _NOW) for text in found)
+    def _check(self, now_ns: int, moving_ns: int) -> None:
+        self._next_ns = moving_ns + min(round((now_ns - moving_ns) * _LONGER), _LAST_NS)
+        signals = signals_of_readings(list(self._wheels), list(self._gyro), self._sensors.mounts, self._joints)
+        if signals is None:
+            return
+        report = check_live(self._sensors, signals, self._is_clock_known)
+        turns = [r for name, r in report.correlations.items() if name.startswith("turn")]
+        agrees = bool(turns) and min(report.correlations.values()) >= _AGREE
+        self.found = report if report.findings else None
+        self.is_done = bool(report.findings) or agrees or now_ns >= moving_ns + _LAST_NS
+
+
+def _forget(readings: deque[Any], before_ns: int) -> None:
+    while readings and readings[0].stamp_ns < before_ns:
+        readings.popleft()
+
+
+class KeptMessages:
+    """Messages in order of coming; those of the LiDAR, which are large, up to `_MAX_BYTES`."""
+
+    def __init__(self, lidar: str) -> None:
+        """``lidar``: its topic."""
+        self._lidar_topic = lidar
+        self._lidar: deque[Received] = deque()
+        self._others: deque[Received] = deque()
+        self._bytes = 0
+
+    def add(self, received: Received) -> None:
+        """Keep ``received``."""
+        if received.topic != self._lidar_topic:
+            self._others.append(received)
+            return
+        self._lidar.append(received)
+        self._bytes += len(received.data)
+        while self._bytes > _MAX_BYTES:
+            self._bytes -= len(self._lidar.popleft().data)
+
+    def forget(self, before_ns: int) -> None:
+        """Leave out those that were received earlier [ns]."""
+        while self._others and self._others[0].received_ns < before_ns:
+            self._others.popleft()
+        while self._lidar and self._lidar[0].received_ns < before_ns:
+            self._bytes -= len(self._lidar.popleft().data)
+
+    def in_order(self) -> list[Received]:
+        """All, by the time of receiving."""
+        return sorted([*self._others, *self._lidar], key=lambda received: received.received_ns)

@@ -33,7 +33,7 @@ from localization.ros.live_wiring import LiveWiring
 from localization.ros.operator_commands import OperatorCommands
 from localization.ros.payloads import Payloads
 from localization.ros.publisher import EstimatePublisher, Predictor
-from localization.ros.session import Session, SessionState, StartPose, View, made_by, shared_of
+from localization.ros.session import LiveRobot, Session, SessionState, StartPose, View, made_by, shared_of
 from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, Transport
 from motion_models.errors import RobotError
@@ -67,12 +67,14 @@ class Node:
         self._transforms = discovered.transforms
         self._stats = MessageStats()
         self._shared = {"stats": self._stats, **shared_of(trial)}
-        self._stream = LiveStream(discovered, run.robot, self._stats, transport.epoch_ns, is_ros1=transport.is_ros1)
+        self._discovered = replace(discovered, backlog=())
+        self._stream = self._open_stream()
         self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
         self._predictor = _predictor(trial, run) if run.node.predict else None
         self._commands = OperatorCommands(self, transport, names, report)
         self._problems: set[str] = set()  # that were reported
         self._entrance: LidarEntrance | None = None
+        self._wiring: LiveWiring | None = None
         self._wiring_notes: list[str] = []
         self._next_status = self._next_path = self._next_map = -float("inf")
         self._newest_ns = 0
@@ -137,15 +139,29 @@ class Node:
                 self.session.view = view
             if self.session.head:
                 self._continue_from(self.session.head, discovered.start_ns)
-            elif self._sources.lidar is not None and self._sources.wheels is not None:
-                self._entrance = LidarEntrance(LidarYawCheck(mounts, self._run.robot, self._sources.lidar.topic))
+            else:
+                self._check_lidar()
             if not self.session.head and self._sources.wheels is not None and self._sources.wheels.kind == "joint_states":
-                wiring = LiveWiring(LiveSensors(self._run.robot, self._sources), mounts, discovered.parts.joints)
-                self._stream.on_reading = partial(self._check_wiring, wiring)
+                self._check_wiring(is_clock_known=False)
             for received in discovered.backlog:
                 self._receive(received)
             self._caught_up_ns = self._transport.now_ns()
             failing.pop_all()
+
+    def _open_stream(self) -> LiveStream:
+        return LiveStream(self._discovered, self._run.robot, self._stats, self._transport.epoch_ns, is_ros1=self._transport.is_ros1)
+
+    def _check_lidar(self) -> None:
+        """Compare the LiDAR's mount with the wheels on the first metres, where there are both."""
+        if self._sources.lidar is not None and self._sources.wheels is not None:
+            check = LidarYawCheck(self.session.pipeline.mounts, self._run.robot, self._sources.lidar.topic)
+            self._entrance = LidarEntrance(check)
+
+    def _check_wiring(self, is_clock_known: bool) -> None:
+        """Compare wheels with gyro and LiDAR from here on, until they agree."""
+        sensors = LiveSensors(self._run.robot, self._sources, self.session.pipeline.mounts)
+        self._wiring = LiveWiring(sensors, self._discovered.parts.joints, is_clock_known)
+        self._stream.on_reading = self._wiring.add
 
     def _subscribe(self) -> None:
         """To what is used from here on; wheels are urgent where every message of them makes a prediction."""
@@ -163,6 +179,8 @@ class Node:
         if not isinstance(state.angles, WheelAngles):
             raise CheckpointError(f"the state in '{path}' is of a log. Remove it to start anew.")
         age = check_age(head, start_ns, str(path))
+        if state.wiring is not None:
+            self._rewire(state.wiring)
         self._stream.restore(state.angles)
         self.payloads.loads = state.loads
         self._report(f"resumed from {path}, {age:.1f} s later.")
@@ -274,8 +292,12 @@ class Node:
         if self._commands.execute(received) or self.is_paused:
             return False
         has_estimate = False
+        if self._wiring is not None:
+            self._wiring.keep(received)
         for event in self._stream.events(received):
             has_estimate |= self._process(event, received)
+        if self._wiring is not None and self._wiring.is_done:
+            self._pass_wiring(self._wiring)
         if has_estimate:  # the next scan is farthest now, and does not wait
             self.session.pipeline.run_deferred()
             self.session.save_state(self._head)
@@ -290,13 +312,19 @@ class Node:
         estimates = self.session.process(event, partial(self._publish, event, arrived_ns))
         if (is_predictable or estimates) and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self._publish_prediction()
-        if self._entrance is not None and self._entrance.add(event):
-            self._pass_entrance(self._entrance)
+        if self._entrance is not None:
+            self._add_to_entrance(self._entrance, event)
         self.session.observe(event)
         self._doctor.observe(event)
         if isinstance(event, Scan):
             self._check_frames()
         return bool(estimates)
+
+    def _add_to_entrance(self, entrance: LidarEntrance, event: Event) -> None:
+        is_done = entrance.add(event)
+        self.session.start_error_m = 0.0 if is_done else entrance.largest_error_m
+        if is_done:
+            self._pass_entrance(entrance)
 
     def _pass_entrance(self, entrance: LidarEntrance) -> None:
         """Go on with the LiDAR's mount as it is, or with the right one: then from the start of the drive on."""
@@ -318,13 +346,53 @@ class Node:
         if self.session.view is not None:
             self.session.view.begin(self._run.robot, mounts)
 
-    def _check_wiring(self, wiring: LiveWiring, reading: Any) -> None:
-        """Report signs, sides and units that contradict the robot file; they stay among the warnings."""
-        for text in wiring.add(reading):
+    def _pass_wiring(self, wiring: LiveWiring) -> None:
+        """Go on as the robot file has it, or, from the start of the drive on, with the signs, sides, units and clock that were found."""
+        self._wiring = self._stream.on_reading = None
+        if wiring.found is None:
+            return
+        for text in wiring.texts:
             self._wiring_notes.append(text)
             self._report(text)
-        if wiring.is_done:
-            self._stream.on_reading = None
+        state = self.session.state
+        state.wiring = LiveRobot(wiring.found.robot, not wiring.found.is_ambiguous)
+        self._rewire(state.wiring)
+        state.angles = self._stream.wheel_angles
+        pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
+        self.session.restart(pipeline, state.start)
+        self.insert_present_cg()
+        self._check_lidar()
+        if wiring.found.keys:  # what comes next: units after signs
+            self._check_wiring(is_clock_known=any(key.startswith("clock.") for key in wiring.found.keys))
+        for received in wiring.messages:
+            if self._wiring is not None:
+                self._wiring.keep(received)
+            for event in self._stream.events(received):
+                self._process_again(event)
+        if self._predictor is not None:
+            self._predictor = _predictor(self._trial, self._run)
+        if self.session.view is not None:
+            self.session.view.begin(self._run.robot, pipeline.mounts)
+
+    def _process_again(self, event: Event) -> None:
+        """Without publishing: its estimates are past."""
+        self.session.pipeline.process(event)
+        if self._entrance is not None:
+            self._add_to_entrance(self._entrance, event)
+
+    def _rewire(self, wiring: LiveRobot) -> None:
+        """Read messages from here on as of the robot of ``wiring``."""
+        self._run = replace(self._run, robot=wiring.robot)
+        parts, joints = self._discovered.parts, wiring.robot.joints
+        if {*parts.joints[0]} != {*joints.left} and {*parts.joints[0], *parts.joints[1]} == {*joints.left, *joints.right}:
+            parts = replace(parts, joints=(joints.left, joints.right))
+        if not wiring.uses_gyro:
+            parts = replace(parts, sources=replace(parts.sources, imu=None))
+        self._discovered, self._sources = replace(self._discovered, parts=parts), parts.sources
+        self._stats.clear()
+        loads = self.payloads.loads
+        self._stream = self._open_stream()
+        self.payloads.loads, self.payloads.mounts = loads, self.session.pipeline.mounts
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""

@@ -89,6 +89,13 @@ class StartPose:
     map_cov: FloatArray = field(default_factory=_no_cov)
     """(3, 3) of its right perturbation."""
 
+    def widened(self, sigma_m: float) -> StartPose:
+        """With positions that err by ``sigma_m`` [m] more."""
+        if not sigma_m:
+            return self
+        more = np.diag([sigma_m**2, sigma_m**2, 0.0])
+        return replace(self, odom_cov=self.odom_cov + more, map_cov=self.map_cov + more)
+
     def apply(self, estimate: Estimate) -> Estimate:
         """``estimate``, which is relative to the start, in the published frames; the covariances of start and motion are added."""
         if not any(array.any() for array in (self.odom_T_start, self.odom_cov, self.map_T_start, self.map_cov)):
@@ -110,6 +117,15 @@ def _moved(
     return se2.compose(world_T_start, start_T_body), None if cov is None else cov + A @ start_cov @ A.T
 
 
+@dataclass(frozen=True)
+class LiveRobot:
+    """A robot as its live sensors show it, where they contradict its file."""
+
+    robot: Robot
+    uses_gyro: bool
+    """False where the signs of wheels and gyro contradict each other, and nothing decides."""
+
+
 @dataclass
 class SessionState:
     """What a checkpoint holds."""
@@ -120,6 +136,8 @@ class SessionState:
     """`WheelAngles` of a live session."""
     loads: dict[str, Load] = field(default_factory=dict)
     """Payloads by frame, of a live session."""
+    wiring: LiveRobot | None = None
+    """How the messages of a live session are read, where that is not the robot file's."""
 
 
 class Session:
@@ -145,6 +163,8 @@ class Session:
         self._is_log_referenced = head.get("records") is not None  # by a checkpoint
         self.count = int(head.get("events", 0))
         """Events so far, those before the checkpoint included."""
+        self.start_error_m = 0.0
+        """Standard deviation of the position that published estimates have besides their own [m], while sensors contradict each other."""
         self.view: View | None = None
         self._not_shown: list[Estimate] = []
 
@@ -188,7 +208,8 @@ class Session:
     def process(self, event: Event, publish: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
         """``publish`` is called with each estimate before anything else is done with it. Raises `EstimatorError`."""
         self.count += 1
-        estimates = [self.state.start.apply(estimate) for estimate in self.pipeline.process(event)]
+        start = self.state.start.widened(self.start_error_m)
+        estimates = [start.apply(estimate) for estimate in self.pipeline.process(event)]
         for estimate in estimates:
             publish(estimate)
         self._record(estimates)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from localization.calibration.wheel_wiring import LiveSensors
 from localization.logs import open_log
 from localization.logs.decode import decode_imu
 from localization.logs.event_decoder import TopicDecoder
+from localization.logs.reader import open_source
 from localization.logs.topic_roles import TopicOverrides
 from localization.logs.wheel_messages import wheel_decoder
 from localization.pipeline import Trial
@@ -20,12 +22,15 @@ from localization.ros.live_wiring import LiveWiring
 from localization.ros.node import Node
 from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.transports.transport import Received
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
+from tests.helpers.entrance_drives import Publishing, Vehicle, write
+from tests.helpers.entrance_drives import drive as robot_drive
 from tests.helpers.extended import cases
-from tests.helpers.online import LogTransport
-from tests.helpers.wiring import CASES, ROBOT_TOML, drive, unchanged
+from tests.helpers.online import LogTransport, track
+from tests.helpers.wiring import ROBOT_TOML, drive, unchanged
 
 WRONG = {
     "right side reversed": (lambda a, r: (a * [1, 1, -1, -1], r * [1, 1, -1, -1]), 1.0, 'joints.reversed = ["front_right_wheel"'),
@@ -39,11 +44,10 @@ WRONG = {
 def sentences(path: Path, robot: Robot) -> list[str]:
     log = open_log(path, robot)
     wheels, imu = wheel_decoder((*robot.joints.left, *robot.joints.right), robot.joints), decode_imu
-    wiring, found = LiveWiring(LiveSensors(robot, log.sources), log.mounts, (robot.joints.left, robot.joints.right)), []
+    wiring = LiveWiring(LiveSensors(robot, log.sources, log.mounts), (robot.joints.left, robot.joints.right))
     for reading in log.readings({"/joint_states": TopicDecoder(0, wheels), "/imu/data": TopicDecoder(1, imu)}):
-        if not wiring.is_done:
-            found += wiring.add(reading)
-    return found
+        wiring.add(reading)
+    return [*wiring.texts]
 
 
 @pytest.mark.parametrize("name", cases(WRONG, usual=["right side reversed", "degrees"]))
@@ -60,20 +64,79 @@ def test_live_wiring_of_a_healthy_robot_has_no_sentence(tmp_path: Path) -> None:
     assert sentences(drive(tmp_path / "still.mcap", lambda a, r: (0.0 * a, 0.0 * r)), replace(robot, name="still")) == []
 
 
-@pytest.mark.extended
-@pytest.mark.xdist_group("online")
-def test_live_node_with_the_right_side_reversed_has_one_sentence_and_warns() -> None:
-    robot, reports = load_robot(ROBOT_TOML), []
-    transport = LogTransport(CASES / "H06-right-side-inverted" / "log.mcap")
+SCANNING = Vehicle(scan_hz=8.0, seed=5)
+LIVE = {
+    "right side reversed": (Vehicle(seed=5), Publishing(lambda a, r: (a * [1, 1, -1, -1], r * [1, 1, -1, -1])), "joints.reversed", 1.0),
+    "swapped by gyro and LiDAR": (SCANNING, Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]])), "joints.left", 0.03),
+    "rpm and right side reversed": (
+        SCANNING,
+        Publishing(lambda a, r: (a * [1, 1, -1, -1], 9.5493 * r * [1, 1, -1, -1])),
+        "joints.rate_unit_rad_s = 0.10472",
+        0.03,
+    ),
+    "swapped by the gyro alone": (Vehicle(seed=5), Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]])), "swapped, or", math.inf),
+}
+
+
+def started(vehicle: Vehicle, transport: LogTransport, reports: list[str], state: Path | None = None) -> Node:
+    """A live node; the EKF where there is a LiDAR."""
+    robot = vehicle.robot()
     run = LiveRun(
         robot,
-        lambda has_lidar: Trial(make_model("skid_steer", robot), "odometry"),
-        Files(),
+        lambda has_lidar: Trial(make_model("skid_steer", robot), "ekf" if has_lidar else "odometry"),
+        Files(state=state),
         TopicOverrides(),
         node=NodeConfig(wait_s=0.0, predict=False),
     )
     WarmUp(run).wait(with_clouds=False)
-    node = Node.start(transport, run, reports.append)
+    return Node.start(transport, run, reports.append)
+
+
+@pytest.mark.parametrize("name", cases(LIVE, usual=["right side reversed"]))
+@pytest.mark.xdist_group("online")
+def test_live_node_with_wrong_wiring_goes_back_to_the_start_of_the_drive(name: str, tmp_path: Path) -> None:
+    """The last published pose is the true one, within ``error_m`` and within its covariance."""
+    vehicle, how, words, error_m = LIVE[name]
+    motion, reports = robot_drive(vehicle), []
+    transport = LogTransport(write(tmp_path / "log.mcap", vehicle, motion, how))
+    node = started(vehicle, transport, reports)
     node.spin(transport.is_empty)
-    assert sum("joints.reversed" in report for report in reports) == 1
-    assert any("joints.reversed" in warning for warning in node.warnings())
+    named = [report for report in reports if "write to the robot file" in report or "Nothing in the log decides" in report]
+    assert words in " ".join(named)
+    assert set(named) <= set(node.warnings())
+    live = track(transport)
+    pose, sigmas = live[max(live)]
+    errors = pose - motion.trajectory().at(np.array([min(max(live), motion.trajectory().stamps_ns[-1])]))[0]
+    errors[2] = math.remainder(errors[2], math.tau)
+    assert math.hypot(*errors[:2]) < error_m
+    assert (np.abs(errors) < 4.0 * sigmas).all()
+
+
+@pytest.mark.extended
+@pytest.mark.xdist_group("online")
+def test_live_node_that_resumes_reads_its_wheels_as_they_were_found(tmp_path: Path) -> None:
+    vehicle, how, _, _ = LIVE["right side reversed"]
+    log = write(tmp_path / "log.mcap", vehicle, robot_drive(vehicle), how)
+    source = open_source(log)
+    middle_ns = source.start_ns + (source.end_ns - source.start_ns) // 2
+    found = []
+    for is_first in (True, False):
+        begin, end = (source.start_ns, middle_ns) if is_first else (middle_ns, source.end_ns)
+        reports: list[str] = []
+        transport = LogTransport(log, lambda messages, b=begin, e=end: part_of(messages, b - source.start_ns, e - source.start_ns))
+        node = started(vehicle, transport, reports, tmp_path / "state")
+        node.spin(transport.is_empty)
+        node.finish()
+        found.append((node, reports, track(transport)))
+    assert sum("joints.reversed" in report for report in found[0][1]) == 1
+    assert not any("joints.reversed" in report for report in found[1][1])
+    whole = LogTransport(log)
+    started(vehicle, whole, []).spin(whole.is_empty)
+    live, split = track(whole), found[1][2]
+    np.testing.assert_allclose(split[max(split)][0], live[max(live)][0], atol=0.02)
+
+
+def part_of(messages: list[Received], begin_ns: int, end_ns: int) -> list[Received]:
+    """Those that came between two times since the first."""
+    first = messages[0].received_ns
+    return [m for m in messages if m.topic == "/tf_static" or begin_ns <= m.received_ns - first < end_ns]
