@@ -27,6 +27,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "EstimatorConfig",
+    "GraphFusion",
     "LearnedParameter",
     "MapFusion",
     "Plane",

@@ -240,6 +240,11 @@ class GraphFusion(FilteredOdometry):
         self.graph.apply(GraphUpdate(positions=found, alignment=alignment))
         self._positions = []
 
+    @property
+    def enu_T_map(self) -> Pose2 | None:
+        """(3,) pose of the map in the plane of the positions; None before these have given it."""
+        return self.graph.alignment() if self._is_aligned else None
+
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory at the stamps of ``filtered``; None unless smoothing, or with fewer than two keyframes."""
         self.run_deferred()

@@ -19,10 +19,11 @@ _ECCENTRICITY2 = _FLATTENING * (2.0 - _FLATTENING)
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 
 
-def reference_decoder(kind: str) -> Callable[[Any, int], Reference]:
-    """Decoder of messages of type ``kind`` (one of `topic_roles.REFERENCE_TYPES`); that of NavSatFix keeps the first fix as origin."""
+def reference_decoder(kind: str, datum: FloatArray | None = None) -> Callable[[Any, int], Reference]:
+    """Decoder of messages of type ``kind`` (one of `topic_roles.REFERENCE_TYPES`). Positions of NavSatFix are east and north of ``datum``
+    (2,), latitude and longitude [deg], by default of the first fix."""
     if kind == "sensor_msgs/msg/NavSatFix":
-        return _fix_decoder()
+        return _fix_decoder(datum)
     return {
         "nav_msgs/msg/Odometry": lambda m, stamp: _reference(stamp, m.pose.pose.position, m.pose.pose.orientation, m.pose.covariance),
         "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m, stamp: _reference(
@@ -47,8 +48,11 @@ def _reference(stamp: int, position: Any, orientation: Any, covariance: Any) -> 
     return Reference(stamp, where, yaw, cov)
 
 
-def _fix_decoder() -> Callable[[Any, int], Reference]:
+def _fix_decoder(datum: FloatArray | None) -> Callable[[Any, int], Reference]:
     origin: tuple[FloatArray, FloatArray] | None = None
+    if datum is not None:
+        place = math.radians(datum[0]), math.radians(datum[1])
+        origin = geodetic_to_ecef(*place, 0.0), east_north(*place)
 
     def decode(message: Any, stamp: int) -> Reference:
         nonlocal origin
@@ -97,16 +101,22 @@ _MIN_SIGMA_M = 0.01
 def read_positions(references: Iterable[Reference], source: str) -> list[PositionSample]:
     """Positions of a topic, by stamp; those that are not finite or repeat a stamp are left out. Raises `LogError` if none is left."""
     found: dict[int, PositionSample] = {}
-    for reference in references:
-        if not np.isfinite(reference.position).all():
-            continue
-        cov = reference.covariance[:2, :2]
-        if not np.isfinite(cov).all() or (np.linalg.eigvalsh(cov) <= 0.0).any():
-            cov = _UNKNOWN_SIGMA_M**2 * np.eye(2)
-        found.setdefault(reference.stamp_ns, PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2)))
+    for sample in map(position_sample, references):
+        if sample is not None:
+            found.setdefault(sample.stamp_ns, sample)
     if not found:
         raise LogError(f"{source} has no usable position. `skidloc info` lists the topics and what is wrong with them.")
     return [found[stamp] for stamp in sorted(found)]
+
+
+def position_sample(reference: Reference) -> PositionSample | None:
+    """The position of ``reference`` with a covariance that is at least a receiver's; None where it is not finite."""
+    if not np.isfinite(reference.position).all():
+        return None
+    cov = reference.covariance[:2, :2]
+    if not np.isfinite(cov).all() or (np.linalg.eigvalsh(cov) <= 0.0).any():
+        cov = _UNKNOWN_SIGMA_M**2 * np.eye(2)
+    return PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2))
 
 
 def merge_positions(events: Iterable[Event], positions: list[PositionSample]) -> Iterator[Event]:

@@ -15,6 +15,7 @@ from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
 from localization.logs.transforms import FixedTransforms
+from localization.logs.wheel_messages import TWIST_TYPES
 from localization.ros.settings import Names
 from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount, Robot
@@ -94,7 +95,7 @@ class TopicDiscovery:
             now = time.monotonic()
             published = self._transport.publishers()
             self._check_types(published)
-            if first is None and any(self.candidates[topic] in _MOTION_TYPES for topic in self._counts):
+            if first is None and any(self.candidates[topic] in (*_MOTION_TYPES, *TWIST_TYPES) for topic in self._counts):
                 first = now
             is_late = first is not None and now - first >= wait_s
             waited_for = {*needed, *(() if is_late else published)} & set(self.candidates)
@@ -104,7 +105,10 @@ class TopicDiscovery:
             if is_settled and not silent and has_mounts and is_ready():
                 for topic in sorted(set(published) & set(self.candidates) - set(self._counts)):
                     report(f"started without {topic}: it is published, but no message comes.")
-                return self._discovered()
+                discovered = self._discovered()
+                for sentence in self._unused(published, {source.topic for source in discovered.parts.sources.used()}):
+                    report(sentence)
+                return discovered
             if (
                 is_ready()
                 and now - begin > wait_s
@@ -129,7 +133,7 @@ class TopicDiscovery:
             message = self._decoders[received.topic](received.data)
         except UnusableError:
             return
-        if stamp_ns(message) and len(self._first[received.topic]) < FIRST_MESSAGES:
+        if hasattr(message, "header") and stamp_ns(message) and len(self._first[received.topic]) < FIRST_MESSAGES:
             wall_ns = received.received_ns + self._transport.epoch_ns
             self._first[received.topic].append(FirstMessage(wall_ns, stamp_ns(message), frame_name(message.header.frame_id)))
         self._counts[received.topic] += 1
@@ -138,13 +142,33 @@ class TopicDiscovery:
             del self._backlog[0]
 
     def _check_types(self, published: Mapping[str, set[str]]) -> None:
-        for topic, kind in self.candidates.items():
+        for topic, kind in list(self.candidates.items()):
             found = published.get(topic, set())
             if found and kind not in found and topic not in self._counts:
+                twists = sorted(found & set(TWIST_TYPES))
+                if twists and kind == TYPES["odometry"]:
+                    self._subscribe_anew(topic, twists[0])
+                    continue
                 others = " and ".join(sorted(short_type(other) for other in found))
                 fits = [part for part, its_type in TYPES.items() if its_type in found]
                 advice = f" Pass --topic.{fits[0].replace('_', '-')} {topic}." if fits else ""
                 raise TransportError(f"'{topic}' carries {others}, not {short_type(kind)}.{advice}")
+
+    def _subscribe_anew(self, topic: str, kind: str) -> None:
+        """Receive ``topic`` as another type than the first one."""
+        self._transport.restrict({*self.candidates, self._tf_static} - {topic})
+        self._transport.subscribe(topic, kind, is_latched=False)
+        self.candidates[topic], self._decoders[topic] = kind, decoder(kind, is_ros1=self._transport.is_ros1)
+
+    def _unused(self, published: Mapping[str, set[str]], used: set[str]) -> list[str]:
+        """Sentences on published LiDARs and IMUs that are not used beside one that is."""
+        found = []
+        for role in ("scan", "points", "imu"):
+            of_type = sorted(topic for topic, kinds in published.items() if TYPES[role] in kinds)
+            chosen, others = [topic for topic in of_type if topic in used], [topic for topic in of_type if topic not in used]
+            if chosen and others:
+                found.append(f"{chosen[0]} is used and {', '.join(others)} not: one {role} is. Choose it with --topic.{role}.")
+        return found
 
     def _silence(self, published: Mapping[str, set[str]], silent: Sequence[str]) -> str:
         there = sorted(topic for topic in published if topic in self.candidates)

@@ -18,7 +18,7 @@ import numpy as np
 from localization.calibration.lidar_yaw import LidarYawCheck, corrected
 from localization.calibration.wheel_wiring import LiveSensors
 from localization.errors import CheckpointError
-from localization.estimators import Estimate, MapFusion, PriorMap
+from localization.estimators import Estimate, GraphFusion, MapFusion, PriorMap
 from localization.events import Event, Scan
 from localization.logs.decode import MessageStats
 from localization.maps.place_search import PlaceMap
@@ -26,6 +26,7 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
+from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.lidar_entrance import LidarEntrance
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
@@ -36,6 +37,7 @@ from localization.ros.publisher import EstimatePublisher, Predictor
 from localization.ros.session import LiveRobot, Session, SessionState, StartPose, View, made_by, shared_of
 from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, Transport
+from motion_models import se2
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
 from motion_models.robot import Mount
@@ -72,6 +74,7 @@ class Node:
         self._made = made_by(trial, run.robot, discovered.mounts, self.has_lidar, run.config, "live topics")
         self._predictor = _predictor(trial, run) if run.node.predict else None
         self._commands = OperatorCommands(self, transport, names, report)
+        self._gnss = _gnss(run, transport, self._stats)
         self._problems: set[str] = set()  # that were reported
         self._entrance: LidarEntrance | None = None
         self._wiring: LiveWiring | None = None
@@ -169,6 +172,9 @@ class Node:
         if self._run.node.tf:
             self._transport.subscribe(self._tf, TF_TYPE, is_latched=False)
             transforms.append(self._tf)
+        if self._gnss is not None:
+            self._transport.subscribe(self._gnss.topic, FIX_TYPE, is_latched=False)
+            transforms.append(self._gnss.topic)
         urgent = [source.topic for source in (self._sources.lidar, self._sources.wheels if self._predictor else None) if source is not None]
         topics = [source.topic for source in self._sources.used()]
         self._transport.restrict([*transforms, *topics, *self._commands.topics], [*urgent, *self._commands.topics])
@@ -290,6 +296,10 @@ class Node:
             self._add_mounts(self._transforms.mounts())
             return False
         if self._commands.execute(received) or self.is_paused:
+            return False
+        if self._gnss is not None and received.topic == self._gnss.topic:
+            if (position := self._gnss.decode(received)) is not None:
+                self.session.process(position)
             return False
         has_estimate = False
         if self._wiring is not None:
@@ -449,9 +459,20 @@ class Node:
             self.statuses.append(Status("pause", WARN, "paused: no messages are used. Call ~/pause with data: false to continue."))
         stamp_ns = self._stream.sender_stamp_ns(self._newest_ns, by_lidar=True)
         self._publisher.publish_diagnostics(self.statuses, self._run.robot.name, stamp_ns)
+        self._publish_utm(stamp_ns)
         parameters = self.session.pipeline.estimator.parameters()
         if parameters:
             self._publisher.publish_corrections(parameters, stamp_ns)
+
+    def _publish_utm(self, stamp_ns: int) -> None:
+        """Where the map is in UTM, once positions have given that."""
+        estimator, frame = self.session.pipeline.estimator, self._run.node.utm_frame
+        if self._gnss is None or self._gnss.datum is None or not frame or not isinstance(estimator, GraphFusion):
+            return
+        if (enu_T_map := estimator.enu_T_map) is not None:
+            map_T_start = self.session.state.start.map_T_start
+            enu_T_published = se2.compose(enu_T_map, se2.inverse(map_T_start))
+            self._publisher.publish_map_frame(frame, se2.compose(utm_pose(self._gnss.datum), enu_T_published), stamp_ns)
 
     def _publish_overview(self, now: float) -> None:
         """Path and map, where they are due."""
@@ -472,6 +493,17 @@ class Node:
 
 def _predictor(trial: Trial, run: LiveRun) -> Predictor:
     return Predictor(trial.model, run.robot, run.config.step.max_hold_s, run.node.predict_hz)
+
+
+def _gnss(run: LiveRun, transport: Transport, stats: MessageStats) -> GnssReceiver | None:
+    """Raises `SettingError` for a datum that is none, and for UTM without pyproj."""
+    node = run.node
+    if not node.positions:
+        return None
+    datum = parse_datum(node.datum)
+    if node.utm_frame:
+        utm_pose(np.zeros(2) if datum is None else datum)  # what is missing is reported now
+    return GnssReceiver(node.names.resolve(node.positions), datum, stats, transport.epoch_ns, is_ros1=transport.is_ros1)
 
 
 class StopSignal:

@@ -123,6 +123,12 @@ class EstimatePublisher:
         if self._has_predictions:
             self._transport.publish(self._topics[PREDICTED_ODOMETRY], odometry or self._odometry.odometry(fused))
 
+    def publish_map_frame(self, parent: str, parent_T_map: FloatArray, stamp_ns: int) -> None:
+        """Publish the transform ``parent`` -> `map`, (3,)."""
+        if self._with_tf:
+            writer = FusedWriter(is_ros1=self._transport.is_ros1, parent=parent, body=self._frames.map_frame)
+            self._transport.publish(self._topics[TF], writer.transform(FusedEstimate(stamp_ns, parent_T_map, np.zeros(3))))
+
     def _publish_pose(self, estimate: Estimate, stamp_ns: int) -> None:
         """geometry_msgs/PoseWithCovarianceStamped in `map`."""
         cov = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))

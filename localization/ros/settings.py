@@ -37,6 +37,14 @@ _NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _NAMESPACE = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _TOPIC = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _GLOBAL = ("/tf", "/tf_static", "/diagnostics")
+_CLEARPATH_TOPICS = {
+    "joint_states": "/platform/joint_states",
+    "odometry": "/platform/odom",
+    "imu": "/sensors/imu_0/data",
+    "scan": "/sensors/lidar2d_0/scan",
+    "points": "/sensors/lidar3d_0/points",
+}
+"""Topics of Clearpath's robots inside their namespace (docs.clearpathrobotics.com, ROS 2 Jazzy, platform and sensors API)."""
 
 PARAMS_FILE = Path(__file__).parent / "share" / "params.yaml"
 _LEFT_OUT = "none"
@@ -89,6 +97,11 @@ class Names(Settings):
         """``topics`` as they are resolved here; parts that are left out or not named stay so."""
         values = {field.name: getattr(topics, field.name) for field in dataclasses.fields(topics)}
         return dataclasses.replace(topics, **{name: self.resolve(topic) for name, topic in values.items() if topic})
+
+    def of_clearpath(self, namespace: str) -> Names:
+        """Names in the ``namespace`` of a Clearpath robot, where transforms and diagnostics are inside it as well."""
+        inside = tuple(f"{topic}:={topic.lstrip('/')}" for topic in _GLOBAL)
+        return dataclasses.replace(self, namespace=f"/{namespace.strip('/')}", remap=(*self.remap, *inside))
 
     def _rules(self) -> list[tuple[str, str]]:
         return [(before, after) for before, after in (rule.split(":=") for rule in self.remap)]
@@ -143,6 +156,14 @@ class NodeConfig(Settings):
     """Time between two messages on `~/map` [s]; 0: none."""
     diagnose_every_min: Annotated[float, tyro.conf.arg(aliases=["--diagnose-every"])] = 5.0
     """Minutes between two diagnoses of the last two minutes, which a process of lowest priority makes and diagnostics report; 0: none."""
+    clearpath: str = ""
+    """Namespace of a Clearpath robot (a200_0000): topics are named as its ROS 2 API has them, /tf and diagnostics are inside it."""
+    positions: str = ""
+    """Topic of a GNSS receiver (sensor_msgs/NavSatFix, as fix), whose positions `graph` fuses; empty: none."""
+    datum: str = ""
+    """LATITUDE,LONGITUDE [deg] from where positions are counted east and north; empty: the first fix."""
+    utm_frame: str = ""
+    """Frame of UTM, of which `map_frame` is published as a child once positions have given its heading (extra `gnss`); empty: none."""
     use_sim_time: bool = False
     """Take the time from /clock, as of a simulator or `ros2 bag play --clock`."""
     frames: Frames = field(default_factory=Frames)
@@ -202,8 +223,14 @@ class OnlineSettings:
         return Trial(make_model(self.model, load_robot(self.robot)), name, form, prior)
 
     def live_run(self) -> LiveRun:
-        """Raises `OutputError`, `RobotError`."""
-        return LiveRun(load_robot(self.robot), self.make_trial, self.files(), self.topic, self.config, self.node)
+        """Raises `OutputError`, `RobotError`, `SettingError`."""
+        robot, node = load_robot(self.robot), self.node
+        if node.clearpath:
+            robot = dataclasses.replace(robot, topics=dataclasses.replace(robot.topics, **_CLEARPATH_TOPICS))
+            node = dataclasses.replace(node, names=node.names.of_clearpath(node.clearpath))
+        if node.positions and self.estimator != "graph":
+            raise SettingError(f"positions are fused by the estimator 'graph' alone, and it is '{self.estimator}'. Pass --estimator graph.")
+        return LiveRun(robot, self.make_trial, self.files(), self.topic, self.config, node)
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,8 @@ class LogTransport(MonotonicTime):
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
         self.subscribed[topic] = is_latched
+        if self.kept is not None:
+            self.kept.add(topic)
 
     def restrict(self, topics, urgent=()) -> None:
         self.kept, self.urgent = set(topics), set(urgent)

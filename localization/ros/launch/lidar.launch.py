@@ -17,6 +17,7 @@ def node(topics, condition):
         "publish_tf": ParameterValue(LaunchConfiguration("publish_tf"), value_type=bool),
         "autostart": ParameterValue(LaunchConfiguration("autostart"), value_type=bool),
         "use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool),
+        "clearpath": ParameterValue(LaunchConfiguration("clearpath"), value_type=str),
         **topics,
     }
     return Node(
@@ -35,7 +36,10 @@ def generate_launch_description():
     own_params = PathJoinSubstitution([FindPackageShare("skidloc"), "params.yaml"])
     arguments = [
         DeclareLaunchArgument("robot", description="Name of a shipped robot, or path of a robot TOML file"),
-        DeclareLaunchArgument("namespace", default_value="", description="Of the node and of the robot's topics"),
+        DeclareLaunchArgument("clearpath", default_value="", description="Namespace of a Clearpath robot, as a200_0000: all names are its"),
+        DeclareLaunchArgument(
+            "namespace", default_value=LaunchConfiguration("clearpath"), description="Of the node and of the robot's topics"
+        ),
         DeclareLaunchArgument("params_file", default_value=own_params, description="Parameter file; the arguments here go before it"),
         DeclareLaunchArgument("estimator", default_value="ekf", description="ekf, graph or lidar; without LiDAR also odometry"),
         DeclareLaunchArgument("lidar", default_value="true", description="false: wheels and gyro alone"),

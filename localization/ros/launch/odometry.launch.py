@@ -11,7 +11,12 @@ def generate_launch_description():
     share = FindPackageShare("skidloc")
     arguments = {
         "robot": DeclareLaunchArgument("robot", description="Name of a shipped robot, or path of a robot TOML file"),
-        "namespace": DeclareLaunchArgument("namespace", default_value="", description="Of the node and of the robot's topics"),
+        "clearpath": DeclareLaunchArgument(
+            "clearpath", default_value="", description="Namespace of a Clearpath robot, as a200_0000: all names are its"
+        ),
+        "namespace": DeclareLaunchArgument(
+            "namespace", default_value=LaunchConfiguration("clearpath"), description="Of the node and of the robot's topics"
+        ),
         "params_file": DeclareLaunchArgument(
             "params_file", default_value=PathJoinSubstitution([share, "params.yaml"]), description="Parameter file"
         ),

@@ -111,6 +111,8 @@ class DdsTransport(MonotonicTime):
             elif topic in urgent:
                 self._urgent.attach(is_new)
         self._readers = [entry for entry in self._readers if entry[0] in topics]
+        kept = {_GRAPH_TOPIC, *map(_dds_name, self._writers), *(_dds_name(topic) for topic, _, _ in self._readers)}
+        self._topics = {name: topic for name, topic in self._topics.items() if name in kept}  # another type may follow
         self._publish_graph()
 
     def advertise(self, topic: str, kind: str, *, is_latched: bool = False) -> None:
