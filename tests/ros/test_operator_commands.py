@@ -29,12 +29,13 @@ def pose_message(pose, frame, cov=None):
     return encode(make(POSE_TYPE, header=make("std_msgs/msg/Header", stamp=stamp, frame_id=frame), pose=content))
 
 
-def commanded(estimator, topic, data, at_s=10.0):
-    """A drive with a message on ``topic`` in its middle, and what was reported."""
+def commanded(estimator, topic, *data, at_s=8.0):
+    """A drive with messages on ``topic``, a second apart in its middle, and what was reported."""
 
     def spoil(messages):
         at = messages[0].received_ns + int(at_s * S)
-        return sorted([*messages, Received(topic, at, data)], key=lambda m: m.received_ns)
+        sent = [Received(topic, at + i * S, content) for i, content in enumerate(data)]
+        return sorted([*messages, *sent], key=lambda m: m.received_ns)
 
     transport = LogTransport(drive_log(), spoil)
     return transport, *run_node(transport, estimator, config=NodeConfig(wait_s=0.0))
@@ -72,18 +73,15 @@ def test_initialpose_moves_the_map_and_leaves_odom_without_a_jump():
     assert node.session.state.start.map_T_start == pytest.approx([5.0, -3.0, 1.0])
 
 
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
-        (pose_message([0.0, 0.0, 0.0], "map"), "its frame is 'map', and this estimator has odom"),
-        (pose_message([np.nan, 0.0, 0.0], "odom"), "it holds numbers that are not finite"),
-        (pose_message([0.0, 0.0, 0.0], "odom", -np.eye(3)), "negative eigenvalues"),
-        (b"no message", "/set_pose: the message is ignored"),
-    ],
-)
-def test_set_pose_with_wrong_content_is_ignored_with_a_reason(data, reason, calm):
-    transport, _, reports = commanded("ekf", "/set_pose", data)
-    assert any(reason in text for text in reports)
+def test_set_pose_with_wrong_content_is_ignored_with_a_reason(calm):
+    wrong = {
+        pose_message([0.0, 0.0, 0.0], "map"): "its frame is 'map', and this estimator has odom",
+        pose_message([np.nan, 0.0, 0.0], "odom"): "it holds numbers that are not finite",
+        pose_message([0.0, 0.0, 0.0], "odom", -np.eye(3)): "negative eigenvalues",
+        b"no message": "/set_pose: the message is ignored",
+    }
+    transport, _, reports = commanded("ekf", "/set_pose", *wrong)
+    assert [reason for reason in wrong.values() if not any(reason in text for text in reports)] == []
     assert track(transport).keys() == calm.keys()
 
 
@@ -185,18 +183,15 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     assert node.session.pipeline.synchronizer._wheels._cg == pytest.approx(node.payloads._unloaded.position)
 
 
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
-        (payload_message("left_griper", 3.0), "no link 'left_griper'"),
-        (payload_message("left_gripper", 300.0), "would tip over"),
-        (payload_message("left_gripper", np.nan), "must be finite"),
-        (b"no message", "/skidloc/payload: the message is ignored"),
-    ],
-)
-def test_payload_with_wrong_content_is_ignored_with_a_reason(data, reason):
-    _, node, reports = commanded("odometry", "/skidloc/payload", data)
-    assert any(reason in text for text in reports)
+def test_payload_with_wrong_content_is_ignored_with_a_reason():
+    wrong = {
+        payload_message("left_griper", 3.0): "no link 'left_griper'",
+        payload_message("left_gripper", 300.0): "would tip over",
+        payload_message("left_gripper", np.nan): "must be finite",
+        b"no message": "/skidloc/payload: the message is ignored",
+    }
+    _, node, reports = commanded("odometry", "/skidloc/payload", *wrong)
+    assert [reason for reason in wrong.values() if not any(reason in text for text in reports)] == []
     assert node.payloads.loads == {}
 
 
