@@ -39,6 +39,13 @@ def solve_3x3(a: Matrix3, x: float, y: float, z: float) -> tuple[float, float, f
 
 
 @subroutine
+def assign(target: FloatArray, source: FloatArray) -> None:
+    """``target[:] = source`` of vectors of one length, whose check numba compiles for seconds in each process."""
+    for i in range(target.shape[0]):
+        target[i] = source[i]
+
+
+@subroutine
 def solve(a: FloatArray, b: FloatArray) -> Triple:
     """`solve_3x3` of arrays: ``a`` (3, 3) and ``b`` (3,)."""
     rows = Matrix3(a[0, 0], a[0, 1], a[0, 2], a[1, 0], a[1, 1], a[1, 2], a[2, 0], a[2, 1], a[2, 2])

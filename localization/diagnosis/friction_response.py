@@ -25,7 +25,7 @@ from motion_models.friction.contact import CREEP, rolling, tyre
 from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
 from motion_models.friction.equilibrium import Floor, motion, newton
 from motion_models.friction.model import FrictionModel, check_parameters, gripped, loads_at, pull_of, unit_rolls
-from motion_models.linear_equations import solve
+from motion_models.linear_equations import assign, solve
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -188,7 +188,8 @@ def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, rated: Floor, b
         heading = drive.headings[w]
         before = quasi_static[drive.first[w]].copy()
         work.is_stale[0] = True
-        out[drive.last[w] : drive.first[w + 1]] = quasi_static[drive.last[w] : drive.first[w + 1]]
+        for i in range(drive.last[w], drive.first[w + 1]):
+            assign(out[i], quasi_static[i])
         for i in range(drive.first[w], drive.last[w]):
             q_l, q_r, h = drive.wheels[i, 0], drive.wheels[i, 1], drive.dt[i]
             if q_l == 0.0 and q_r == 0.0:
@@ -204,13 +205,15 @@ def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, rated: Floor, b
             influence[10], influence[11] = influence[0], influence[1]
             problem = _Problem(before, h, q_l, q_r, state, influence, shift, floor, body)
             # start as far from the quasi-static motion as the sample before was
-            now[:] = quasi_static[i] + (before - quasi_static[i - 1]) if i > drive.first[w] else quasi_static[i]
+            last = max(i - 1, drive.first[w])
+            for j in range(3):
+                now[j] = quasi_static[i, j] + (before[j] - quasi_static[last, j])
             found = _solve_step(now, problem, work)
             if not found:
-                now[:] = quasi_static[i]
+                assign(now, quasi_static[i])
                 found = _solve_step(now, problem, work)
-            out[i] = now if found else quasi_static[i]
-            before[:] = out[i]
+            assign(out[i], now if found else quasi_static[i])
+            assign(before, out[i])
             heading += out[i, 2] * h
 
 
@@ -227,8 +230,8 @@ def _solve_step(now: FloatArray, problem: _Problem, work: _Work) -> bool:
             new = _search(now, problem, work, size)
             if not new < size:
                 break
-        now[:] = work.tried
-        work.off[:] = work.off_tried
+        assign(now, work.tried)
+        assign(work.off, work.off_tried)
         size = new
     if not size < _SOLVED:
         work.is_stale[0] = True
@@ -260,7 +263,7 @@ def _search(now: FloatArray, problem: _Problem, work: _Work, size: float) -> flo
 @subroutine
 def _differentiate(now: FloatArray, problem: _Problem, work: _Work) -> None:
     for j in range(3):
-        work.tried[:] = now
+        assign(work.tried, now)
         work.tried[j] += _DIFFERENCE
         _misfit(work.tried, problem, work.off_tried)
         for k in range(3):

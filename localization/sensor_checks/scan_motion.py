@@ -137,11 +137,12 @@ def _connect(surface: FloatArray, ranges: FloatArray) -> None:
         gap = 1
         while gap < _MAX_GAP and not is_beam[(k + gap) % BEARINGS]:
             gap += 1
-        step = surface[(k + gap) % BEARINGS] - surface[k]  # NaN where one of them is no beam
-        if math.hypot(step[0], step[1]) < 0.1 + 0.5 * ranges[k]:
+        after = surface[(k + gap) % BEARINGS]
+        dx, dy = after[0] - surface[k, 0], after[1] - surface[k, 1]  # NaN where one of them is no beam
+        if math.hypot(dx, dy) < 0.1 + 0.5 * ranges[k]:
             for i in range(1, gap):
                 middle = (k + i) % BEARINGS
-                surface[middle] = surface[k] + i / gap * step
+                surface[middle, 0], surface[middle, 1] = surface[k, 0] + i / gap * dx, surface[k, 1] + i / gap * dy
                 ranges[middle] = math.hypot(surface[middle, 0], surface[middle, 1])
 
 

@@ -248,7 +248,8 @@ def integrate(state: FloatArray, wheels: FloatArray, cg: FloatArray, out: FloatA
             return k
         for j in range(2):
             state[10 + j] = targets[j] + slopes[j] * h
-        out[k, :10] = state[:10]
+        for j in range(10):
+            out[k, j] = state[j]
         vx, vy, wz = state[3], state[4], state[5]
         out[k, 3], out[k, 4], out[k, 5] = _sheared(vx, vy, wz, plant.yields)
         out[k, 10] = cg[k, 0] + h * (cg[k, 2] + 0.5 * h * cg[k, 4])
