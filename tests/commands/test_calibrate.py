@@ -145,6 +145,7 @@ def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, cap
     assert make_model("skid_steer", load_robot(tmp_path / "husky.toml")).nominal[0] == k["value"]
 
 
+@pytest.mark.extended
 def test_calibrate_by_gyro_of_distances_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     message = refused(capsys, HUSKY, "--model", "diff_drive", "--fit", "wheel_radius,wheel_separation_multiplier")
     assert "cannot be distinguished" in message
@@ -292,6 +293,7 @@ def room_scans(poses: np.ndarray, lidar_x: float) -> list[Record]:
     return [("/tf_static", mount, START), *records]
 
 
+@pytest.mark.extended
 def test_calibrate_by_lidar_and_gyro_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cg = (0.03, 0.0)
     wheels, cgs, poses = drive([cg, cg])
@@ -562,6 +564,7 @@ def test_calibrate_writes_the_clock_that_its_errors_are_without(tmp_path: Path) 
     assert kept["before"][0] == pytest.approx(promised["after"][0], rel=0.2)
 
 
+@pytest.mark.extended
 def test_calibrate_against_a_late_reference_promises_what_it_writes(tmp_path: Path) -> None:
     """The reference's clock is not the robot's: [clock] stays, and what it explains is no gain of the robot file."""
     log, first = diagnosis_drives.bag(tmp_path / "drive.mcap", {"wheel_time_offset": -0.09}, 7, "husky_a200"), tmp_path / "1.json"

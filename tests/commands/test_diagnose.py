@@ -61,6 +61,7 @@ def test_diagnose_table_shows_what_findings_and_tolerances_take_off(capsys: pyte
     assert any(line.startswith("yaw: track_width") and "friction_anisotropy 23 % (tolerated)" in line for line in lines)
 
 
+@pytest.mark.extended
 def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> None:
     """The patch is in: under it, the floor's causes that were named are gone."""
     out, second = tmp_path / "out", tmp_path / "second.json"
@@ -203,6 +204,7 @@ def test_diagnose_reference_that_is_off_changes_no_lidar(
     assert text.count("+-") == 1
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("options", "has_note"), [((), True), (("--reference-sigma", "0.1", "1.7"), False)])
 def test_diagnose_reference_sigma_is_the_noise_of_the_reference(tmp_path: Path, options: tuple[str, ...], has_note: bool) -> None:
     """A healthy robot against a reference of 0.1 m, five times what one without covariances counts as."""

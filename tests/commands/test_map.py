@@ -123,6 +123,7 @@ def test_replay_in_its_own_map_near_a_pose_is_localized(log: Path, saved: Path, 
     assert "localization" not in estimator
 
 
+@pytest.mark.extended
 def test_replay_extend_map_of_the_same_room_adds_little_and_keeps_the_old_file(log: Path, saved: Path, tmp_path: Path) -> None:
     before, extended = saved.read_bytes(), tmp_path / "extended.skidmap"
     assert (
@@ -137,6 +138,7 @@ def test_replay_extend_map_of_the_same_room_adds_little_and_keeps_the_old_file(l
     assert "Occupancy grid of the map" in report
 
 
+@pytest.mark.extended
 def test_replay_extend_map_by_another_building_writes_nothing(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     office, extended = tmp_path / "office.skidmap", tmp_path / "extended.skidmap"
     save_map(office, SavedMap(floor_plan.make_map(), {}))

@@ -34,6 +34,7 @@ def drawn(width):
     return console.file.getvalue().splitlines()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("width", cases([16, 30, 45, 80, 132, 300], ("45",)))
 def test_terminal_view_fits_any_width_and_loses_nothing(width):
     lines = drawn(width)

@@ -45,6 +45,7 @@ def test_replay_of_an_uncalibrated_robot_writes_its_prior(
     assert NOTE in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.extended
 def test_compare_of_an_uncalibrated_robot_reports_its_prior(
     inputs: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,6 +18,7 @@ from localization.simulation.experiments import EXPERIMENTS
 from motion_models.registry import MODELS, make_model
 from motion_models.robot_file import load_robot
 from tests.helpers import bags, online
+from tests.helpers.extended import cases
 from tests.helpers.online import LogTransport, drive_events, drive_log, run_node
 from tests.helpers.rooms import drive
 
@@ -65,7 +66,7 @@ def result(command: str, robot: str, out: Path, log: Path, capsys: pytest.Captur
     return code, shown, sorted(path.name for path in out.parent.rglob("*"))
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", cases(COMMANDS, ("replay", "calibrate")))
 def test_command_with_a_robot_by_file_gives_the_same(
     command: str, log: Path, robot_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,6 +103,7 @@ def test_pipeline_of_a_robot_by_file_can_be_written_as_state(estimator: str, rob
         assert isinstance(deserialize(text, blob), Pipeline)
 
 
+@pytest.mark.extended
 def test_live_node_of_a_robot_by_file_resumes_from_another_folder(
     robot_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,6 +91,7 @@ def test_compare_table_does_not_depend_on_the_processes(table, tmp_path):
     assert (tmp_path / "one.csv").read_bytes() == table.read_bytes()
 
 
+@pytest.mark.extended
 def test_compare_prints_means_and_differences(table, capsys, tmp_path):
     content = json.loads(table.with_suffix(".json").read_text())
     found = {m["name"]: m for m in content["means"]}
@@ -109,6 +110,7 @@ def test_compare_prints_means_and_differences(table, capsys, tmp_path):
     assert (tmp_path / "t.html").read_text().startswith("<!DOCTYPE html>")
 
 
+@pytest.mark.extended
 def test_compare_again_skips_finished_logs(table, tmp_path, asked, capsys):
     out = tmp_path / "table.csv"
     out.write_bytes(table.read_bytes())
@@ -148,6 +150,7 @@ def test_compare_half_a_table_is_completed(table, tmp_path):
     assert out.read_bytes() == table.read_bytes()
 
 
+@pytest.mark.extended
 def test_compare_broken_log_is_reported_and_the_others_finished(table, tmp_path, capsys):
     broken, absent = tmp_path / "broken.mcap", tmp_path / "absent.mcap"
     broken.write_bytes(logs(3)[0].read_bytes()[:40])

@@ -57,6 +57,7 @@ def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, caus
     assert found.gain.low > 0.0
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("robot", "route", "seed"),
     cases(

@@ -27,6 +27,7 @@ def test_diagnose_nominal_drive_is_consistent(nominal: Drive) -> None:
 OF_REFERENCE = ("reference is longer in one quarter", "reference turns with its range")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", OF_REFERENCE)
 def test_diagnose_reference_that_scatters_is_named_in_a_note(nominal: Drive, name: str) -> None:
     """Nothing follows a cause or a trend: no cause is named, and the noise is the reference's."""

@@ -172,6 +172,7 @@ def test_ekf_in_bare_corridor_keeps_the_wheels_length() -> None:
 # --- wheels that contradict
 
 
+@pytest.mark.extended
 def test_ekf_with_spinning_wheels_follows_lidar() -> None:
     def spinning(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
         return twists + np.where((t > 6) & (t < 10), 0.5, 0.0)[:, None] * [1.0, 0.0, 0.0]

@@ -312,6 +312,7 @@ def test_graph_with_outlier_position_keeps_poses() -> None:
     assert np.abs(spoilt - clean).max() < 0.3
 
 
+@pytest.mark.extended
 def test_graph_with_first_position_far_off_leaves_it_out() -> None:
     """It is among those that give the map its heading."""
     errors, pipeline = driven_with(positions(around(), spoil={1: np.array([1e5, 1e5])}))
@@ -328,6 +329,7 @@ def test_graph_with_positions_at_rest_reports_them_unused() -> None:
     assert "2 positions could not be used" in pipeline.warnings()[-1]
 
 
+@pytest.mark.extended
 def test_graph_with_position_that_comes_late_reports_it() -> None:
     fixes = positions(around())
     late = replace(fixes[60], stamp_ns=fixes[20].stamp_ns)
@@ -340,6 +342,7 @@ def test_graph_with_position_that_comes_late_reports_it() -> None:
     assert warning.startswith("1 position came after")
 
 
+@pytest.mark.extended
 def test_graph_with_named_radius_has_it_once() -> None:
     """`wheel_radius_scale` is a correction of the motion model here, with the size of the graph's own, and not there a second time."""
     trial = Trial(make_model("diff_drive", rooms.ROBOT), "graph", "constant+wheel_radius_scale")
@@ -412,6 +415,7 @@ def numbers(estimate: Estimate) -> tuple:
     return estimate.stamp_ns, *(array.tobytes() for array in arrays)
 
 
+@pytest.mark.extended
 def test_graph_resumed_after_loops_equals_uncut_bitwise() -> None:
     drive = around()
     fixed = list(merge_positions(drive.events, positions(drive)))
@@ -502,6 +506,7 @@ def test_smoothed_covariance_has_what_widens_live_poses_not_between_keyframes() 
     np.testing.assert_array_equal(smoothed(wide, pipeline).covariances, smoothed(estimates, pipeline).covariances)
 
 
+@pytest.mark.extended
 def test_graph_after_a_gap_of_all_sensors_is_where_the_scans_find_it() -> None:
     """Its keyframes before that are uncertain by metres, and what a scan shows is not about them."""
     circles = rooms.path((1, 0, 0), (60, 0.5, 0.4))

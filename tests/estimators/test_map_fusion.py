@@ -41,6 +41,7 @@ def start(initial=None) -> Pipeline:
     return Pipeline(Trial(MODEL, "map", prior=PriorMap(places(), initial)), ROBOT, ROBOT.mounts, True)
 
 
+@pytest.mark.extended
 def test_map_fusion_odometry_is_the_filters_own():
     ekf = Pipeline(Trial(MODEL, "ekf"), ROBOT, ROBOT.mounts, True)
     located, poses = start(np.array([0.2, -0.2, 0.1])), {}

@@ -40,6 +40,7 @@ def test_merge_moves_the_second_map_into_the_first() -> None:
     assert (np.linalg.eigvalsh(found.map.covariances)[:, 0] > 0.0).all()
 
 
+@pytest.mark.extended
 def test_merge_of_two_buildings_is_refused() -> None:
     hall = floor_plan.make_map(floor_plan.HALL, floor_plan.path((1, 1), (8, 1), step=1.8))
     with pytest.raises(MapError, match="could not be joined"):

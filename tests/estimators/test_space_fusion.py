@@ -29,6 +29,7 @@ def among_trees(rolled):
     return list(scans(rolled, make_scene(rolled, 3)))
 
 
+@pytest.mark.extended
 def test_space_fusion_among_trees_is_within_centimetres(rolled, among_trees):
     found, pipeline = run_in_space(rolled, among_trees, "diff_drive")
     assert np.degrees(np.arccos(found.true[:, 2, 2])).max() > 5.0

@@ -26,6 +26,7 @@ from localization.evaluation.consistency import (
 from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.trajectory import Trajectory
 from motion_models import se2
+from tests.helpers.extended import cases
 
 SECOND = 10**9
 
@@ -290,7 +291,7 @@ def correlated(rng, n, d, samples):
     return z
 
 
-@pytest.mark.parametrize(("samples", "n_expected"), [(1e-3, 400.0), (8.0, 50.0), (40.0, 10.0), (math.inf, 1.0)])
+@pytest.mark.parametrize(("samples", "n_expected"), cases([(1e-3, 400.0), (8.0, 50.0), (40.0, 10.0), (math.inf, 1.0)], ("8.0",)))
 def test_p_value_of_correlated_errors_is_uniform(samples, n_expected):
     """Of consistent errors 95 % are called so, whatever their correlation; of half the sigma nearly all are called overconfident."""
     rng, p = np.random.default_rng(20), np.tile(np.eye(3), (400, 1, 1))

@@ -346,6 +346,7 @@ def test_clock_sync_equal_stamps_are_ordered_by_rank() -> None:
     assert [m.topic for m in marks] == ["/0", "/1", "/2", "/3"]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("case", ["same log time", "same stamp step of 1 ns", "random stamps", "log time runs away"])
 def test_clock_sync_any_input_uses_bounded_memory(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("localization.logs.clock_sync._MAX_BUFFERED_WEIGHT", 2000)

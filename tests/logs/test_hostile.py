@@ -164,6 +164,7 @@ def test_decompression_bomb_is_refused_within_bounds(name: str, pack) -> None:
         decompress(packed, name)
 
 
+@pytest.mark.extended
 def test_large_valid_chunk_passes() -> None:
     """100 MB that compress 4 to 1, and 60 MB of nothing (an empty map) that compress 10,000 to 1."""
     rng = np.random.default_rng(1)
@@ -259,6 +260,7 @@ def test_fifo_and_device_are_refused_at_once(tmp_path: Path) -> None:
         open_log(folder, ROBOT)
 
 
+@pytest.mark.extended
 def test_metadata_of_millions_of_brackets_is_not_parsed(tmp_path: Path) -> None:
     path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "mcap")
     for text in ("[" * 20_000, "a: &a [x]\n" * 1000, " " * (8 << 20)):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from localization.errors import LogError
 from localization.logs import inspect_log, open_log
 from motion_models.robot_file import load_robot
-from tests.helpers import bags, fuzz
+from tests.helpers import bags, extended, fuzz
 from tests.helpers.hostile_logs import (
     BAD,
     FILE_FAULTS,
@@ -39,7 +39,7 @@ DECIDED_IN_LOGS = (
 )
 
 
-@pytest.mark.parametrize("fault", DECIDED_IN_LOGS)
+@pytest.mark.parametrize("fault", extended.cases(DECIDED_IN_LOGS, ("transform twice",)))
 def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, truths: Path, fault: str) -> None:
     source = SOURCES[0]
     case = Case(0, source.name, "mcap", fault, "")
@@ -49,7 +49,7 @@ def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, tr
     assert outcome.message != ""
 
 
-@pytest.mark.parametrize("form", bags.FORMATS)
+@pytest.mark.parametrize("form", extended.cases(bags.FORMATS, ("ros1", "mcap")))
 @pytest.mark.parametrize("fault", FILE_FAULTS)
 def test_damaged_file_of_any_format_is_read_or_refused(tmp_path: Path, form: str, fault: str) -> None:
     for number in range(2):
@@ -64,6 +64,7 @@ def test_damaged_file_of_any_format_is_read_or_refused(tmp_path: Path, form: str
         assert stamps == sorted(stamps)
 
 
+@pytest.mark.extended
 def test_hostile_cases_of_one_seed_repeat_and_contain_all_faults() -> None:
     chosen = cases(300, 0)
     assert chosen == cases(300, 0) != cases(300, 1)

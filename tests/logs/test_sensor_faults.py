@@ -135,6 +135,7 @@ def wheels_of(log: Log) -> list[WheelSample]:
     return [e for e in log.events() if isinstance(e, WheelSample)]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("offset_ms", [3, 10, 17])
 @pytest.mark.parametrize("rate", [10, 50])
 def test_second_publisher_of_zeros_loses_no_distance(tmp_path: Path, offset_ms: int, rate: int) -> None:

@@ -104,6 +104,7 @@ def garbled(data, where):
         yield data[:at] + bytes([data[at] ^ 5]) + data[at + 1 :]
 
 
+@pytest.mark.extended
 @given(st.lists(joint_states(), min_size=1, max_size=4), st.integers(-8, 8), st.integers(0, 400))
 def test_joint_states_whole_cut_or_corrupted_are_read_as_by_rosbags(messages, longer, where):
     decode = decoder(JOINTS)  # one decoder for all: it caches the names of the last message

@@ -61,6 +61,7 @@ def test_localizer_in_another_buildings_map_is_never_localized(office: PlaceMap)
         assert localizer.probability < LIKELY
 
 
+@pytest.mark.extended
 def test_localizer_carried_is_lost_and_found_again(office: PlaceMap) -> None:
     localizer = Localizer(office)
     assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"

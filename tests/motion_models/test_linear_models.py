@@ -17,6 +17,7 @@ RATE = st.floats(-8.0, 8.0)
 SLIP = np.array([0.04, 0.1, 0.2, 0.03, 0.05, 0.15])
 
 
+@pytest.mark.extended
 @settings(deadline=None)  # the first example compiles
 @given(RATE, RATE, st.floats(0.3, 1.5), st.floats(-1.5, -0.3), st.floats(-0.2, 0.2), st.floats(0.8, 1.2), st.floats(0.8, 1.2))
 def test_icr_tread_at_its_icr_does_not_slip_lengthwise(

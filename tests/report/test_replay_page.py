@@ -488,6 +488,7 @@ def test_figures_have_the_colours_of_the_page_in_dark_mode():
     assert not re.findall(r"(?:fill|stroke): ?#(?!f{6}|f{3}\b)[0-9a-f]{3,6}", made)  # every colour is the page's to change
 
 
+@pytest.mark.extended
 def test_page_of_a_large_log_is_small():
     n = 100_000
     rng = np.random.default_rng(0)

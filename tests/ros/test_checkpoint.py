@@ -96,6 +96,7 @@ print(len(found), hashlib.sha256(repr(found).encode()).hexdigest())
 """
 
 
+@pytest.mark.extended
 def test_checkpoint_resumed_by_another_process_gives_the_same_bits(tmp_path):
     events, _ = drive_events()
     cut, pipeline = 1500, new_core("ekf")

@@ -425,6 +425,7 @@ def test_configuration_of_default_ends_with_the_users():
     assert "cyclone.xml" not in configuration("lo", environment)
 
 
+@pytest.mark.extended
 def test_publishers_without_a_participant_that_left_are_found(chatter, transport):
     """A sample of an instance without a publisher holds its key alone, no names."""
     chatter.match("a", transport)

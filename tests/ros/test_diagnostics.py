@@ -133,6 +133,7 @@ def test_doctor_clock_names_its_alias_in_the_message(tmp_path: Path) -> None:
     assert "This drive cannot separate it from lidar_time_offset +0.0" in status.message
 
 
+@pytest.mark.extended
 def test_doctor_explained_drive_names_contradictions_as_well(tmp_path: Path) -> None:
     """Tyres that differ, and a robot that is turned while it stands."""
     robot, tour = load_robot("husky_a200"), drive("40s")
@@ -225,6 +226,7 @@ def test_doctor_short_drive_reports_why() -> None:
     assert status.level == OK
 
 
+@pytest.mark.extended
 def test_node_with_doctor_publishes_the_same_estimates(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("localization.ros.diagnostics._MIN_SPAN_S", 2.0)
     transports = []

@@ -131,6 +131,7 @@ def test_output_that_a_killed_run_left_is_replaced(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
 
 
+@pytest.mark.extended
 def test_online_stopped_by_sigterm_leaves_its_last_state(replayed, tmp_path, capsys):
     process = start(tmp_path, "1")
     wait_for_state(tmp_path, process, 100)
@@ -217,6 +218,7 @@ def test_online_with_bad_arguments_is_refused(arguments, expected, capsys):
     assert "Traceback" not in shown.err
 
 
+@pytest.mark.extended
 def test_online_with_a_state_of_another_run_is_refused(killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     state, out = tmp_path / "state", tmp_path / "a.tum"

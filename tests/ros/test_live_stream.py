@@ -37,6 +37,7 @@ from motion_models import se2
 from motion_models.registry import make_model
 from tests.helpers import bags
 from tests.helpers.disks import fill_disk
+from tests.helpers.extended import cases
 from tests.helpers.online import ROBOT, LogTransport, drive_events, drive_log, published, run_node, stamp_of, track
 
 S = 1_000_000_000
@@ -338,7 +339,7 @@ def test_lidar_without_a_mount_is_an_error_and_a_warning():
     assert f"{node.session.pipeline.estimator.counts()['scans']} scans of it were taken as if from the body's origin" in note
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "graph"])
+@pytest.mark.parametrize("estimator", cases(["ekf", "graph"], ("ekf",)))
 def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     calm, late = undisturbed(estimator)[0], LogTransport(drive_log(), late_transforms)
     node, reports = run_node(late, estimator, Files(state=tmp_path / "state"))
@@ -363,6 +364,7 @@ def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     assert "resumed from" in run_node(again, estimator, Files(state=tmp_path / "state"))[1][-1]
 
 
+@pytest.mark.extended
 def test_discovery_of_silent_topics_reports_once_and_continues():
     quiet = LogTransport(drive_log())
     polls = 0
@@ -485,6 +487,7 @@ def test_files_of_a_killed_run_do_not_stop_a_live_node(tmp_path, left):
     assert (tmp_path / "state").is_file()
 
 
+@pytest.mark.extended
 def test_full_disk_does_not_stop_a_live_node(tmp_path, monkeypatch, calm):
     files = Files(tmp_path / "run.tum", tmp_path / "state")
     monkeypatch.setattr(CheckpointWriter, "is_due", lambda self: True)
@@ -549,6 +552,7 @@ def test_second_publisher_of_the_transform_is_reported():
     assert "enable_odom_tf" in status.message
 
 
+@pytest.mark.extended
 def test_other_transforms_are_not_reported():
     for parent, child, config in (("map", "odom", None), ("odom", "base_link", NodeConfig(wait_s=0.0, predict=False, tf=False))):
         transport = LogTransport(drive_log(), with_transform(parent, child), {"/tf": "tf2_msgs/msg/TFMessage"})

@@ -136,6 +136,7 @@ def test_pause_publishes_nothing_until_it_is_continued():
     assert stamp_of(published(transport, PREDICTED_ODOMETRY)[-1]) * 1e-9 > 15.0
 
 
+@pytest.mark.extended
 def test_diagnostics_of_a_paused_node_name_the_service():
     transport, node, _, _ = serviced("/skidloc/pause", True)
     node._publish_status()
@@ -209,6 +210,7 @@ def test_commands_by_topics_do_what_the_services_do():
     assert not node.is_paused
 
 
+@pytest.mark.extended
 def test_path_and_map_are_published_in_the_frame_of_the_estimates():
     transport = LogTransport(drive_log())
     node, _ = run_node(transport, "graph", config=NodeConfig(wait_s=0.0, map_period_s=0.001))

@@ -72,6 +72,7 @@ def send(topic: str, data: bytes, at_s: float):
     return LogTransport(drive_log(), spoil)
 
 
+@pytest.mark.extended
 def test_node_relocalize_searches_again_and_offers_amcls_service(places: PlaceMap) -> None:
     transport = send("/skidloc/relocalize", encode(make("std_msgs/msg/Empty")), 2.0)
     node, reports = run_node(transport, "map", config=NodeConfig(wait_s=0.0), prior=PriorMap(places, np.array([1.0, 0.1, 0.2])))
@@ -101,6 +102,7 @@ def test_node_save_map_writes_the_graphs_map_and_nothing_over_a_file(tmp_path) -
     assert "uses no saved map" in transport.services["/skidloc/load_map"](name).message
 
 
+@pytest.mark.extended
 def test_node_load_map_searches_the_new_map_and_refuses_what_is_none(places: PlaceMap, tmp_path) -> None:
     """Refused: files that are missing, truncated, foreign, of a newer version. The present map and its place stay."""
     floor = make_map()

@@ -37,6 +37,7 @@ def test_signal_at_any_line_of_a_sleep_does_not_block_it() -> None:
     assert done.stdout == "awake\n", done.stderr
 
 
+@pytest.mark.extended
 def test_second_signal_interrupts_at_once() -> None:
     code = """
 import signal

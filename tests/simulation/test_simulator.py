@@ -41,6 +41,7 @@ from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
+from tests.helpers.extended import cases
 from tests.studies.thesis_regressions import grid
 
 ROBOT = load_robot("vaultbot")
@@ -370,7 +371,7 @@ def test_grid_points_are_the_thesis_grid_and_reachable():
         simulation._reach(cg)
 
 
-@pytest.mark.parametrize("name", sorted(set(EXPERIMENTS) - {"controller_evaluation", "rotation_grid"}))
+@pytest.mark.parametrize("name", cases(sorted(set(EXPERIMENTS) - {"controller_evaluation", "rotation_grid"}), ("laps", "preliminary")))
 def test_experiment_each_is_driven_to_its_end(name):
     """The shortest form of each, by the robot with arms and by one without."""
     config = dataclasses.replace(BLIND, experiment=ExperimentConfig(laps=1, hours=0.03))

@@ -32,6 +32,7 @@ def test_patch_runs_and_leaves_nothing_behind(name: str, drive: Drive, poses: np
     assert np.array_equal(drive.until(5.0).run("ekf", "skid_steer").trajectory.poses, poses[: _scans(drive, 5.0)])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", GRAPH_PATCHES)
 def test_patch_of_graph_runs(name: str, drive: Drive) -> None:
     with GRAPH_PATCHES[name]():
@@ -40,6 +41,7 @@ def test_patch_of_graph_runs(name: str, drive: Drive) -> None:
     assert changed.counts["keyframes"] > 10
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["submap's error", "prior in the least squares", "thickness of surfaces", "size of the residuals"])
 def test_patch_of_matcher_changes_poses(name: str, drive: Drive, poses: np.ndarray) -> None:
     with PATCHES[name]():

@@ -39,6 +39,7 @@ def test_rival_law_is_proportional_first_and_saturates(shape):
     np.testing.assert_allclose(SHAPES[shape](z), [0.0, 1e-6, 1.0], rtol=1e-5)
 
 
+@pytest.mark.extended
 def test_grid_does_not_separate_brush_and_exponential_tyre():
     brush = fitted(FITTED, rival("brush", 8.0).model("VaultBot"))[1]
     exponential = fitted(FITTED)[1]

@@ -16,6 +16,7 @@ CHOSEN = [name for i, name in enumerate(BY_NAME) if i % 20 == 0 or name in USUAL
 """Others run by `python -m tests.studies.entrances`."""
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("variant", cases([BY_NAME[name] for name in CHOSEN], usual=USUAL, ids=CHOSEN))
 def test_variant_of_an_entrance_is_right_or_named(variant: Variant, tmp_path: Path) -> None:
     found = variant.judge(tmp_path)
