@@ -13,6 +13,7 @@ from localization.core.measurements.scan import key_scan_transition, measure_sca
 from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, initial_state, wheel_transition
 from localization.core.policies.excitation import Excitation
+from localization.core.policies.outlier import PriorOutlier
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
@@ -67,26 +68,28 @@ class EkfFusion(Estimator):
         self.state = initial_state(robot.gyro_noise, corrections, config)
         """Means and covariance at the end of the last step."""
         self._config, self._gyro, self.model, self.corrections, self._sensor = config, robot.gyro_noise, model, corrections, sensor
-        self._wheel_noise, self._slip = WheelNoiseScale(), SweepSlip()
+        self._wheel_noise, self._slip, self._outlier = WheelNoiseScale(), SweepSlip(), PriorOutlier()
         self._excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
         self.wheels = WheelPrediction(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
         self._turn: Innovation | None = None  # of the gyro, in the last step
         self._scan: Innovation | None = None  # of its scan, as if the prior were no outlier
         self._has_gyro = self._is_scan_pending = False
-        self.counts_by_name = dict.fromkeys(("scans", "matched", "standing", "prior_outliers"), 0)
+        self.counts_by_name = dict.fromkeys(("scans", "matched", "standing"), 0)
 
     def step(self, step: Step) -> Estimate:
         """Predict, update by the gyro, update by the scan."""
         self.run_deferred()
         motion = replace(step.predicted, cov=self._wheel_noise.cov(step))
         self._excitation.start_step(motion)
-        self.wheels = WheelPrediction(motion, self.state["corrections"], self._excitation.is_turning)
+        self._outlier.start_step()
         state = clone(self.state, "pose", "start")
         state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
         self._wheel_noise.start_step(state, step, motion.cov)
         state, self._turn = self._update_turn(state, step)
         self._scan = None
         state, scan = self._update_scan(state, step)
+        motion = replace(motion, cov=motion.cov + self._outlier.cov)
+        self.wheels = WheelPrediction(motion, self.state["corrections"], self._excitation.is_turning)
         self.state = state
         self.counts_by_name["standing"] += step.is_standing
         twist, twist_cov = self._estimate_twist(step, is_measured=scan is not None)
@@ -132,26 +135,17 @@ class EkfFusion(Estimator):
         self._is_scan_pending = True
         prior_cov = state.difference_cov("pose", "map")
         match = sensor.measure(step, state["pose"], prior_cov, self._slip.twist(step), self._slip.offset(step))
-        if match is None or (step.rested_s and match.outlier_cov.any()):
-            moved = None if step.rested_s else sensor.moved.cov(step)
-            return state if moved is None else self._inflate(state, moved), None
+        state, match = self._outlier.apply(state, step, match, sensor.moved.cov(step))
+        if match is None:
+            return state, None
         match, R = self._slip.refine(sensor, step, state["start"], match)
         R = R * (1.0 + step.rested_s / _REPEATED_S) ** 4
         self.counts_by_name["matched"] += 1
-        if match.outlier_cov.any():
-            self.counts_by_name["prior_outliers"] += 1
-            state = self._inflate(state, match.outlier_cov)
         self._excitation.start_scan(state, R)
         state, innovation = update(state, measure_scan(state, match.measured, R), self._excitation.considered())
         self._wheel_noise.learn(innovation)
-        self._scan = replace(innovation, S=innovation.S - match.outlier_cov)
+        self._scan = replace(innovation, S=innovation.S - self._outlier.cov)
         return state, innovation
-
-    def _inflate(self, state: State, cov: Cov3) -> State:
-        """The wheels' motion in this step was off by an error of ``cov`` (3, 3) more than predicted."""
-        motion = self.wheels.motion
-        self.wheels = replace(self.wheels, motion=replace(motion, cov=motion.cov + cov))
-        return inflate(state, "pose", cov)
 
     def _estimate_twist(self, step: Step, *, is_measured: bool) -> tuple[Twist2, Cov3 | None]:
         """Twist (3,) at the stamp and its covariance: by the motion in the step, how the wheels' rates changed in it, and the gyro."""
@@ -234,7 +228,8 @@ class EkfFusion(Estimator):
 
     def counts(self) -> Mapping[str, int]:
         """Number of occurrences by name: scans, matched, searched, and those of lost scans by cause."""
-        return self.counts_by_name if self._sensor is None else {**self.counts_by_name, **self._sensor.lost.causes}
+        found = {**self.counts_by_name, "prior_outliers": self._outlier.count}
+        return found if self._sensor is None else {**found, **self._sensor.lost.causes}
 
     def warnings(self) -> list[str]:
         """A clock offset that is large and certain."""

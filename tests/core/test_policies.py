@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from localization.core.filter import inflate
 from localization.core.motion import FilterConfig, initial_state
 from localization.core.policies.excitation import Excitation
+from localization.core.policies.outlier import PriorOutlier
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.events import Step
+from localization.lidar import ScanMatch
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import make_corrections
@@ -59,3 +63,23 @@ def test_wheel_noise_scale_is_of_driving_wheels_alone():
     np.testing.assert_allclose(noise.cov(step_of([0.1, 0.0, 0.0])), 4e-4 * np.eye(3))
     for step in (step_of([0.0, 0.0, 0.0], is_standing=True), step_of([0.1, 0.0, 0.0], has_wheels=False)):
         np.testing.assert_allclose(noise.cov(step), 1e-4 * np.eye(3))
+
+
+def test_prior_outlier_at_rest_takes_no_match_that_needs_it():
+    """Wheels that stand count nothing wrongly; while they turn, the step is off by as much as the search was wide."""
+    cov, outlier = np.diag([0.1, 0.1, 0.01]), PriorOutlier()
+    match = ScanMatch(np.zeros(3), np.zeros(3), 1e-4 * np.eye(3), 1.0, cov)
+    driven, resting = step_of([0.1, 0.0, 0.0]), replace(step_of([0.0, 0.0, 0.0], is_standing=True), rested_s=1.0)
+    assert outlier.apply(STATE, resting, match, None) == (STATE, None)
+    state, used = outlier.apply(STATE, driven, match, None)
+    assert used is match
+    assert outlier.count == 1
+    np.testing.assert_allclose(state.cov("pose") - STATE.cov("pose"), cov)
+
+
+def test_prior_outlier_of_a_moved_robot_is_as_wide_as_its_motion():
+    outlier, moved = PriorOutlier(), np.diag([9.0, 9.0, 2.0])
+    state, _ = outlier.apply(STATE, step_of([0.0, 0.0, 0.0]), None, moved)
+    np.testing.assert_allclose(state.cov("pose") - STATE.cov("pose"), moved)
+    outlier.start_step()
+    assert not outlier.cov.any()

@@ -44,11 +44,22 @@ def trace():
     return steps_with, n_calls, n_steps
 
 
+def usual_functions(steps_with, n_steps):
+    """Code of the functions that are called in at least every second step."""
+    return [code for code, count in steps_with.items() if count >= n_steps / 2 and not code.co_name.startswith("<")]
+
+
+def usual_files():
+    """Files of these functions."""
+    steps_with, _, n_steps = trace()
+    return {Path(code.co_filename) for code in usual_functions(steps_with, n_steps)}
+
+
 def test_step_of_ekf_passes_few_functions_calls_and_lines(capsys):
     """Functions are those called in at least every second step, once the checks compare; comprehensions count as calls. Readers and
     decoding are left out."""
     steps_with, n_calls, n_steps = trace()
-    usual = [code for code, count in steps_with.items() if count >= n_steps / 2 and not code.co_name.startswith("<")]
+    usual = usual_functions(steps_with, n_steps)
     files = {code.co_filename for code in usual}
     found = {
         "functions": len(usual),

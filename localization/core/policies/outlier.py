@@ -1,0 +1,41 @@
+"""A step in which the robot went elsewhere than predicted: its wheels slipped or counted wrongly, or it was moved by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from localization.core.filter import inflate
+from localization.core.state import State
+from localization.events import Step
+from localization.lidar import ScanMatch
+from motion_models.se2 import Cov3
+
+
+class PriorOutlier:
+    """`apply` with each scan's match. Nothing is rejected: the prior is off by an independent error more, as wide as the search."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Matches for which the prior was an outlier."""
+        self.cov: Cov3 = np.zeros((3, 3))
+        """(3, 3) of what the wheels missed in the last step besides their noise."""
+
+    def start_step(self) -> None:
+        """No outlier yet."""
+        self.cov = np.zeros((3, 3))
+
+    def apply(self, state: State, step: Step, match: ScanMatch | None, moved_cov: Cov3 | None) -> tuple[State, ScanMatch | None]:
+        """The state before the update by the scan of ``step``, and ``match`` if it is to be used; ``moved_cov`` (3, 3) of a robot that was
+        moved by hand, or None.
+
+        The wheels of a robot at rest count nothing wrongly: a scan that fits elsewhere is no measurement of its pose.
+        """
+        is_outlier = match is not None and bool(match.outlier_cov.any())
+        if step.rested_s:
+            return state, None if is_outlier else match
+        if is_outlier and match is not None:
+            self.count += 1
+            self.cov = match.outlier_cov
+        elif match is None and moved_cov is not None:
+            self.cov = moved_cov
+        return inflate(state, "pose", self.cov) if self.cov.any() else state, match
