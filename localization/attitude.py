@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Gravity, ImuSample
+from localization.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
 from motion_models.robot import GyroNoise, Mount
@@ -26,13 +27,10 @@ from motion_models.se2 import FloatArray
 GRAVITY = 9.81
 """[m/s^2]"""
 _NS = 1e-9
-_FIRST_SAMPLES = 20
-"""Whose mean gives units, sign and the first vertical."""
 _MAX_GAP_S = 0.5
 """Without a sample for longer, the vertical starts anew."""
-_IN_M_S2, _IN_G, _NO_GRAVITY = (8.0, 12.0), (0.8, 1.2), 3.0
-"""Size of the mean specific force: its ranges in m/s^2 and in g (some drivers), and below what gravity was removed [m/s^2]."""
-_MAX_MOUNT_ERROR_RAD = math.radians(30.0)
+_IN_G, _NO_GRAVITY = (0.8, 1.2), 3.0
+"""Size of the mean specific force in g (some drivers), and below what gravity was removed [m/s^2]."""
 _MIN_TURN_RAD = 3.0
 """Turn by the wheels, as difference of the sides' angles, after which it shows whether the gyro's axis points up."""
 _LEVEL = math.tan(math.radians(3.0))
@@ -187,7 +185,7 @@ class AttitudeFilter:
             return
         if not self._imu.scale:
             self._first.append(sample.linear_acceleration)
-            if len(self._first) == _FIRST_SAMPLES:
+            if len(self._first) == GRAVITY_SAMPLES:
                 self._check_force()
         n = self._n
         if n == len(self._stamps):
@@ -200,7 +198,7 @@ class AttitudeFilter:
         mean = np.mean(self._first, axis=0)
         size = float(np.linalg.norm(mean))
         named = f"the accelerometer of IMU '{self._frame}'"
-        if _IN_M_S2[0] < size < _IN_M_S2[1]:
+        if is_gravity(size):
             self._set_scale(1.0)
         elif _IN_G[0] < size < _IN_G[1]:
             self._set_scale(GRAVITY)
@@ -280,7 +278,7 @@ class AttitudeFilter:
 
     def _is_above(self, up_z: float) -> bool:
         """Whether the vertical by the mount is above the robot; where it is below, the wheels' turns show why."""
-        least = math.cos(_MAX_MOUNT_ERROR_RAD)
+        least = math.cos(MAX_MOUNT_ERROR_RAD)
         if up_z > least:
             return True
         named = f"gravity contradicts the mount of IMU '{self._frame}'"

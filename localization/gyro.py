@@ -13,18 +13,25 @@ from motion_models.robot import GyroNoise, Mount
 
 _NS = 1e-9
 _MAX_GAP_NS, _MAX_HOLD_NS = 500_000_000, 100_000_000
+"""Time between samples over which no turn is interpolated, and time for which the newest rate is held [ns]: at 1 rad/s^2 the turn is off by
+0.1 and 0.005 rad then."""
 _MAX_SILENCE_NS = 2_000_000_000
-"""After which another IMU of the topic is used: longer than a driver drops messages, for its bias and scale are others."""
-_FIRST_SAMPLES = 20
+"""Time without a sample after which another IMU of the topic is used [ns]: longer than a driver drops messages, for its bias and scale are
+others."""
 _SCATTER_SAMPLES = 25
-"""Over which the scatter of the rates is measured: half a second of most drivers."""
-_MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 8.0, 12.0  # m/s^2; drivers that publish none, or in other units, do not show the mount
-_MAX_TILT_RAD = math.radians(30.0)
-_JUMP_RAD_PER_S, _JUMP_RAD_PER_S2 = 2.0, 200.0  # noise and shaking, and how fast such a robot may begin to turn
-_MAX_JUMP_RAD_PER_S = 10.0  # at which none turns
-_FOREVER_S = 1e6
-_MAX_SPIKES = 2  # that agree, in a row; a third is accepted
-_MIN_TURN_RAD = 0.5  # rad of turning by the wheels, after which they show which way the gyro's axis points
+"""Samples over which the scatter of the rates is measured: half a second of most drivers."""
+GRAVITY_SAMPLES = 20
+"""First samples of an IMU, whose mean specific force is that of gravity."""
+_GRAVITY_M_S2 = 8.0, 12.0
+"""Size of a mean specific force that is gravity's [m/s^2]: 9.81 with a scale that is off by less than a fifth."""
+MAX_MOUNT_ERROR_RAD = math.radians(30.0)
+"""Angle between gravity and the vertical of an IMU's mount, from where on the mount is wrong: no ground is as steep [rad]."""
+_JUMP_RAD_PER_S, _JUMP_RAD_PER_S2, _MAX_JUMP_RAD_PER_S = 2.0, 200.0, 10.0
+"""Change of the rate that is no spike: noise and shaking, how fast such a robot may begin to turn, and what none reaches."""
+_MAX_SPIKES = 2
+"""Spikes in a row that agree; a third is accepted."""
+_MIN_TURN_RAD = 0.5
+"""Turn by the wheels, after which they show which way the gyro's axis points [rad]."""
 
 
 class GyroBuffer:
@@ -42,7 +49,7 @@ class GyroBuffer:
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], keep_s: float = 10.0) -> None:
         self._noise, self._mounts = noise, mounts
-        self._keep_ns = int(keep_s / _NS)
+        self._keep_ns = keep_s / _NS
         self._stamps: list[int] = []
         self.newest_ns: int | None = None
         """Stamp of the newest sample; None before the first."""
@@ -203,14 +210,14 @@ class GyroBuffer:
 
     def _check_mount(self, sample: ImuSample) -> None:
         """Check the mount once, by the mean of the first samples."""
-        if self._n_force >= _FIRST_SAMPLES:
+        if self._n_force >= GRAVITY_SAMPLES:
             return
         self._force = self._force + sample.linear_acceleration
         self._n_force += 1
         strength = float(np.linalg.norm(self._force)) / self._n_force
-        if self._n_force == _FIRST_SAMPLES and _MIN_GRAVITY_M_S2 < strength < _MAX_GRAVITY_M_S2:
+        if self._n_force == GRAVITY_SAMPLES and is_gravity(strength):
             found = self._force / np.linalg.norm(self._force)
-            if found @ self._up < math.cos(_MAX_TILT_RAD):
+            if found @ self._up < math.cos(MAX_MOUNT_ERROR_RAD):
                 self._axis, self._contradicts = found, True
                 self._reset()
 
@@ -249,7 +256,7 @@ class GyroRecord:
         if newest is None or sample.stamp_ns - newest > _MAX_GAP_NS:
             if newest is not None:
                 self.silent_s += (sample.stamp_ns - newest) * _NS
-            self._stretches.append(GyroBuffer(self._noise, self._mounts, keep_s=_FOREVER_S))
+            self._stretches.append(GyroBuffer(self._noise, self._mounts, keep_s=math.inf))
             self._starts.append(sample.stamp_ns)
         self._stretches[-1].insert(sample)
 
@@ -262,6 +269,11 @@ class GyroRecord:
         """The turn from ``start_ns`` to ``end_ns`` (see `GyroBuffer.turn`); None also where there is a gap between."""
         i = bisect.bisect_right(self._starts, start_ns) - 1
         return None if i < 0 else self._stretches[i].turn(start_ns, end_ns, by_wheels)
+
+
+def is_gravity(force_m_s2: float) -> bool:
+    """Whether the size of a mean specific force [m/s^2] is gravity's: some drivers publish none, or in other units."""
+    return _GRAVITY_M_S2[0] < force_m_s2 < _GRAVITY_M_S2[1]
 
 
 def _may_follow(before: tuple[int, float], after: tuple[int, float]) -> bool:

@@ -24,6 +24,7 @@ from localization.evaluation.reference_check import compare_reference
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
 from localization.events import Event, ImuSample
+from localization.gyro import GRAVITY_SAMPLES, is_gravity
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
@@ -56,7 +57,6 @@ _MAX_CLOCK_S, _MAX_CLOCK_SIGMA_S = 0.1, 0.1
 _SIGMAS = 3.0
 _MIN_TURNING_RAD_S = 0.05
 _MIN_SPEED_M_S, _MAX_TURN_RAD_S, _MIN_TRAVEL_INTERVALS, _MIN_COHERENCE = 0.05, 0.1, 6, 0.9
-_GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2 = 20, 8.0, 12.0
 _MAX_ODD_SHARE = 0.02
 """Largest share of a topic's messages or time that may be out of order or missing."""
 _TURN_AND_STRAIGHT = "drive straight on for 10 s and turn in place both ways for 10 s each"
@@ -363,14 +363,14 @@ def _imu_rows(log: Log) -> list[CheckRow]:
     for event in log.events():
         if isinstance(event, ImuSample) and event.frame_id == frame:
             samples.append(event)
-        if len(samples) >= _GRAVITY_SAMPLES:
+        if len(samples) >= GRAVITY_SAMPLES:
             break
     if not samples:
         return []
     force = mount.rotation() @ np.mean([sample.linear_acceleration for sample in samples], axis=0)
     size = float(np.linalg.norm(force))
     value = f"{frame}: roll {math.degrees(mount.roll):.0f}, pitch {math.degrees(mount.pitch):.0f} deg"
-    if not _MIN_GRAVITY_M_S2 < size < _MAX_GRAVITY_M_S2:
+    if not is_gravity(size):
         advice = "the driver publishes no gravity in m/s^2: its axes show only in turns."
         return [CheckRow("axes of IMU", value, f"{size:.1f} m/s^2 at the start", "cannot be seen", advice)]
     tilt = math.acos(max(-1.0, min(1.0, float(force[2]) / size)))

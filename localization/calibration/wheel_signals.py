@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from localization.events import ImuSample, Scan
+from localization.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
 from localization.lidar import LidarConfig, Sweep
 from localization.logs import Log
 from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry
@@ -36,9 +37,6 @@ _MOVED = 0.02
 """Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
 _MAX_LIDAR_S = 60.0
 """Time from the wheels' first motion in which scans are used [s]; registering one takes some milliseconds."""
-_GRAVITY_SAMPLES, _MIN_GRAVITY_M_S2, _MAX_GRAVITY_M_S2, _MAX_TILT_COSINE = 20, 8.0, 12.0, 0.87
-"""Number of first samples, bounds of their mean specific force, and its cosine to the mount's vertical below which the mount is wrong, as
-in `localization.gyro`."""
 _DEG_PER_RAD = 180.0 / math.pi
 _JUMP_FACTOR = 8.0
 """Increment of a position over the 97th percentile of all, from which on it is a reset or a counter that wrapped."""
@@ -236,9 +234,9 @@ def _gyro(samples: Sequence[ImuSample], mounts: Mapping[str, Mount], edges: Floa
     frame = samples[0].frame_id
     samples = [sample for sample in samples if sample.frame_id == frame]
     up = mounts.get(frame, Mount()).rotation()[2]
-    force = np.mean([sample.linear_acceleration for sample in samples[:_GRAVITY_SAMPLES]], axis=0)
+    force = np.mean([sample.linear_acceleration for sample in samples[:GRAVITY_SAMPLES]], axis=0)
     size = float(np.linalg.norm(force))
-    is_upright = not _MIN_GRAVITY_M_S2 < size < _MAX_GRAVITY_M_S2 or float(force @ up) / size >= _MAX_TILT_COSINE
+    is_upright = not is_gravity(size) or float(force @ up) / size >= math.cos(MAX_MOUNT_ERROR_RAD)
     axis = up if is_upright else force / size
     rates = np.array([sample.angular_velocity for sample in samples]) @ axis
     return _mean_rates(_seconds(samples, first_ns), rates, edges)[:, 0], is_upright

@@ -21,7 +21,7 @@ from localization.calibration.motion_references import GyroMotionReference, Lida
 from localization.calibration.position_reference import PositionMotionReference
 from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
-from localization.gyro import GyroRecord
+from localization.gyro import GyroRecord, is_gravity
 from localization.logs.reader import Log
 from localization.simulation.experiments import CONFIGURATION_CGS, CONTROLLERS, TRAJECTORIES
 from motion_models import se2
@@ -35,7 +35,6 @@ from motion_models.se2 import FloatArray
 
 _NS = 1e-9
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
-_MIN_GRAVITY, _MAX_GRAVITY = 8.0, 12.0
 _MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
 _MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
 _FEWEST_GAPS = 50
@@ -169,7 +168,7 @@ class _Imu:
         if not self.stamps:
             return None
         stamps, forces = np.array(self.stamps), np.array(self.forces)
-        if not _MIN_GRAVITY < float(np.median(forces[:, 2])) < _MAX_GRAVITY:
+        if not is_gravity(float(np.median(forces[:, 2]))):
             return None
         total = np.vstack([np.zeros(3), np.cumsum(forces, axis=0)])
         a, b = np.searchsorted(stamps, spans[:, 0]), np.searchsorted(stamps, spans[:, 1])

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 
-_MAX_SCAN_GAP_S = 1.0
-"""Time without a scan that counts as lost [s]: scanners give 5 to 40 scans a second, and in this time wheels alone err by the few
-centimetres of a voxel."""
+MIN_LOST_S = 1.0
+"""Time without a scan that counts as lost, and from where on a stretch without a matched one is a loss [s]: scanners give 5 to 40 scans a
+second, and in this time wheels alone err by the few centimetres of a voxel."""
 _MAX_SCAN_GAP_PERIODS = 4.0
 """Time without a scan that counts as lost in logs with few scans, in median times from scan to scan."""
 _GAPS = 51
@@ -17,8 +17,6 @@ MIT-CSAIL), matched scans by 0.05 to 0.09 m, so that from a twentieth of the way
 MAX_LOST_S = 5.0
 """Longest stretch without a matched scan [s], beyond which a run is not recommended, whatever the share: at 0.4 m/s those wheels err by
 0.15 m in it, from where on Gauss-Newton alone may end in a wrong place."""
-MIN_LOST_S = 1.0
-"""The share counts where one stretch at least is longer [s]: wheels carry the pose over single scans without a visible error (voxels)."""
 
 
 class LostScans:
@@ -53,12 +51,12 @@ class LostScans:
         self._last_ns = stamp_ns
 
     def add_no_scan(self, stamp_ns: int) -> None:
-        """The time has come to ``stamp_ns`` without a scan. It is lost once no scan has come for `_MAX_SCAN_GAP_S`, or for much longer
+        """The time has come to ``stamp_ns`` without a scan. It is lost once no scan has come for `MIN_LOST_S`, or for much longer
         than they are apart."""
         if self._first_ns is None:
             return
         gap_ns = stamp_ns - self._scan_ns
-        if gap_ns <= _MAX_SCAN_GAP_S * 1e9 or gap_ns <= _MAX_SCAN_GAP_PERIODS * self._period_ns:
+        if gap_ns <= MIN_LOST_S * 1e9 or gap_ns <= _MAX_SCAN_GAP_PERIODS * self._period_ns:
             return
         self.silences += not self._is_silent
         self._is_silent, self._last_ns = True, max(stamp_ns, self._last_ns)

@@ -33,8 +33,8 @@ ones is 1.3 on simulated laps, 1.7 on ACES, 2.9 on fr079 and 4.3 on MIT-CSAIL (m
 _BLOCK = 5 * CORRELATED_BEAMS
 """Neighbouring beams whose residuals are summed, to measure how they err together [beams]: batch means take blocks of several times the
 length of the correlation, which is 10 to 20 beams at most in real scans, 1 to 10 in simulated rooms."""
-_BASIN_M, _BASIN_RAD = 0.15, 0.15
-"""Sigma of a prior from which Gauss-Newton alone may end elsewhere: from .3 m, .15 rad it does in 14 to 31 % of trials."""
+_BASIN = 0.15
+"""Sigma of a prior from which Gauss-Newton alone may end elsewhere [m, rad]: from .3 m, .15 rad it does in 14 to 31 % of trials."""
 OUTLIER_SIGMAS = 5.0
 """What is farther off is an outlier: scans, wheels that slip or count wrongly, positions."""
 
@@ -83,7 +83,7 @@ def is_narrow(cov: Cov3) -> bool:
     """Whether a pose with ``cov`` (3, 3) is within the basin of Gauss-Newton."""
     (xx, xy, _), (_, yy, _), (_, _, yaw) = cov.tolist()
     longest = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)  # eigenvalue
-    return bool(longest < _BASIN_M**2 and yaw < _BASIN_RAD**2)
+    return bool(longest < _BASIN**2 and yaw < _BASIN**2)
 
 
 def mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:

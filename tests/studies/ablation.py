@@ -131,8 +131,7 @@ def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *r
 
 _NO_SEARCH = (
     _attribute(ScanMatcher, "_search", lambda *a: None),
-    _attribute(registration, "_BASIN_M", math.inf),
-    _attribute(registration, "_BASIN_RAD", math.inf),
+    _attribute(registration, "_BASIN", math.inf),
 )
 _ASSUMED_NOISE = (_attribute(ScanMatcher, "_residual_variance", 1.0), _attribute(ScanMatcher, "_block_variance", 1.0))
 PATCHES: Mapping[str, Patch] = {
