@@ -134,7 +134,7 @@ class EkfFusion(Estimator):
         self.counts_by_name["scans"] += 1
         self._is_scan_pending = True
         prior_cov = state.difference_cov("pose", "map")
-        match = sensor.measure(step, state["pose"], prior_cov, self._slip.twist(step), self._slip.offset(step))
+        match = sensor.measure(step, state["pose"], prior_cov, self._slip.offset(step))
         state, match = self._outlier.apply(state, step, match, sensor.moved.cov(step))
         if match is None:
             return state, None

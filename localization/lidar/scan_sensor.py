@@ -53,20 +53,20 @@ class ScanMatchingSensor:
         self._stale, self._place = StaleScans(), OpenPlace()
         self.moved, self.lost = MovedRobot(), LostScans()
 
-    def measure(self, step: Step, prior: Pose2, cov: Cov3, twist: Twist2, offset: Tangent2) -> ScanMatch | None:
+    def measure(self, step: Step, prior: Pose2, cov: Cov3, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
 
-        The sweep is deskewed with ``twist`` (3,), the body's at the middle of the sweep. ``offset`` (3,): see `ScanMatcher.match`.
+        The sweep is deskewed with the wheels' twist at its middle. ``offset`` (3,): see `ScanMatcher.match`.
         """
         self._scan, self._prior, self._cov = None, prior, cov
-        found, cause = self._measure(step, twist, offset)
+        found, cause = self._measure(step, offset)
         if cause:
             self.lost.add(step.end_ns, cause)
         else:
             self.lost.add_matched(step.end_ns)
         return found
 
-    def _measure(self, step: Step, twist: Twist2, offset: Tangent2) -> tuple[ScanMatch | None, str]:
+    def _measure(self, step: Step, offset: Tangent2) -> tuple[ScanMatch | None, str]:
         """The match, and why the scan is lost; "" where it is not, also of the first scan."""
         scan = step.scan
         assert scan is not None
@@ -74,7 +74,7 @@ class ScanMatchingSensor:
         if self._stale.is_stale(scan, step.is_standing):
             return None, "stale"
         sweep = Sweep.from_scan(scan, self._mount(scan.frame_id)).within(self._config.min_range_m, self._config.max_range_m)
-        deskewed = self._deskew(sweep, twist)
+        deskewed = self._deskew(sweep, step.twist)
         if len(deskewed.planar) < MIN_POINTS:
             return None, "sparse"
         self._scan = deskewed

@@ -11,7 +11,6 @@ from localization.core.filter import inflate
 from localization.core.motion import FilterConfig, initial_state
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.outlier import PriorOutlier
-from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.events import Step
 from localization.lidar import ScanMatch
@@ -46,15 +45,6 @@ def test_excitation_by_scan_that_leaves_the_way_open_considers_radius():
     assert "radius" in excitation.considered()
     excitation.start_scan(state, np.diag([1e-6, 1e-6, 1e-6]))
     assert "radius" not in excitation.considered()
-
-
-def test_sweep_slip_deskews_with_the_slip_of_the_last_step():
-    slip, driven = SweepSlip(), step_of([0.1, 0.0, 0.0])
-    np.testing.assert_allclose(slip.twist(driven), [1.0, 0.0, 0.0])
-    slip.end_step(driven, np.array([0.8, 0.0, 0.1]), is_measured=True)  # wheels slip by 0.2 m/s
-    np.testing.assert_allclose(slip.twist(driven), [0.8, 0.0, 0.1])
-    stalled = step_of([0.0, 0.0, 0.0])
-    np.testing.assert_allclose(slip.offset(stalled), [0.08, 0.0, 0.01], atol=1e-15)
 
 
 def test_wheel_noise_scale_is_of_driving_wheels_alone():

@@ -32,7 +32,7 @@ def step_at(seconds: float, walls: np.ndarray, pose: np.ndarray, delta: tuple[fl
 def sensor() -> ScanMatchingSensor:
     """With a submap of the lab from its origin."""
     made = ScanMatchingSensor({}, LidarConfig())
-    assert made.measure(step_at(0.1, LAB, np.zeros(3)), np.zeros(3), NARROW, np.zeros(3), np.zeros(3)) is None
+    assert made.measure(step_at(0.1, LAB, np.zeros(3)), np.zeros(3), NARROW, np.zeros(3)) is None
     assert made.is_key(np.zeros(3))
     made.insert_key_scan(np.zeros(3), np.zeros((3, 3)))
     return made
@@ -40,7 +40,7 @@ def sensor() -> ScanMatchingSensor:
 
 def measure(sensor: ScanMatchingSensor, seconds: float, walls: np.ndarray, cov: np.ndarray) -> bool:
     """Whether a scan of ``walls`` from a little ahead is matched by a prior of ``cov`` (3, 3) there."""
-    return sensor.measure(step_at(seconds, walls, AHEAD), AHEAD, cov, np.zeros(3), np.zeros(3)) is not None
+    return sensor.measure(step_at(seconds, walls, AHEAD), AHEAD, cov, np.zeros(3)) is not None
 
 
 def test_scan_that_is_lost_from_a_wide_prior_is_no_key_scan_for_some_seconds(sensor: ScanMatchingSensor) -> None:
@@ -66,7 +66,7 @@ def test_scan_that_is_found_again_is_a_key_scan(sensor: ScanMatchingSensor) -> N
 def test_submap_begins_anew_where_the_mount_comes_while_a_place_is_searched() -> None:
     mounts: dict[str, Mount] = {}
     sensor = ScanMatchingSensor(mounts, LidarConfig())
-    sensor.measure(step_at(0.1, LAB, np.zeros(3)), np.zeros(3), NARROW, np.zeros(3), np.zeros(3))
+    sensor.measure(step_at(0.1, LAB, np.zeros(3)), np.zeros(3), NARROW, np.zeros(3))
     sensor.insert_key_scan(np.zeros(3), np.zeros((3, 3)))
     assert not measure(sensor, 1.0, HALL, WIDE)
     mounts[""] = Mount()
@@ -79,7 +79,7 @@ def test_submap_begins_anew_where_the_mount_comes_while_a_place_is_searched() ->
 def test_scene_that_changes_at_once_is_no_new_place(sensor: ScanMatchingSensor) -> None:
     """The robot is carried to another room while its wheels stand: the scan is lost, and no key scan."""
     step = step_at(1.0, HALL, AHEAD, (0.0, 0.0, 0.0))
-    assert sensor.measure(step, AHEAD, NARROW, np.zeros(3), np.zeros(3)) is None
+    assert sensor.measure(step, AHEAD, NARROW, np.zeros(3)) is None
     assert sensor.moved.cov(step_at(1.0, HALL, AHEAD)) is not None
     assert sensor.moved.cov(step_at(1.1, HALL, AHEAD)) is None
     assert sensor.lost.causes == {"moved": 1}

@@ -140,16 +140,11 @@ PATCHES: Mapping[str, Patch] = {
     ),
     "slip that changes within a sweep": _attribute(SlipChanges, "rate", lambda *a: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
-    "slip in the deskewing twist": _wrap(
-        ScanMatchingSensor,
-        "measure",
-        lambda original, self, step, prior, cov, twist, offset: original(self, step, prior, cov, step.twist, offset),
-    ),
     "correlative search": lambda: _together(*_NO_SEARCH),
     "motion of the last step in the search": _wrap(
         ScanMatchingSensor,
         "measure",
-        lambda original, self, step, prior, cov, twist, offset: original(self, step, prior, cov, twist, np.zeros(3)),
+        lambda original, self, step, prior, cov, offset: original(self, step, prior, cov, np.zeros(3)),
     ),
     "rival test of the search": _attribute(correlative_search, "_MAX_RIVAL", math.inf),
     "total cost (more points fit, instead)": _attribute(

@@ -1,4 +1,4 @@
-"""Slip of the wheels within a sweep: what a scan is deskewed with, and how far it is bent nevertheless."""
+"""Slip of the wheels within a sweep: how far it bends a scan that was deskewed with one twist."""
 
 from __future__ import annotations
 
@@ -15,16 +15,12 @@ simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8).
 
 
 class SweepSlip:
-    """The twist of the last step, and what the wheels missed of it: slip that lasts goes on in the next step."""
+    """A sweep is deskewed with the wheels' twist first, and with the slip that its match shows then; slip that is white bends it."""
 
     def __init__(self) -> None:
         self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step, and less that of the wheels
         self._is_measured = False
         self._changes = SlipChanges()
-
-    def twist(self, step: Step) -> Twist2:
-        """(3,) with which the sweep at the end of ``step`` is deskewed: by the wheels, with the last slip."""
-        return step.twist + self._slip
 
     def offset(self, step: Step) -> Tangent2:
         """(3,) from the wheels' motion to that with the last twist: where wheels stall and catch up, the robot goes on as before."""
