@@ -84,7 +84,7 @@ class EkfFusion(Estimator):
         self._outlier.start_step()
         state = clone(self.state, "pose", "start")
         state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
-        self._wheel_noise.start_step(state, step, motion.cov)
+        self._wheel_noise.start_step(state, motion.cov)
         state, self._turn = self._update_turn(state, step)
         self._scan = None
         state, scan = self._update_scan(state, step)

@@ -52,14 +52,14 @@ class Chain:
         self.config = config
         self.state = initial_state(GYRO, CORRECTED, config)
         self.noise, self.excitation = WheelNoiseScale(), Excitation(ROBOT.geometry.track_width_m, CORRECTED.min_track_over_radius)
-        self.noise.start_step(self.state, step_of(np.zeros(3)), NOTHING)
+        self.noise.start_step(self.state, NOTHING)
 
     def predict(self, step, is_turning=True):
         motion = dataclasses.replace(step.predicted, cov=self.noise.cov(step))
         self.excitation.is_turning = is_turning
         state = clone(self.state, "pose", "start")
         self.state = propagate(state, wheel_transition(state, step, motion, GYRO, CORRECTED, self.config))
-        self.noise.start_step(self.state, step, motion.cov)
+        self.noise.start_step(self.state, motion.cov)
 
     def _update(self, measurement):
         self.state, innovation = update(self.state, measurement, self.excitation.considered())
