@@ -32,6 +32,8 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _MAX_ZERO_EIGENVALUE = 1e-12  # of the largest
+_MAX_INSTANTS = 120
+"""Whose correlations are computed: the mean over a drive does not change with more."""
 _MIN_STEP_M, _MIN_STEP_RAD = 0.01, 0.01
 """Steps from where on a robot has moved: below, its error is the one that it had."""
 
@@ -164,6 +166,22 @@ def independent_samples(whitened: FloatArray, weights: FloatArray | None = None)
     return float(w.sum() ** 2 / (pairs[0] + 2.0 * np.sum(pairs[1:] * rho[1:] ** 2)))
 
 
+def claimed_samples(rows: FloatArray, covariances: FloatArray, motions: FloatArray) -> float:
+    """Number of independent samples that errors ``rows[i] @ e_i`` of unit covariance (N, k, 3) are worth, if increments are independent.
+
+    With the covariances P (N, 3, 3) and motions d (N, 3) since the start, e_j has Ad(d_ij^-1) P_i with an earlier e_i. Independent samples
+    in the mean square follow as in `independent_samples`.
+    """
+    pick = np.unique(np.linspace(0, len(motions) - 1, _MAX_INSTANTS).round().astype(int))
+    h, p, d = rows[pick], covariances[pick], motions[pick]
+    n, k = h.shape[:2]
+    total = float(n * k)
+    for i in range(n - 1):
+        a = se2.adjoint(se2.inverse(se2.between(d[i], d[i + 1 :])))
+        total += 2.0 * float(np.sum((h[i + 1 :] @ a @ p[i] @ h[i].T) ** 2))
+    return float(k * n**2 / total)
+
+
 def _autocovariance(values: FloatArray) -> FloatArray:
     """(N, d) sums over i of ``values[i] * values[i + k]`` by lag k, of values (N, d)."""
     n = len(values)
@@ -210,6 +228,10 @@ class PoseErrors:
     """Matches left out: before the first motion, and where the growth of the covariance since the first match is no covariance."""
     motions: FloatArray | None = None
     """(N, 3) estimated motion since the first match [m, m, rad]."""
+    claimed: FloatArray | None = None
+    """(N, 3, 3) covariances without the reference's noise."""
+    rows: FloatArray | None = None
+    """(N, k, 3) that take an error of the pose, in the body frame, to one of unit covariance."""
 
 
 def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float = 1.0) -> PoseErrors:
@@ -233,14 +255,15 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
     known = trajectory.covariances_at(part.stamps_ns)
     if known is None:
         return PoseErrors(stamps, errors, None, motions=d)
-    grown = known[1:] - _moved(known[0], d)
+    grown = known[1:] - moved_covariances(known[0], d)
     stands = (np.abs(d).max(axis=1) < 1e-9) & (np.abs(grown).max(axis=(1, 2)) < 1e-15)
     use = is_covariance(grown) & ~stands
+    claimed = grown
     grown = grown + np.eye(3) * trajectory.interpolation_errors_at(stamps)[:, None, :] ** 2
     if part.covariances is not None:
         noise = covariances_in_body(part.covariances, truth[:, 2])
-        grown = grown + noise[1:] + _moved(noise[0], r)
-    return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)), d[use])
+        grown = grown + noise[1:] + moved_covariances(noise[0], r)
+    return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)), d[use], claimed[use], _roots(grown[use]))
 
 
 def _is_moved(poses: FloatArray) -> NDArray[np.bool_]:
@@ -254,21 +277,26 @@ def _is_moved(poses: FloatArray) -> NDArray[np.bool_]:
 
 
 def pose_consistency(
-    trajectory: Trajectory, reference: ReferenceTrack, probability: float = 0.95, max_gap_s: float = 1.0
+    trajectory: Trajectory,
+    reference: ReferenceTrack,
+    probability: float = 0.95,
+    max_gap_s: float = 1.0,
+    is_dead_reckoning: bool = False,
 ) -> Consistency | None:
     """NEES of a trajectory along one run, 3 expected; None without covariances, headings or motion to test.
 
-    The band is that of as many independent samples as the errors are worth (`independent_samples`).
+    The band is that of as many independent samples as the errors are worth (`independent_samples`); for dead reckoning, whose increments
+    are independent, of no more than its covariances claim (`claimed_samples`).
     """
     if trajectory.covariances is None or reference.yaws is None:
         return None
     found = pose_errors(trajectory, reference, max_gap_s)
     if found.covariances is None or not found.covariances.any():
         return None
-    return _along_one_run(found, probability)
+    return _along_one_run(found, probability, is_dead_reckoning)
 
 
-def _along_one_run(found: PoseErrors, probability: float) -> Consistency:
+def _along_one_run(found: PoseErrors, probability: float, is_dead_reckoning: bool) -> Consistency:
     assert found.covariances is not None
     assert found.motions is not None
     errors, covariances = found.errors, found.covariances
@@ -282,11 +310,18 @@ def _along_one_run(found: PoseErrors, probability: float) -> Consistency:
     starts = np.flatnonzero(_is_moved(found.motions) & use)
     weights = np.diff(np.append(np.searchsorted(np.flatnonzero(use), starts), np.count_nonzero(use))).astype(float)
     n = independent_samples(whitened[starts], weights) if len(starts) else 1.0
+    if is_dead_reckoning and found.claimed is not None and found.rows is not None:
+        n = max(min(n, claimed_samples(found.rows, found.claimed, found.motions)), 1.0)
     return consistency(found.errors, found.covariances, probability, n_independent=n)
 
 
 def position_consistency(
-    trajectory: Trajectory, reference: ReferenceTrack, lever_sigma_m: float = 0.0, probability: float = 0.95, max_gap_s: float = 1.0
+    trajectory: Trajectory,
+    reference: ReferenceTrack,
+    lever_sigma_m: float = 0.0,
+    probability: float = 0.95,
+    max_gap_s: float = 1.0,
+    is_dead_reckoning: bool = False,
 ) -> Consistency | None:
     """NEES of a trajectory by positions without headings: of its distances from the first match, 1 expected.
 
@@ -302,15 +337,14 @@ def position_consistency(
     assert known is not None
     assert part.covariances is not None
     d = se2.between(estimate[0], estimate[1:])
-    grown = known[1:] - _moved(known[0], d)
+    grown = known[1:] - moved_covariances(known[0], d)
     c, s = np.cos(d[:, 2]), np.sin(d[:, 2])
-    start_R_body = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=-2)
-    in_start = start_R_body @ grown[:, :2, :2] @ np.swapaxes(start_R_body, 1, 2)
     noise = np.trace(part.covariances[:, :2, :2], axis1=1, axis2=2) / 2.0
     length = np.hypot(d[:, 0], d[:, 1])
     of_positions = noise[1:] + noise[0]
-    along = d[:, :2] / np.maximum(length, 1e-12)[:, None]
-    variance = np.einsum("ni,nij,nj->n", along, in_start, along) + of_positions + 2.0 * (1.0 - c) * lever_sigma_m**2
+    u = d[:, :2] / np.maximum(length, 1e-12)[:, None]
+    in_body = np.stack([c * u[:, 0] + s * u[:, 1], -s * u[:, 0] + c * u[:, 1]], axis=1)
+    variance = np.einsum("ni,nij,nj->n", in_body, grown[:, :2, :2], in_body) + of_positions + 2.0 * (1.0 - c) * lever_sigma_m**2
     variance += trajectory.interpolation_errors_at(part.stamps_ns[1:])[:, 0] ** 2
     use = is_covariance(grown) & np.isfinite(variance) & (length > 5.0 * np.sqrt(of_positions)) & (length > _MIN_STEP_M) & (variance > 0.0)
     if not use.any():
@@ -318,14 +352,25 @@ def position_consistency(
     # noise across a displacement makes it longer by sigma^2 / (2 l) in the mean
     measured = np.hypot(*(part.positions[1:] - part.positions[0]).T)
     errors = measured - length - of_positions / (2.0 * np.maximum(length, _MIN_STEP_M))
-    found = PoseErrors(part.stamps_ns[1:][use], errors[use, None], variance[use, None, None], int(np.count_nonzero(~use)), d[use])
-    return _along_one_run(found, probability)
+    rows = np.column_stack([in_body, np.zeros(len(d))])[use, None] / np.sqrt(variance[use])[:, None, None]
+    left_out = int(np.count_nonzero(~use))
+    found = PoseErrors(part.stamps_ns[1:][use], errors[use, None], variance[use, None, None], left_out, d[use], grown[use], rows)
+    return _along_one_run(found, probability, is_dead_reckoning)
 
 
-def _moved(covariance: FloatArray, motions: FloatArray) -> FloatArray:
-    """(N, 3, 3) what a covariance (3, 3) at the start is at the ends of motions (N, 3)."""
+def _roots(covariances: FloatArray) -> FloatArray:
+    """(N, d, d) that take errors of ``covariances`` (N, d, d) to unit covariance; zero where the variance is."""
+    sigma, values, vectors = _spectrum(covariances)
+    free = (values > _MAX_ZERO_EIGENVALUE * values[:, -1:]) & (values > 0.0)
+    scale = np.where(free, 1.0 / np.sqrt(np.where(free, values, 1.0)), 0.0)
+    roots: FloatArray = scale[:, :, None] * np.swapaxes(vectors, 1, 2) / sigma[:, None, :]
+    return roots
+
+
+def moved_covariances(covariances: FloatArray, motions: FloatArray) -> FloatArray:
+    """(N, 3, 3) what covariances (3, 3) or (N, 3, 3) at the start are at the ends of motions (N, 3)."""
     a = se2.adjoint(se2.inverse(motions))
-    moved: FloatArray = a @ covariance @ np.swapaxes(a, 1, 2)
+    moved: FloatArray = a @ covariances @ np.swapaxes(a, 1, 2)
     return moved
 
 

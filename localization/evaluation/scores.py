@@ -12,6 +12,7 @@ from localization.evaluation.consistency import Consistency, pose_consistency, p
 from localization.evaluation.metrics import Accuracy, evaluate
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.stretches import stretch_consistency
 from localization.log_replay import Run
 
 _LEVER_SIGMA_M = 0.3
@@ -34,6 +35,8 @@ class Result:
     """Where `nees_mean` is in 95 % of drives of consistent covariances, for as many independent samples as this drive has."""
     position_nees: Consistency | None = None
     """NEES of distances from the start, 1 expected, where the reference has positions and their covariances, but no headings."""
+    stretch_nees: Consistency | None = None
+    """NEES of dead reckoning's motions over stretches of the drive, 3 expected, 1 of positions, where the reference has covariances."""
     contradictions: tuple[str, ...] = ()
     """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
 
@@ -65,6 +68,8 @@ class Result:
             "nees_band": None if self.nees_band is None else list(self.nees_band),
             "position_nees_mean": None if self.position_nees is None else self.position_nees.mean,
             "position_nees_band": None if self.position_nees is None else list(self.position_nees.band),
+            "stretch_nees_mean": None if self.stretch_nees is None else self.stretch_nees.mean,
+            "stretch_nees_band": None if self.stretch_nees is None else list(self.stretch_nees.band),
             "nis_mean": self.nis_mean,
             "moments": None if self.filtered is None else self.filtered.numbers(),
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
@@ -104,8 +109,11 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None, contradiction
     published = None if run.filtered is None else evaluate(run.filtered, reference)
     if isinstance(reference, Relations) or contradictions:
         return Result(run, accuracy, None, published, contradictions=contradictions)
-    found = pose_consistency(filtered, reference)
-    by_distances = position_consistency(filtered, reference, _LEVER_SIGMA_M) if reference.yaws is None else None
-    if found is None:
-        return Result(run, accuracy, None, published, position_nees=by_distances)
-    return Result(run, accuracy, found.mean, published, found.band, by_distances)
+    drifts = not np.isfinite(run.nis).any()  # no scan has corrected it
+    stretches = stretch_consistency(filtered, reference, _LEVER_SIGMA_M) if drifts else None
+    found = pose_consistency(filtered, reference, is_dead_reckoning=drifts)
+    mean, band = (None, None) if found is None else (found.mean, found.band)
+    by_distances = None
+    if reference.yaws is None:
+        by_distances = position_consistency(filtered, reference, _LEVER_SIGMA_M, is_dead_reckoning=drifts)
+    return Result(run, accuracy, mean, published, band, by_distances, stretches)

@@ -39,6 +39,10 @@ _NOISE_FACTOR = 1.25  # errors up to it times the reference's noise are 0.75 of 
 _MIN_SIGMA_FACTOR = 1.25  # the band of thousands of innovations is so narrow that every filter leaves it; smaller factors are not reported
 
 
+_MIN_SHOWN_FACTOR = 1.5
+"""In sigma; what a drive shows is said where smaller errors of the covariances stay hidden."""
+
+
 def verdict(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:
     """The summary as one paragraph."""
     return " ".join(verdict_sentences(results, reference))
@@ -235,6 +239,11 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     elif (distances := line.result.position_nees) is not None:
         results_.append(_test("NEES of distances", distances.mean, distances.band, "errors", dof=1))
         by_pose = results_[-1][0]
+    if (stretches := line.result.stretch_nees) is not None:
+        dof = round(stretches.dof)
+        results_.append(_test(f"NEES over {stretches.n} stretches", stretches.mean, stretches.band, "errors", dof))
+    elif by_pose == "fits":
+        results_[-1] = ("fits", results_[-1][1] + _shown(line.result))
     found = {word: [text for verdict_, text in results_ if verdict_ == word] for word in ("over", "under", "fits")}
     if found["over"] and by_pose in ("fits", "under"):
         also = f"{whose} are not too small by the reference ({join_words([*found['fits'], *found['under']])})"
@@ -253,6 +262,15 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     if found["fits"]:
         return [f"{whose} are consistent: {join_words(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings or with covariances of its positions."]
+
+
+def _shown(result: Result) -> str:
+    """Which errors of the covariances the few independent samples of one drive show."""
+    dof, band = _DOF, _nees_band(result)
+    if result.nees_mean is None and result.position_nees is not None:
+        dof, band = 1, result.position_nees.band
+    factor = math.sqrt(band[1] / dof)
+    return f"; this drive shows sigmas that are {factor:.1f} times too small or more" if factor > _MIN_SHOWN_FACTOR else ""
 
 
 def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:

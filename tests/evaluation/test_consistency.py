@@ -11,6 +11,7 @@ from scipy.stats import binom, chi2, kstest
 
 from localization.errors import EvaluationError
 from localization.evaluation.consistency import (
+    claimed_samples,
     consistency,
     degrees_of_freedom,
     independent_samples,
@@ -24,6 +25,7 @@ from localization.evaluation.consistency import (
     position_consistency,
 )
 from localization.evaluation.references import ReferenceTrack, with_noise
+from localization.evaluation.stretches import stretch_consistency
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.extended import cases
@@ -270,14 +272,29 @@ def test_pose_nees_of_half_the_variance_fails_over_runs():
     assert np.all(means > high)
 
 
-def test_pose_nees_of_one_odometry_run_counts_as_two_samples():
-    """A random walk's normalised errors have the correlation sqrt(s / t): in the mean of their squares that is two samples."""
-    truths, estimate, p = odometry_runs(16, runs=150)
-    found = [pose_consistency(as_trajectory(estimate, p), as_track(truth)) for truth in truths]
-    assert 1.7 < np.median([one.n_independent for one in found]) < 3.0
-    assert [one.verdict for one in found].count("consistent") >= 0.85 * 150
-    halved = [pose_consistency(as_trajectory(estimate, 0.25 * p), as_track(truth)).verdict for truth in truths]
-    assert halved.count("overconfident") > 0.7 * 150
+def test_nees_of_one_dead_reckoning_counts_as_two_samples_and_by_stretches():
+    """A random walk's normalised errors have the correlation sqrt(s / t): in the mean of their squares that is two samples, which show half
+    the sigma in some drives; sixteen stretches show it in all. Of right covariances 95 % are called consistent."""
+    truths, estimate, p = odometry_runs(16, runs=100)
+    noise = np.tile(np.diag([25e-6, 25e-6, 1e-6]), (61, 1, 1))
+    tracks = [as_track(truth, covariances=noise) for truth in truths]
+    right, halved = as_trajectory(estimate, p), as_trajectory(estimate, 0.25 * p)
+    found = [pose_consistency(right, track, is_dead_reckoning=True) for track in tracks]
+    assert 1.2 < np.median([one.n_independent for one in found]) < 2.1
+    assert as_often_as([one.verdict for one in found].count("consistent"), 100, 0.97)
+    assert [pose_consistency(halved, track, is_dead_reckoning=True).verdict for track in tracks].count("overconfident") > 50
+    stretches = [stretch_consistency(right, track) for track in tracks]
+    assert [one.n for one in stretches] == [16] * 100
+    assert as_often_as([one.verdict for one in stretches].count("consistent"), 100, 0.95)
+    assert {stretch_consistency(halved, track).verdict for track in tracks} == {"overconfident"}
+
+
+def test_claimed_samples_of_a_random_walk_are_two():
+    """Squared correlations s / t have the mean 1/2 over all pairs of times."""
+    n = 400
+    p = np.eye(3) * np.arange(1, n + 1)[:, None, None]
+    rows = np.eye(3) / np.sqrt(np.arange(1, n + 1))[:, None, None]
+    assert claimed_samples(rows, p, np.zeros((n, 3))) == pytest.approx(2.0, rel=0.02)
 
 
 def correlated(rng, n, d, samples):
@@ -311,19 +328,25 @@ def test_independent_samples_of_a_robot_that_stands_are_those_of_its_drive():
     assert independent_samples(z[:1]) == 1.0
 
 
-@pytest.mark.parametrize(("scale", "share"), [(1.0, ("consistent", 0.83)), (1.0 / 16.0, ("overconfident", 0.7))])
-def test_position_nees_of_odometry_without_headings_follows_its_covariance(scale, share):
-    """The frame of the positions is turned: right covariances are consistent, a quarter of the sigma is not."""
-    truths, estimate, p = odometry_runs(22, runs=200)
-    rng, noise, verdicts, means = np.random.default_rng(23), np.diag([4e-4, 4e-4, 0.0]), [], []
+def test_position_nees_of_odometry_without_headings_follows_its_covariance():
+    """The frame of the positions is turned: right covariances are consistent, half the sigma shows over stretches, and where the positions'
+    noise hides it, nothing is claimed."""
+    truths, estimate, p = odometry_runs(22, runs=100)
+    rng, verdicts, by_stretches, halved, means = np.random.default_rng(23), [], [], [], []
     for truth in truths:
-        seen = se2.compose([3.0, -2.0, 1.1], truth)[:, :2] + 0.02 * rng.normal(size=(len(truth), 2))
-        track = ReferenceTrack(np.arange(len(truth)) * SECOND, seen, None, np.tile(noise, (len(truth), 1, 1)))
-        found = position_consistency(as_trajectory(estimate, scale * p), track)
+        seen = se2.compose([3.0, -2.0, 1.1], truth)[:, :2] + 0.005 * rng.normal(size=(len(truth), 2))
+        track = ReferenceTrack(np.arange(len(truth)) * SECOND, seen, None, np.tile(np.diag([25e-6, 25e-6, 0.0]), (len(truth), 1, 1)))
+        found = position_consistency(as_trajectory(estimate, p), track, is_dead_reckoning=True)
         verdicts.append(found.verdict)
         means.append(found.mean)
-    assert verdicts.count(share[0]) >= share[1] * 200
-    assert np.mean(means) == pytest.approx(1.0, abs=0.25) if scale == 1.0 else np.mean(means) > 2.0
+        by_stretches.append(stretch_consistency(as_trajectory(estimate, p), track).verdict)
+        halved.append(stretch_consistency(as_trajectory(estimate, 0.25 * p), track).verdict)
+    assert as_often_as(verdicts.count("consistent"), 100, 0.98)
+    assert np.mean(means) == pytest.approx(1.0, abs=0.25)
+    assert as_often_as(by_stretches.count("consistent"), 100, 0.95)
+    assert halved.count("overconfident") >= 85  # 96 % of 200 drives
+    coarse = ReferenceTrack(np.arange(61) * SECOND, truths[0][:, :2], None, np.tile(np.diag([1.0, 1.0, 0.0]), (61, 1, 1)))
+    assert stretch_consistency(as_trajectory(estimate, p), coarse) is None
 
 
 def test_position_nees_without_covariances_or_motion_is_none():
