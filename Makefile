@@ -12,10 +12,17 @@ DATA := tests/data
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
+KERNELS := $(shell grep -rlE '^@(threaded_kernel|kernel|subroutine)' --include='*.py' localization motion_models)
+
+.venv/kernels: .venv/ready $(KERNELS)
+	@echo "Compiling, once (a minute)."
+	$(BIN)/python -m tests.helpers.compile_kernels
+	touch $@
+
 # A minute: real rotations held out, then a drive whose arms move the centre of gravity, then the same with a hidden load.
-demo: .venv/ready
+demo: .venv/kernels
 	rm -rf $(DEMO) && mkdir $(DEMO)
-	@echo "1. Real robot: 68 rotations in place, each at another centre of gravity (about a minute in all; the first start compiles)."
+	@echo "1. Real robot: 68 rotations in place, each at another centre of gravity."
 	$(BIN)/python -m tests.studies.held_out_rotations
 	@echo "2. Simulated drive: the arms take another posture on each lap. Wheels alone, then fused with gyro and LiDAR."
 	$(BIN)/skidloc simulate laps --out $(DEMO)/laps.mcap
@@ -35,11 +42,11 @@ demo-buildings: .venv/ready
 		--reference $(DATA)/fr079/fr079_reference.tum --reference-sigma 0.016 0.5 --out $(DEMO)/fr079
 	@echo "Open $(DEMO)/aces/report.html, $(DEMO)/fr079/report.html and $(DEMO)/husky/report.html in a browser."
 
-test: .venv/ready
+test: .venv/kernels
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow and not extended"
 
 # What `make test` leaves out: more cases of each kind and long scenarios.
-test-extended: .venv/ready
+test-extended: .venv/kernels
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "extended and not slow"
 
 test-all: test test-extended
