@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from kiss_icp.config import load_config
-from kiss_icp.kiss_icp import KissICP
 
 from motion_models.se2 import FloatArray, Pose2
 
@@ -52,6 +50,9 @@ class KissIcp:
     """
 
     def __init__(self, voxel_size: float, max_range: float) -> None:
+        from kiss_icp.config import load_config  # here: both take 0.2 s to import, and usual planar runs need neither
+        from kiss_icp.kiss_icp import KissICP
+
         self._made = voxel_size, max_range
         with _without_environment():
             config = load_config(None)

@@ -8,21 +8,29 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-STORE_ROS1 = get_typestore(Stores.ROS1_NOETIC)
-STORE_ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 _T = STORE.types
 _STAMP = (0x5A5A1234, 0x3A3A4321)
 _NS = 1_000_000_000
 UNKNOWN_VARIANCE = 1e6
 
 Array = NDArray[Any]
+
+
+@cache
+def store_ros1() -> Typestore:
+    """Types of ROS 1, made when they are first asked for."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    return store
 
 
 class Message(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,12 +20,11 @@ from rosbags.typesys.store import Typestore
 
 from localization.logs.chunks import Channel, RawMessage
 from localization.logs.decode import Oddity, UnusableError
-from localization.logs.message_templates import STORE, STORE_ROS1, Message, MessageLayout, Template
+from localization.logs.message_templates import STORE, Message, MessageLayout, Template, store_ros1
 from localization.logs.writer import BODY_FRAME, PARENT_FRAME, FusedEstimate, odometry_message, six_by_six, transform_message
 from motion_models.se2 import FloatArray
 
 _GRAPH_PACKAGE = "rmw_dds_common"
-_STORE_GRAPH = get_typestore(Stores.ROS2_JAZZY)  # its entities have 16 bytes since Iron, 24 in Humble
 _MAX_DEFINITION_CHARACTERS = 1 << 18  # characters; those of ROS's own types have up to 20,000
 _MAX_FIXED_ARRAY_LENGTH = (
     10_000  # elements; ROS's longest is a covariance of 36, and the generated deserializer has a line or more for each
@@ -49,7 +48,7 @@ def encode(message: Any, *, is_ros1: bool = False) -> bytes:
 def decoder(kind: str, *, is_ros1: bool = False) -> Callable[[bytes], Any]:
     """Deserializer of messages of type ``kind`` (package/msg/Type); for frequent types it returns the fields in use only (`fast_decoder`).
     It raises `UnusableError`."""
-    deserialize = STORE_ROS1.deserialize_ros1 if is_ros1 else STORE.deserialize_cdr
+    deserialize = store_ros1().deserialize_ros1 if is_ros1 else STORE.deserialize_cdr
     fast = None if is_ros1 else fast_decoder(kind)
 
     def decode(data: bytes) -> Any:
@@ -74,7 +73,7 @@ def type_hash(kind: str) -> str:
 
 def definition(kind: str, *, is_ros1: bool = False) -> tuple[str, str]:
     """Text of a type's definition and, in ROS 1, its MD5 sum."""
-    store: Typestore = STORE_ROS1 if is_ros1 else STORE
+    store: Typestore = store_ros1() if is_ros1 else STORE
     text, digest = store.generate_msgdef(kind, ros_version=1 if is_ros1 else 2)
     return text, digest
 
@@ -90,7 +89,12 @@ def fields(kind: str) -> list[tuple[str, Shape]]:
 
 
 def _store(kind: str) -> Typestore:
-    return _STORE_GRAPH if kind.startswith(_GRAPH_PACKAGE) else STORE
+    return _store_graph() if kind.startswith(_GRAPH_PACKAGE) else STORE
+
+
+@cache
+def _store_graph() -> Typestore:
+    return get_typestore(Stores.ROS2_JAZZY)  # its entities have 16 bytes since Iron, 24 in Humble
 
 
 def _shape(described: Any) -> Shape:

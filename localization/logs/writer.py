@@ -46,7 +46,7 @@ from rosbags.typesys.stores.ros2_humble import tf2_msgs__msg__TFMessage as TFMes
 
 from localization.errors import OutputError
 from localization.lifting import Pose3, quaternion
-from localization.logs.message_templates import STORE, STORE_ROS1, Message, MessageLayout, Template
+from localization.logs.message_templates import STORE, Message, MessageLayout, Template, store_ros1
 from localization.output import output_errors, refuse_existing
 from motion_models.se2 import FloatArray
 
@@ -143,7 +143,7 @@ def _connect(writer: Any, path: Path, layout: MessageLayout, is_ros1: bool) -> A
     with _writing(path):
         if is_ros1:
             latched = 1 if layout.topic == _LATCHED_TOPIC else None
-            return writer.add_connection(layout.topic, layout.type, typestore=STORE_ROS1, latching=latched)
+            return writer.add_connection(layout.topic, layout.type, typestore=store_ros1(), latching=latched)
         return writer.add_connection(layout.topic, layout.type, typestore=STORE)
 
 

@@ -158,7 +158,7 @@ def run_node(
         node=config or NodeConfig(wait_s=0.0, predict=False),
     )
     warming = WarmUp(run)  # the transport has no time: everything would come while the node compiles
-    warming.wait(with_clouds="sensor_msgs/msg/PointCloud2" in transport.types.values())
+    warming.wait(with_clouds={"sensor_msgs/msg/PointCloud2"} in transport.publishers().values())
     node = Node.start(transport, run, reports.append, view=view)
     node.spin(transport.is_empty)
     return node, reports
