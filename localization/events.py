@@ -140,6 +140,8 @@ class Reference:
     """[rad]; None where the source has positions only (GPS)."""
     covariance: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
     """(3, 3) of x, y, yaw [m, m, rad]; NaN where unknown."""
+    origin: tuple[float, float, float] | None = None
+    """Latitude and longitude [deg] and height [m] of the plane's origin; None for a plane that is nowhere on the earth."""
 
 
 Event = WheelSample | CgSample | Scan | ImuSample | PositionSample | Reference

@@ -38,7 +38,7 @@ from localization.events import Event, PositionSample
 from localization.lifting import write_tum3
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
-from localization.logs.reference_topics import merge_positions, read_positions
+from localization.logs.reference_topics import merge_positions, move_origin, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
@@ -89,7 +89,8 @@ class Replay:
     reference_sigma: tuple[float, float] | None = None
     """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: without it the NEES assumes an exact reference."""
     positions: str | None = None
-    """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`. The lever arm of the antenna is
+    """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`; in a `--map` that was built with them they narrow
+    the search. The lever arm of the antenna is
     --config.estimator.graph.antenna-x-m and -y-m. If they are the reference as well, every second one is fused, and the others score."""
     map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Map of an earlier drive, by `--save-map`: the estimator `map` is added, whose poses are in that map's frame."""
@@ -163,7 +164,10 @@ class Replay:
         self._write(head, results, reference)
         if self.save_map is not None:
             save_map(
-                self.save_map, saved_map([run for run in runs if run.estimator != LOCALIZER], head, mounts, dataclasses.asdict(self.config))
+                self.save_map,
+                saved_map(
+                    [run for run in runs if run.estimator != LOCALIZER], head, mounts, dataclasses.asdict(self.config), self._origin(log)
+                ),
             )
         if self.extend_map is not None:
             console.print(self._extend(self.extend_map, runs, head, mounts), markup=False, soft_wrap=True)
@@ -261,10 +265,18 @@ class Replay:
     def _positions(self, log: Log) -> list[PositionSample]:
         if self.positions is None:
             return []
-        if "graph" not in self.estimator.split(","):
+        if "graph" not in self.estimator.split(",") and self.map is None:
             raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
-        samples = log.references(self.positions)
+        samples = move_origin(log.references(self.positions), self._origin(log), self.positions)
         return read_positions(itertools.islice(samples, 0, None, 2) if self._is_held_out(log) else samples, self.positions)
+
+    def _origin(self, log: Log) -> tuple[float, float, float] | None:
+        """Latitude, longitude [deg] and height [m] of the origin of `--positions`: that of the map, or the first one."""
+        plane = None if self.map is None else load_map(self.map).map.plane
+        if plane is not None:
+            return plane.origin
+        first = None if self.positions is None else next(log.references(self.positions), None)
+        return None if first is None else first.origin
 
     def _reference_name(self, log: Log) -> str | None:
         return self.reference if self.reference is not None else log.reference_topic
@@ -299,8 +311,15 @@ class Replay:
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 
 
-def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:
-    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``."""
+def saved_map(
+    runs: Sequence[Run],
+    head: ReportHead,
+    mounts: Mapping[str, Mount],
+    config: Mapping[str, Any],
+    origin: tuple[float, float, float] | None = None,
+) -> SavedMap:
+    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``,
+    ``origin`` [deg, deg, m] of the positions that were fused."""
     run, keyframes = [(run, run.keyframes) for run in runs if run.keyframes is not None][-1]
     provenance = {
         "log": head.log,
@@ -312,7 +331,8 @@ def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount]
         "config": config,
         "versions": dict(head.versions),
     }
-    return SavedMap(keyframes, provenance)
+    plane = None if keyframes.plane is None else dataclasses.replace(keyframes.plane, origin=origin)
+    return SavedMap(dataclasses.replace(keyframes, plane=plane), provenance)
 
 
 def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:

@@ -24,6 +24,7 @@ from localization.lidar import OUTLIER_SIGMAS, LidarConfig
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
+from localization.maps.position_plane import PositionPlane
 from localization.trajectory import Trajectory, through_nodes
 from motion_models import se2
 from motion_models.online_calibration import Corrections
@@ -302,7 +303,7 @@ class GraphFusion(FilteredOdometry):
         keys, edges = self._loops.keyframes, [between for update in self.graph.updates for between in update.betweens]
         if not keys:
             return None
-        covs = self._smoothed_covs
+        covs, alignment = self._smoothed_covs, self.graph.alignment()
         return KeyframeMap(
             stamps_ns=np.array([key.stamp_ns for key in keys], dtype=np.int64),
             poses=self.graph.poses(),
@@ -314,6 +315,7 @@ class GraphFusion(FilteredOdometry):
             edge_deltas=np.array([edge.delta for edge in edges]).reshape(-1, 3),
             edge_information=np.array([edge.information for edge in edges]).reshape(-1, 3, 3),
             edge_is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
+            plane=None if alignment is None else PositionPlane(*alignment, self.graph.lever_arm()[0]),
         )
 
     def occupancy(self) -> Grid | None:

@@ -14,7 +14,8 @@ import numpy as np
 
 from localization.estimators.estimator import Estimate, Estimator
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
-from localization.events import Step
+from localization.events import PositionSample, Step
+from localization.lidar.registration import is_narrow
 from localization.maps import KeyframeMap
 from localization.maps.changes import Changes, find_changes
 from localization.maps.grid import Grid
@@ -62,6 +63,8 @@ class MapFusion(FilteredOdometry):
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
         self._first_s: float | None = None
         self._n_losses, self._waiting_s = 0, 0.0
+        self._positions: list[PositionSample] = []
+        self._n_without_plane = 0
         self._drive: list[_DriveKeyframe] | None = [] if is_recording else None
         self._changes: Changes | None = None
 
@@ -75,7 +78,9 @@ class MapFusion(FilteredOdometry):
         self._add_step()
         delta, cov = self._motion_since_keyframe()
         is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
-        self._is_keyframe_due = (is_far or not self._has_key) and len(self.odometry.scan_points) > 0
+        has_scan = len(self.odometry.scan_points) > 0
+        self._is_keyframe_due = ((is_far or not self._has_key) and has_scan) or not is_narrow(cov)  # carried: what was is no longer so
+        self._take_positions(step.end_ns, delta)
         A = se2.adjoint(se2.inverse(delta))
         pose, covariance = se2.compose(self._map_T_odom, estimate.pose), A @ self._key_cov @ A.T + cov
         return replace(
@@ -91,12 +96,26 @@ class MapFusion(FilteredOdometry):
         if self._is_keyframe_due:
             self._is_keyframe_due, self._has_key = False, True
             was_localized = self.localizer.state == "localized"
-            self.localizer.add(self.odometry.state["pose"], self.odometry.scan_points, *self._motion_since_keyframe())
+            self.localizer.add(self.odometry.scan_points, *self._motion_since_keyframe())
             self.odometry.start_key()
             self._summed_cov = np.zeros((3, 3))
             self._n_losses += was_localized and self.localizer.state == "lost"
             self._take_pose()
             self._record()
+
+    def add_position(self, sample: PositionSample) -> None:
+        """A position of the plane in which the map's drive fused its own, as by GNSS: it narrows where the robot may be."""
+        self._positions.append(sample)
+
+    def _take_positions(self, until_ns: int, delta: Pose2) -> None:
+        """Pass on the last position up to ``until_ns``, when the robot has moved by ``delta`` (3,) since the last keyframe."""
+        due = [sample for sample in self._positions if sample.stamp_ns <= until_ns]
+        self._positions = self._positions[len(due) :]
+        plane = self.localizer.places.plane
+        if due and plane is not None:
+            fix = plane.to_map(due[-1].position, due[-1].covariance)
+            self.localizer.add_position(fix._replace(way_m=math.hypot(delta[0], delta[1])))
+        self._n_without_plane += len(due) if plane is None else 0
 
     def _record(self) -> None:
         if self._drive is not None:
@@ -206,6 +225,9 @@ class MapFusion(FilteredOdometry):
                 f"the place in the map was lost {self._n_losses} times, for {unknown:.0f} of {total:.0f} s, and is {state} at the end: "
                 "poses of that time are by odometry alone. The robot was carried, or the map is out of date."
             )
+        if self._n_without_plane:
+            unused = f"{self._n_without_plane} positions could not be used: the map was built without"
+            found.append(f"{unused}. Build it with --positions, or leave them out.")
         return [*found, *([] if self._changes is None else _describe(self._changes))]
 
     def occupancy(self) -> Grid:

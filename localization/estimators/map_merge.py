@@ -69,7 +69,7 @@ def _closures(places: PlaceMap, second: KeyframeMap, initial: Pose2 | None) -> d
     for order, near in ((range(len(scans)), initial), (range(len(scans) - 1, -1, -1), None)):
         localizer, before = Localizer(places, near), second.poses[order[0]]
         for k in order:
-            localizer.add(second.poses[k], scans[k], se2.between(before, second.poses[k]), _RELATIVE_COV)
+            localizer.add(scans[k], se2.between(before, second.poses[k]), _RELATIVE_COV)
             before = second.poses[k]
             if k not in found and localizer.state == "localized" and (closure := _closure(places, scans[k], localizer)) is not None:
                 found[k] = closure
@@ -124,6 +124,7 @@ def _join(
         edge_deltas=np.vstack([first.edge_deltas, second.edge_deltas, ties]),
         edge_information=np.vstack([first.edge_information, second.edge_information, information]),
         edge_is_loop=np.r_[first.edge_is_loop, second.edge_is_loop, np.ones(len(closures), dtype=bool)],
+        plane=first.plane,
     )
 
 

@@ -147,6 +147,12 @@ class PoseGraph:
             return self.lever, _LEVER_SIGMA_M**2 * np.eye(2)
         return np.asarray(self._values.atPoint2(_LEVER)), np.asarray(self._isam.marginalCovariance(_LEVER))
 
+    def alignment(self) -> tuple[Pose2, Cov3] | None:
+        """``enu_T_map`` (3,) and the covariance (3, 3) of its right perturbation; None without positions."""
+        if not self._values.exists(_ALIGNMENT):
+            return None
+        return _array(self._values.atPose2(_ALIGNMENT)), np.asarray(self._isam.marginalCovariance(_ALIGNMENT))
+
     def position_errors(self) -> FloatArray:
         """(n,) normalised errors [sigma] of the positions by the present estimates."""
         positions = [position for update in self.updates for position in update.positions]

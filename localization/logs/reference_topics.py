@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -49,13 +50,14 @@ def _reference(stamp: int, position: Any, orientation: Any, covariance: Any) -> 
 
 
 def _fix_decoder(datum: FloatArray | None) -> Callable[[Any, int], Reference]:
-    origin: tuple[FloatArray, FloatArray] | None = None
+    origin: tuple[float, float, float] | None = None
+    centre, axes = np.zeros(3), np.zeros((2, 3))
     if datum is not None:
-        place = math.radians(datum[0]), math.radians(datum[1])
-        origin = geodetic_to_ecef(*place, 0.0), east_north(*place)
+        origin = float(datum[0]), float(datum[1]), 0.0
+        centre, axes = _plane(origin)
 
     def decode(message: Any, stamp: int) -> Reference:
-        nonlocal origin
+        nonlocal origin, centre, axes
         degrees = np.array([message.latitude, message.longitude], dtype=float)
         if int(message.status.status) < 0 or not np.isfinite(degrees).all() or abs(degrees[0]) > 90.0:
             raise UnusableError(Oddity.NO_FIX)
@@ -63,13 +65,20 @@ def _fix_decoder(datum: FloatArray | None) -> Callable[[Any, int], Reference]:
         latitude, longitude = np.radians(degrees)
         position = geodetic_to_ecef(latitude, longitude, height)
         if origin is None:
-            origin = position, east_north(latitude, longitude)
+            origin = float(degrees[0]), float(degrees[1]), height
+            centre, axes = _plane(origin)
         cov = np.full((3, 3), np.nan)
         if int(message.position_covariance_type) > 0:
             cov[:2, :2] = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
-        return Reference(stamp, origin[1] @ (position - origin[0]), None, cov)
+        return Reference(stamp, axes @ (position - centre), None, cov, origin)
 
     return decode
+
+
+def _plane(origin: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
+    """(3,) earth-centred position [m] of ``origin`` [deg, deg, m], and (2, 3) its axes to the east and to the north."""
+    latitude, longitude = np.radians(origin[:2])
+    return geodetic_to_ecef(latitude, longitude, origin[2]), east_north(latitude, longitude)
 
 
 def geodetic_to_ecef(latitude: float, longitude: float, height: float) -> FloatArray:
@@ -117,6 +126,22 @@ def position_sample(reference: Reference) -> PositionSample | None:
     if not np.isfinite(cov).all() or (np.linalg.eigvalsh(cov) <= 0.0).any():
         cov = _UNKNOWN_SIGMA_M**2 * np.eye(2)
     return PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2))
+
+
+def move_origin(references: Iterable[Reference], origin: tuple[float, float, float] | None, source: str) -> Iterator[Reference]:
+    """``references`` in the plane that has its origin at latitude, longitude [deg] and height [m], by way of the earth's centre. Yaws stay:
+    the axes of two planes 1 km apart differ by 0.01 deg. Raises `LogError` if one of both planes is on the earth and the other is not.
+    """
+    for reference in references:
+        if (reference.origin is None) != (origin is None):
+            kinds = ("positions in metres", "latitude and longitude")
+            here, there = (kinds[plane is not None] for plane in (reference.origin, origin))
+            raise LogError(f"{source} has {here}, and the map was built with {there}. Name the topic that the map was built with.")
+        if reference.origin is None or origin is None:
+            yield reference
+            continue
+        (centre, axes), (to_centre, to_axes) = _plane(reference.origin), _plane(origin)
+        yield replace(reference, position=to_axes @ (centre + axes.T @ reference.position - to_centre), origin=origin)
 
 
 def merge_positions(events: Iterable[Event], positions: list[PositionSample]) -> Iterator[Event]:

@@ -19,10 +19,11 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 class BackgroundSearch:
     """`PlaceMap.search` of merged scans. `advance` by each step, `move` by each keyframe, and take the `result` when it is due."""
 
-    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None) -> None:
-        """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map."""
+    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None, is_by_fix: bool = False) -> None:
+        """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
+        ``is_by_fix``: it is about a measured position."""
         self._places, self._points, self._near = places, points, near
-        self.n_points = len(points)
+        self.n_points, self.is_by_fix = len(points), is_by_fix
         self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
         """(3,) motion since the scans, with its covariance (3, 3)."""
         self._left_s = places.search_s

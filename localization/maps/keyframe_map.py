@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.maps.position_plane import PositionPlane
 from motion_models import se2
 from motion_models.se2 import FloatArray, Points2
 
@@ -37,6 +38,8 @@ class KeyframeMap:
     """(E, 3, 3) of their right perturbations."""
     edge_is_loop: NDArray[np.bool_]
     """(E,) whether it is a loop closure."""
+    plane: PositionPlane | None = None
+    """Where the map is in the plane of the positions that were fused; None without such."""
 
     def scans(self) -> list[Points2]:
         """The points (n, 2) of each keyframe in its body frame [m]."""
@@ -63,4 +66,5 @@ class KeyframeMap:
             edge_deltas=self.edge_deltas[is_kept],
             edge_information=self.edge_information[is_kept],
             edge_is_loop=self.edge_is_loop[is_kept],
+            plane=self.plane,
         )

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from localization.errors import MapError
 from localization.maps.keyframe_map import KeyframeMap
+from localization.maps.position_plane import plane_from_json
 from localization.output import whole_file
 
 VERSION = 1
@@ -40,6 +41,7 @@ _DAMAGE = (
     NotImplementedError,
     RuntimeError,
     SyntaxError,
+    TypeError,
 )
 """What Python's zip, JSON and .npy readers raise for bytes that are none."""
 _SHAPES: Mapping[str, tuple[str, tuple[str | int, ...]]] = {
@@ -73,6 +75,8 @@ def save_map(path: Path, saved: SavedMap) -> None:
     members = {name: _npy(array) for name, array in arrays.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in members.items()}
     header = {"format": _FORMAT, "version": VERSION, "sha256": digests, "provenance": saved.provenance}
+    if saved.map.plane is not None:
+        header["positions"] = saved.map.plane.as_json()
     text = json.dumps(header, indent=1, ensure_ascii=False, sort_keys=True, allow_nan=False) + "\n"
     with whole_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
         archive.writestr(_member(_HEADER), text.encode())
@@ -88,6 +92,7 @@ def load_map(path: Path) -> SavedMap:
             if sum(archive.getinfo(f"{name}.npy").file_size for name in _SHAPES) > _MAX_BYTES:
                 raise MapError(f"map '{path}' holds more than {_MAX_BYTES >> 30} GiB of arrays, which no map of this program does.")
             arrays = {name: _read_array(archive, name, header, path) for name in _SHAPES}
+            plane = plane_from_json(header["positions"]) if "positions" in header else None
     except FileNotFoundError as error:
         raise MapError(f"no map '{path}'. Write one by `skidloc replay LOG ... --estimator graph --save-map FILE`.") from error
     except IsADirectoryError as error:
@@ -97,7 +102,7 @@ def load_map(path: Path) -> SavedMap:
     except _DAMAGE as error:
         raise MapError(f"map '{path}' is truncated, damaged, or no map file ({_reason(error)}). Write it again by --save-map.") from error
     _check(arrays, path)
-    return SavedMap(KeyframeMap(**arrays), header["provenance"])
+    return SavedMap(KeyframeMap(**arrays, plane=plane), header["provenance"])
 
 
 def _read_header(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:

@@ -43,6 +43,8 @@ _SEARCH_S, _SEARCH_S_PER_BLOCK = 0.2, 2e-4
 six maps and a machine with nine processes on two cores."""
 _NEAR = math.exp(-0.5 * 1.5**2)
 """Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
+OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
+"""Information of a scan along directions that the scene leaves open, at least [1/m^2, 1/m^2, 1/rad^2]."""
 _ALIGN_COV = np.diag([0.1, 0.1, 0.03]) ** 2
 """Covariance of a searched pose, from which scans are aligned [m^2, m^2, rad^2]."""
 
@@ -65,6 +67,11 @@ class Place:
     def residual_variance(self) -> float:
         """Mean square of the residuals of the inliers, in units of the assumed noise."""
         return self.fit.sum_squares / max(self.fit.n_inliers, 1)
+
+    @property
+    def measured_cov(self) -> Cov3:
+        """(3, 3) of the pose by the points alone, along directions that the scene leaves open 10 m or 1 rad."""
+        return np.asarray(np.linalg.inv(self.fit.information + OPEN_INFORMATION)) * max(self.residual_variance, 1.0)
 
     @property
     def score(self) -> float:
@@ -93,7 +100,7 @@ class PlaceMap:
         self._starts = self._free_blocks(keyframes)
         self.search_s = _SEARCH_S + _SEARCH_S_PER_BLOCK * len(self._starts)
         """Time after which the result of a search beside the estimates is due [s]."""
-        self._poses, self._covs = keyframes.poses, keyframes.covariances
+        self._poses, self._covs, self.plane = keyframes.poses, keyframes.covariances, keyframes.plane
         low, high = points.min(axis=0), points.max(axis=0)
         self.centre: Pose2 = np.array([*(0.5 * (low + high)), 0.0])
         """(3,) the middle of the map."""

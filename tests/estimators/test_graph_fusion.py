@@ -310,6 +310,9 @@ def test_graph_with_outlier_position_keeps_poses() -> None:
     assert pipeline.estimator.counts()["positions"] > 70
     assert pipeline.estimator.warnings() == []
     assert np.abs(spoilt - clean).max() < 0.3
+    plane = pipeline.estimator.keyframe_map().plane
+    off = se2.local(plane.plane_T_map, np.array([300.0, -200.0, 0.9]))
+    assert off @ np.linalg.solve(plane.covariance, off) < 16.3  # 99.9 % of normal errors
 
 
 @pytest.mark.extended

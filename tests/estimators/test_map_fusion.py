@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
 import pytest
 
 from localization.estimators import MapFusion, PriorMap
+from localization.events import PositionSample
 from localization.log_replay import replay
 from localization.logs import open_log
+from localization.logs.reference_topics import merge_positions
 from localization.maps.place_search import PlaceMap
+from localization.maps.position_plane import PositionPlane
 from localization.pipeline import Pipeline, Trial
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
@@ -63,6 +67,31 @@ def test_map_fusion_before_it_is_localized_has_the_maps_extent_as_sigma():
     assert pipeline.estimator.localization()["state"] == "searching"
     assert np.sqrt(estimates[-1].covariance[0, 0]) > 4.0
     assert any("never localized" in text for text in pipeline.warnings())
+
+
+def test_map_fusion_with_positions_elsewhere_leaves_the_place():
+    """The map's plane is turned and moved; positions that are right keep the place, those 30 m away do not."""
+    plane = PositionPlane(np.array([300.0, -200.0, 0.9]), 1e-4 * np.eye(3), np.zeros(2), None)
+    placed, events = PlaceMap(dataclasses.replace(keyframes(), plane=plane), 0.02), drive()[: len(drive()) // 2]
+    states = {}
+    for off in (0.0, 30.0):
+        pipeline = Pipeline(Trial(MODEL, "map", prior=PriorMap(placed, np.array([0.2, -0.2, 0.1]))), ROBOT, ROBOT.mounts, True)
+        fixes = [
+            PositionSample(int(stamp), se2.compose(plane.plane_T_map, pose)[:2] + np.array([off, 0.0]), np.eye(2))
+            for stamp, pose in zip(keyframes().stamps_ns, keyframes().poses, strict=True)
+        ]
+        for event in merge_positions(events, fixes):
+            pipeline.process(event)
+        states[off] = pipeline.estimator.localization()["state"]
+    assert states[0.0] == "localized"
+    assert states[30.0] != "localized"
+
+
+def test_map_fusion_with_positions_in_a_map_without_says_so():
+    pipeline = start()
+    for event in merge_positions(drive()[:50], [PositionSample(drive()[0].stamp_ns, np.zeros(2), np.eye(2))]):
+        pipeline.process(event)
+    assert any("the map was built without" in text for text in pipeline.warnings())
 
 
 def test_map_fusion_state_written_and_read_gives_the_same_estimates():

@@ -34,7 +34,7 @@ def test_localizer_during_a_search_waits_for_nothing_until_it_is_due(office: Pla
     monkeypatch.setattr(PlaceMap, "search", slow)
     localizer = Localizer(office, is_background=True)
     for k, delta in enumerate(floor_plan.moves(WAY[:3])):
-        localizer.add(WAY[k], floor_plan.scan(OFFICE, WAY[k], seed=k), delta, COV)  # the search of the first scan runs meanwhile
+        localizer.add(floor_plan.scan(OFFICE, WAY[k], seed=k), delta, COV)  # the search of the first scan runs meanwhile
     assert not localizer.advance(0.9 * office.search_s)
     assert not len(localizer.hypotheses)
     may_end.set()
@@ -48,7 +48,7 @@ def test_localizer_with_searches_beside_it_is_localized_at_the_same_place(office
     localizer = Localizer(office, is_background=True)
     states = []
     for k, delta in enumerate(floor_plan.moves(WAY)):
-        localizer.add(WAY[k], floor_plan.scan(OFFICE, WAY[k], seed=k), delta, COV)
+        localizer.add(floor_plan.scan(OFFICE, WAY[k], seed=k), delta, COV)
         localizer.advance(office.search_s)
         states.append(localizer.state)
     assert states[-1] == "localized"

@@ -27,11 +27,10 @@ def office() -> PlaceMap:
 
 def drive(localizer: Localizer, walls: np.ndarray, poses: np.ndarray, first_cov: np.ndarray = COV) -> list[tuple[str, float]]:
     """State and error [m] after each of ``poses`` (K, 3); odometry drifts by 1 % and 0.2 degrees a step."""
-    odometry, found = np.zeros(3), []
+    found = []
     for k, delta in enumerate(floor_plan.moves(poses)):
         delta = delta * 1.01 + np.array([0.0, 0.0, math.radians(0.2)]) * (k > 0)
-        odometry = se2.compose(odometry, delta)
-        localizer.add(odometry, floor_plan.scan(walls, poses[k], seed=100 + k), delta, first_cov if k == 0 else COV)
+        localizer.add(floor_plan.scan(walls, poses[k], seed=100 + k), delta, first_cov if k == 0 else COV)
         found.append((localizer.state, float(math.hypot(*(localizer.pose[:2] - poses[k, :2])))))
     return found
 
@@ -54,9 +53,9 @@ def test_localizer_from_nothing_finds_the_place_and_keeps_it(office: PlaceMap) -
 
 def test_localizer_in_another_buildings_map_is_never_localized(office: PlaceMap) -> None:
     """Nor does it give any place a probability above 0.9."""
-    localizer, way = Localizer(office), path((1, 1), (12, 1), (13, 4), step=1.0)
+    localizer, way = Localizer(office), path((1, 1), (12, 1), (13, 4), step=2.0)
     for k, delta in enumerate(floor_plan.moves(way)):
-        localizer.add(way[k], floor_plan.scan(HALL, way[k], seed=k), delta, COV)
+        localizer.add(floor_plan.scan(HALL, way[k], seed=k), delta, COV)
         assert localizer.state == "searching"
         assert localizer.probability < LIKELY
 
@@ -66,7 +65,7 @@ def test_localizer_carried_is_lost_and_found_again(office: PlaceMap) -> None:
     localizer = Localizer(office)
     assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"
     elsewhere = path((3.5, 1), (1, 1), (1, 1.5))
-    localizer.add(np.zeros(3), floor_plan.scan(OFFICE, elsewhere[0]), np.zeros(3), CARRIED)
+    localizer.add(floor_plan.scan(OFFICE, elsewhere[0]), np.zeros(3), CARRIED)
     assert localizer.state == "lost"
     found = drive(localizer, OFFICE, path((3.5, 1), (3.5, 3.6), (7, 3.8), (10, 4.1)))
     assert found[-1][0] == "localized"
@@ -112,7 +111,7 @@ def test_localizer_with_a_wrong_given_pose_searches_everywhere(office: PlaceMap)
 def test_localizer_without_scans_keeps_searching(office: PlaceMap) -> None:
     localizer = Localizer(office)
     for _ in range(3):
-        localizer.add(np.zeros(3), np.empty((0, 2)), np.zeros(3), COV)
+        localizer.add(np.empty((0, 2)), np.zeros(3), COV)
     assert localizer.state == "searching"
 
 
@@ -139,7 +138,7 @@ def test_localizer_with_a_sensor_of_another_height_is_never_wrong(office: PlaceM
 def test_localizer_by_one_view_again_and_again_is_not_certain(office: PlaceMap) -> None:
     localizer = Localizer(office)
     for k in range(6):
-        localizer.add(np.zeros(3), floor_plan.scan(OFFICE, WAY[0], seed=k), np.zeros(3), COV)
+        localizer.add(floor_plan.scan(OFFICE, WAY[0], seed=k), np.zeros(3), COV)
         assert localizer.state == "searching"
         assert localizer.probability < LIKELY + 1e-9
     assert math.hypot(*(localizer.hypotheses[0].pose[:2] - WAY[0, :2])) < 0.05
@@ -149,9 +148,9 @@ def test_localizer_beyond_the_map_keeps_its_pose_and_is_found_near_it(office: Pl
     """Odometry alone: searched about its pose, with its covariance and not that of the whole map, and never lost."""
     localizer = Localizer(office)
     assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"
-    nothing, grown = np.column_stack([np.linspace(3.0, 5.0, 50), np.full(50, 40.0)]), np.diag([0.1, 0.1, 0.12]) ** 2
+    grown = np.diag([0.1, 0.1, 0.12]) ** 2
     for _ in range(9):
-        localizer.add(np.zeros(3), nothing, np.zeros(3), grown)
+        localizer.add(np.empty((0, 2)), np.zeros(3), grown)
     assert localizer.state == "searching"
     assert 0.3 < math.sqrt(localizer.covariance[2, 2]) < 0.5
     found = drive(localizer, OFFICE, WAY[8:12], grown)

@@ -1,9 +1,11 @@
 """Localization in saved maps: maps of one half of a log, starts in the other half, and in maps of other buildings.
 
-``python -m tests.studies.localization`` prints three tables. *Starts*: the robot is put down at random moments of one half, the map is of
+``python -m tests.studies.localization`` prints four tables. *Starts*: the robot is put down at random moments of one half, the map is of
 the other half, and it drives for ``--seconds``; keyframes and truth are those of the smoothed graph of the whole log. A start is
-mapped where, at its end, the scan at the true pose has a score of at least 0.5. Right is within 0.5 m and 0.2 rad. *Reliability*: of all,
-by the probability that they gave. *Drives*: the second half of each log, replayed in the map of the first, and the reverse.
+mapped where, at its end, the scan at the true pose has a score of at least 0.5. Right is within 0.5 m and 0.2 rad. *Reliability*: of all
+keyframes by the probability that was said, and of all searches by weights that were fitted to the other buildings. *Drives*: the second
+half of each log, replayed in the map of the first, and the reverse. *Carried*: the same drives with cuts; times count from where the scan
+at the true pose is mapped, and a place that the map does not have cannot be found.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,19 +23,20 @@ from localization.estimators import EstimatorConfig, MapFusion, PriorMap
 from localization.estimators.graph_fusion import GraphConfig
 from localization.log_replay import replay
 from localization.maps import KeyframeMap
-from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.localizer import LIKELY, RIGHT_M, RIGHT_RAD, Localizer
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from motion_models import se2
 from motion_models.registry import make_model
 from tests.studies.buildings import BUILDINGS, Drive
+from tests.studies.localization_reliability import Moment, RecordedSearches, Search, draw, held_out
+from tests.studies.localization_reliability import table as reliability_table
 
 _DENSE = ReplayConfig(estimator=EstimatorConfig(graph=GraphConfig(keyframe_distance_m=0.3, keyframe_angle_rad=0.2)))
 _MAP_STRIDE = 3
 """Of dense keyframes in a map: about 1 m, as by default."""
 _STEP_M, _STEP_RAD = 0.5, 0.3
 _COV = np.diag([0.01, 0.01, 0.005]) ** 2
-_RIGHT_M, _RIGHT_RAD = 0.5, 0.2
 _MAPPED_SCORE = 0.5
 _CYCLE_S, _KEPT_S = 70.0, 40.0
 
@@ -65,44 +69,57 @@ def halves(keyframes: KeyframeMap) -> tuple[np.ndarray, np.ndarray]:
     return np.arange(n // 2), np.arange(n // 2, n)
 
 
-def run_start(places: PlaceMap, keyframes: KeyframeMap, scans: Sequence[np.ndarray], ids: np.ndarray, is_same: bool) -> Start:
-    """Keyframes ``ids`` in a row, from an unknown place."""
+def run_start(
+    places: RecordedSearches, keyframes: KeyframeMap, scans: Sequence[np.ndarray], ids: np.ndarray, name: str, is_same: bool
+) -> tuple[Start, list[Moment], list[Search]]:
+    """Keyframes ``ids`` of building ``name`` in a row, from an unknown place: its end, what was said, and what searches found."""
     localizer, last, after, spent = Localizer(places), None, math.nan, 0.0
+    moments, searches, kind = [], [], "starts" if is_same else "starts in maps of other buildings"
     truth = keyframes.poses[ids[0]]
     for k in ids:
         pose = keyframes.poses[k]
         delta = np.zeros(3) if last is None else se2.between(last, pose)
         if last is not None and math.hypot(delta[0], delta[1]) < _STEP_M and abs(delta[2]) < _STEP_RAD:
             continue
-        begin = time.process_time()
-        localizer.add(pose, scans[k], delta, np.zeros((3, 3)) if last is None else _COV)
+        begin, n_before = time.process_time(), len(places.found)
+        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else _COV)
         spent, last, truth = max(spent, time.process_time() - begin), pose, pose
         if localizer.state == "localized" and math.isnan(after):
             after = (keyframes.stamps_ns[k] - keyframes.stamps_ns[ids[0]]) * 1e-9
-    found = localizer.pose if localizer.state == "localized" or not localizer.hypotheses else localizer.hypotheses[0].pose
-    off = se2.between(truth, found)
-    error = math.hypot(off[0], off[1])
-    is_right = is_same and error < _RIGHT_M and abs(off[2]) < _RIGHT_RAD
+        searches += [Search(name, found, n, is_same and _off(truth, found[0].pose)[1]) for found, n in places.found[n_before:]]
+        moments.append(Moment(kind, name, localizer.probability, is_same and _off(truth, _best(localizer))[1]))
+    error, is_near = _off(truth, _best(localizer))
+    is_right = is_same and is_near
     at_truth = places.align(scans[ids[-1]], truth)
-    return Start(
-        is_same and at_truth.score >= _MAPPED_SCORE, is_same, localizer.state, localizer.probability, is_right, error, after, spent
-    )
+    is_mapped = is_same and at_truth.score >= _MAPPED_SCORE
+    return Start(is_mapped, is_same, localizer.state, localizer.probability, is_right, error, after, spent), moments, searches
 
 
-def starts(maps: dict[str, KeyframeMap], map_name: str, name: str, n: int, seconds: float) -> list[Start]:
+def _best(localizer: Localizer) -> np.ndarray:
+    """(3,) the pose that is said, or the best place of the last search."""
+    return localizer.pose if localizer.state == "localized" or not localizer.hypotheses else localizer.hypotheses[0].pose
+
+
+def _off(truth: np.ndarray, pose: np.ndarray) -> tuple[float, bool]:
+    """How far ``pose`` is from the ``truth`` [m], and whether that is the same place."""
+    off = se2.between(truth, pose)
+    error = math.hypot(off[0], off[1])
+    return error, error < RIGHT_M and abs(off[2]) < RIGHT_RAD
+
+
+def starts(
+    maps: dict[str, KeyframeMap], map_name: str, name: str, n: int, seconds: float
+) -> list[tuple[Start, list[Moment], list[Search]]]:
     """``n`` starts in each half of building ``name``, in the map of the other half of ``map_name``."""
     found, rng = [], np.random.default_rng(1)
     for i in (0, 1):
-        places = PlaceMap(maps[map_name].select(halves(maps[map_name])[i][::_MAP_STRIDE]), 0.02)
+        places = RecordedSearches(maps[map_name].select(halves(maps[map_name])[i][::_MAP_STRIDE]), 0.02)
         keyframes, scans = maps[name], maps[name].scans()
         ids = halves(keyframes)[1 - i]
         for k in rng.integers(ids[0], ids[-1] - 20, size=n):
             until = keyframes.stamps_ns[k] + seconds * 1e9
-            found.append(
-                run_start(
-                    places, keyframes, scans, np.array([j for j in ids if j >= k and keyframes.stamps_ns[j] <= until]), name == map_name
-                )
-            )
+            way = np.array([j for j in ids if j >= k and keyframes.stamps_ns[j] <= until])
+            found.append(run_start(places, keyframes, scans, way, name, name == map_name))
     return found
 
 
@@ -125,17 +142,6 @@ def table(title: str, found: Sequence[Start]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def reliability(found: Sequence[Start]) -> str:
-    """Rows of probability, number and share that is right; and the Brier score."""
-    p, right = np.array([s.probability for s in found]), np.array([s.is_right for s in found])
-    lines = ["| probability | starts | right [%] |", "|---|---|---|"]
-    for low, high in ((0.0, 0.1), (0.1, 0.3), (0.3, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 1.0)):
-        is_in = (p >= low) & (p < high)
-        if is_in.any():
-            lines.append(f"| {low:.1f} to {high:.1f} | {is_in.sum()} | {100 * right[is_in].mean():.0f} |")
-    return "\n".join([*lines, f"Brier score {np.mean((p - right) ** 2):.3f}"])
-
-
 def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i, of which every 40 s the next 30 s are cut out: the robot is carried on meanwhile."""
     places = PlaceMap(keyframes.select(halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
@@ -144,22 +150,26 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
     pipeline = Pipeline(Trial(make_model("diff_drive", drive.robot), "map", prior=PriorMap(places)), drive.robot, drive.mounts, True)
     estimator = pipeline.estimator
     assert isinstance(estimator, MapFusion)
-    cut_at, found_after, wrong_s, n, cycle = None, [], 0.0, 0, -1
+    cut_at, mapped_at, found_after, wrong_s, n, cycle, scans = None, None, [], 0.0, 0, -1, keyframes.scans()
     for event in drive.events:
         since = (event.stamp_ns - begin) * 1e-9
         if not begin <= event.stamp_ns <= end or since % _CYCLE_S > _KEPT_S:
             continue
         if since // _CYCLE_S != cycle:
             cycle = since // _CYCLE_S
-            cut_at, n = (since, n + 1) if cycle > 0 else (None, 0)
+            cut_at, mapped_at = since if cycle > 0 else None, None
         for estimate in pipeline.process(event):
             k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
-            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or estimator.localizer.state != "localized":
+            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or cut_at is None:
                 continue
-            is_right = math.hypot(*(estimate.pose[:2] - keyframes.poses[k, :2])) < _RIGHT_M
-            wrong_s = max(wrong_s, 0.0 if is_right or cut_at is None else since - cut_at)
-            if is_right and cut_at is not None:
-                found_after.append(since - cut_at)
+            if mapped_at is None and places.align(scans[k], keyframes.poses[k]).score >= _MAPPED_SCORE:
+                mapped_at, n = since, n + 1
+            if estimator.localizer.state != "localized":
+                continue
+            is_right = _off(keyframes.poses[k], estimate.pose)[1]
+            wrong_s = max(wrong_s, 0.0 if is_right else since - cut_at)
+            if is_right:
+                found_after.append(since - (cut_at if mapped_at is None else mapped_at))
                 cut_at = None
     quantiles = np.quantile(found_after, [0.5, 0.9]) if found_after else np.full(2, math.nan)
     times = f"{quantiles[0]:.1f} / {quantiles[1]:.1f}"
@@ -220,18 +230,24 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--starts", type=int, default=100, help="in each half")
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--no-drives", action="store_true")
+    parser.add_argument("--figure", type=Path, help="new file for the reliability diagram, .png or .svg")
     options = parser.parse_args(words)
     drives = {name: BUILDINGS[name].open() for name in options.log.split(",")}
     maps = {name: dense_map(drive) for name, drive in drives.items()}
     print("| map, starts | starts / mapped | right [%] | localized [%] | localized / wrong | wrong above 0.9 | after [s] | CPU [s] |")
     print("|---" * 8 + "|")
-    every: list[Start] = []
+    moments: list[Moment] = []
+    searches: list[Search] = []
     for map_name in maps:
         for name in maps:
             found = starts(maps, map_name, name, options.starts if name == map_name else options.starts // 4, options.seconds)
-            every += found
-            print(table(f"{map_name}, {name}", found), flush=True)
-    print("\n" + reliability(every))
+            moments += [moment for _, said, _ in found for moment in said]
+            searches += [search for _, _, of_start in found for search in of_start]
+            print(table(f"{map_name}, {name}", [start for start, _, _ in found]), flush=True)
+    moments += held_out(searches) if len(maps) > 1 else []
+    print(f"\nReliability: number of keyframes and share that is right [%]\n\n{reliability_table(moments)}")
+    if options.figure:
+        draw(moments, options.figure)
     if not options.no_drives:
         columns = "error median / p95 / max [m] | localized / searching / lost [s] | first after [s] | losses"
         print(f"\n| drive | {columns} | CPU of searches [s] | CPU localized / ekf |")
@@ -239,7 +255,7 @@ def main(words: Sequence[str] | None = None) -> None:
         for name, drive in drives.items():
             for i in (0, 1):
                 print(drive_row(name, drive, maps[name], i), flush=True)
-        print("\n| carried | found again | median / p90 [s] | wrong, longest [s] | within 10 s |")
+        print("\n| carried | found again, of those mapped | median / p90 [s] | wrong, longest [s] | within 10 s |")
         print("|---" * 5 + "|")
         for name, drive in drives.items():
             for i in (0, 1):

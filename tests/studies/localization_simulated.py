@@ -1,9 +1,15 @@
-"""Localization in maps of simulated office floors, beside a particle filter by AMCL's rules over the same grid.
+"""Localization in maps of simulated office floors: starts, carried robots, changed and foreign maps, positions; and a particle filter.
 
 ``python -m tests.studies.localization_simulated`` puts the robot down at random in floors of `tests.helpers.office_floor`, by which no
-constant was chosen: in the map as it was drawn, after 10 % of the inner walls were moved, removed or added, and in the map of another
-floor. It drives for ``--keyframes`` of 0.5 m. Right is within 0.5 m and 0.2 rad. *Tracked*: drives of 60 keyframes from a given pose, the
-share of them that is localized and right.
+constant was chosen, and drives for ``--keyframes`` of 0.5 m, in the map
+
+- as it was drawn (*same*), with 10 % of the inner walls moved, removed or added (*changed*), and of another floor (*foreign*);
+- as it was drawn, after it was carried from one place to another, with an odometry that knows of it or does not (*carried*, *unnoticed*);
+- of a corridor with equal rooms (*equal rooms*); of the first and the third with positions of 3 m, as by GNSS.
+
+Right is within 0.5 m and 0.2 rad. Every keyframe's probability is in the reliability table, beside those of single searches by weights that
+were fitted to the other floors. *Tracked*: drives of 60 keyframes from a given pose, the share of them that is localized and right.
+``--particles`` runs a particle filter by AMCL's rules over the same grid beside it.
 """
 
 from __future__ import annotations
@@ -11,18 +17,23 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from localization.maps.grid import Grid
-from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.localizer import LIKELY, RIGHT_M, RIGHT_RAD, Localizer
 from localization.maps.place_search import PlaceMap
+from localization.maps.position_plane import PositionFix
 from motion_models import se2
 from tests.helpers import floor_plan, office_floor
+from tests.studies.localization_reliability import Moment, RecordedSearches, Search, draw, held_out, table
 
 _COV = np.diag([0.02, 0.02, 0.01]) ** 2
-_RIGHT_M, _RIGHT_RAD = 0.5, 0.2
+_CARRIED = np.diag([3.0, 3.0, 1.5]) ** 2
+_AMCL_KINDS = ("same", "changed", "foreign")
 Guess = tuple[np.ndarray, float, bool]
 """Pose (3,), probability, and whether it is said to be localized."""
 
@@ -69,7 +80,7 @@ class ParticleFilter:
         weights = self.weights
         best = self.poses[np.argmax(weights)]
         for _ in range(3):
-            near = (np.hypot(*(self.poses - best)[:, :2].T) < _RIGHT_M) & (np.abs(se2.wrap_angle(self.poses[:, 2] - best[2])) < _RIGHT_RAD)
+            near = (np.hypot(*(self.poses - best)[:, :2].T) < RIGHT_M) & (np.abs(se2.wrap_angle(self.poses[:, 2] - best[2])) < RIGHT_RAD)
             if near.any():
                 angle = np.angle(np.sum(weights[near] * np.exp(1j * self.poses[near, 2])))
                 best = np.array([*np.average(self.poses[near, :2], axis=0, weights=weights[near]), angle])
@@ -77,86 +88,157 @@ class ParticleFilter:
         return best, share, share > LIKELY
 
 
-def run_localizer(places: PlaceMap, walls: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> Guess:
-    """The place after ``poses`` (K, 3) among ``walls``."""
-    localizer = Localizer(places)
-    for odometry, delta, points in measured(walls, poses, rng):
-        localizer.add(odometry, points, delta, _COV)
-    found = localizer.pose if localizer.state == "localized" or not localizer.hypotheses else localizer.hypotheses[0].pose
-    return found, localizer.probability, localizer.state == "localized"
+class Scene(NamedTuple):
+    """Walls (W, 4), poses (K, 3) of the robot among them, and how the odometry and positions are."""
+
+    kind: str
+    walls: np.ndarray
+    poses: np.ndarray
+    carried_at: int = -1
+    """Keyframe to which it was carried."""
+    is_noticed: bool = True
+    fix_m: float = 0.0
+    """Sigma of positions; 0 for none [m]."""
+    is_foreign: bool = False
+
+
+def run_localizer(places: RecordedSearches, scene: Scene, floor: str, rng: np.random.Generator) -> tuple[list[Moment], list[Search], str]:
+    """What is published after each keyframe, what the searches found, and the state at the end."""
+    localizer, moments, searches, covs = Localizer(places), [], [], {scene.carried_at: _CARRIED if scene.is_noticed else _COV}
+    for k, (delta, points) in enumerate(measured(scene.walls, scene.poses, rng, scene.carried_at)):
+        n_before, truth = len(places.found), scene.poses[k]
+        localizer.add(points, delta, covs.get(k, _COV))
+        if scene.fix_m:
+            localizer.add_position(PositionFix(truth[:2] + rng.normal(0.0, scene.fix_m, 2), scene.fix_m**2 * np.eye(2)))
+        for found, n in places.found[n_before:]:
+            searches.append(Search(floor, found, n, is_right(found[0].pose, truth) and not scene.is_foreign))
+        is_localized = localizer.state == "localized" or not localizer.hypotheses
+        pose = localizer.pose if is_localized else localizer.hypotheses[0].pose
+        moments.append(Moment(scene.kind, floor, localizer.probability, is_right(pose, truth) and not scene.is_foreign))
+    return moments, searches, localizer.state
 
 
 def run_particles(n: int) -> Callable[[PlaceMap, np.ndarray, np.ndarray, np.random.Generator], Guess]:
-    """The same by a particle filter of ``n``."""
+    """The place after ``poses`` (K, 3) among ``walls`` by a particle filter of ``n``."""
 
     def run(places: PlaceMap, walls: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> Guess:
         particles = ParticleFilter(places.grid, n, rng)
-        for _, delta, points in measured(walls, poses, rng):
+        for delta, points in measured(walls, poses, rng):
             particles.add(delta, _COV, points)
         return particles.guess()
 
     return run
 
 
-def measured(walls: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Odometry, motion and scan at each of ``poses``, with noise."""
-    odometry, found = np.zeros(3), []
+def measured(walls: np.ndarray, poses: np.ndarray, rng: np.random.Generator, carried_at: int = -1) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Motion to and scan at each of ``poses``, with noise; none to that to which the robot was carried."""
+    found = []
     for k, delta in enumerate(floor_plan.moves(poses)):
-        moved = se2.compose(delta, rng.multivariate_normal(np.zeros(3), _COV)) if k else delta
-        odometry = se2.compose(odometry, moved)
-        found.append((odometry, moved, floor_plan.scan(walls, poses[k], seed=int(rng.integers(1 << 31)))))
+        moved = se2.compose(np.zeros(3) if k == carried_at else delta, rng.multivariate_normal(np.zeros(3), _COV)) if k else delta
+        found.append((moved, floor_plan.scan(walls, poses[k], seed=int(rng.integers(1 << 31)))))
     return found
 
 
 def is_right(found: np.ndarray, truth: np.ndarray) -> bool:
     """Whether a pose is that of the ``truth``."""
     off = se2.between(truth, found)
-    return bool(math.hypot(off[0], off[1]) < _RIGHT_M and abs(off[2]) < _RIGHT_RAD)
+    return bool(math.hypot(off[0], off[1]) < RIGHT_M and abs(off[2]) < RIGHT_RAD)
 
 
 def tracked_share(places: PlaceMap, walls: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> float:
     """Share of ``poses`` (K, 3) that is localized and right, from the first one given on."""
     localizer, n = Localizer(places, poses[0]), 0
-    for (odometry, delta, points), pose in zip(measured(walls, poses, rng), poses, strict=True):
-        localizer.add(odometry, points, delta, _COV)
+    for (delta, points), pose in zip(measured(walls, poses, rng), poses, strict=True):
+        localizer.add(points, delta, _COV)
         n += localizer.state == "localized" and is_right(localizer.pose, pose)
     return n / len(poses)
+
+
+def scenes(walls: np.ndarray, other: np.ndarray, n: int, rng: np.random.Generator) -> list[Scene]:
+    """One of each kind, with ``n`` keyframes after the start or the new place."""
+    changed = office_floor.change(walls, rng)
+
+    def drive(among: np.ndarray) -> np.ndarray:
+        return office_floor.drive(among, rng, n)
+
+    return [
+        Scene("same", walls, drive(walls)),
+        Scene("changed", changed, drive(changed)),
+        Scene("foreign", other, drive(other), is_foreign=True),
+        Scene("carried", walls, np.vstack([drive(walls), drive(walls)]), carried_at=n),
+        Scene("carried unnoticed", walls, np.vstack([drive(walls), drive(walls)]), carried_at=n, is_noticed=False),
+        Scene("same, positions of 3 m", walls, drive(walls), fix_m=3.0),
+        Scene("foreign, positions of 3 m", other, drive(other), fix_m=3.0, is_foreign=True),
+    ]
+
+
+def equal_rooms(n: int, rng: np.random.Generator) -> tuple[RecordedSearches, Scene]:
+    """A corridor with equal rooms, and a drive in one of them."""
+    walls = office_floor.make_equal_rooms(rng)
+    places = RecordedSearches(floor_plan.make_map(walls, office_floor.drive(walls, rng, 150)), 0.02)
+    room = floor_plan.path((14.0, 1.0), (13.0, 1.0), (13.0, 1.0), (14.5, 1.0))
+    return places, Scene("equal rooms", walls, room[:n])
+
+
+def row(kind: str, ends: Sequence[tuple[Moment, str]]) -> str:
+    """Of the last keyframes: share right and localized, and how many are localized and wrong."""
+    right, localized = (np.array(column) for column in zip(*((m.is_right, state == "localized") for m, state in ends), strict=True))
+    return f"| {kind} | {len(ends)} | {100 * right.mean():.0f} | {100 * localized.mean():.0f} | {int((localized & ~right).sum())} |"
+
+
+def particle_rows(runs: Sequence[tuple[PlaceMap, Scene, np.random.Generator]]) -> list[str]:
+    """The same by 500 and 5,000 particles."""
+    lines = []
+    for n in (500, 5000):
+        for kind in dict.fromkeys(scene.kind for _, scene, _ in runs):
+            guesses = [(run_particles(n)(places, s.walls, s.poses, rng), s) for places, s, rng in runs if s.kind == kind]
+            ends = [(Moment(kind, "", g[1], is_right(g[0], s.poses[-1]) and not s.is_foreign), "localized" * g[2]) for g, s in guesses]
+            lines.append(row(f"{kind}, {n} particles", ends))
+    return lines
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--floors", type=int, default=6)
-    parser.add_argument("--starts", type=int, default=15, help="on each floor and in each kind of map")
+    parser.add_argument("--first", type=int, default=100, help="seed of the first floor")
+    parser.add_argument("--starts", type=int, default=15, help="on each floor and of each kind")
     parser.add_argument("--keyframes", type=int, default=8)
+    parser.add_argument("--tracked", type=int, default=60, help="keyframes of a tracked drive; 0 for none")
+    parser.add_argument("--particles", action="store_true")
+    parser.add_argument("--figure", type=Path, help="new file for the reliability diagram, .png or .svg")
     options = parser.parse_args(words)
-    methods = {"localizer": run_localizer, "500 particles": run_particles(500), "5,000 particles": run_particles(5000)}
-    kinds = ("same", "changed by 10 %", "another floor")
-    found: dict[tuple[str, str], list[tuple[float, bool, bool]]] = {(kind, name): [] for kind in kinds for name in methods}
-    tracked: dict[str, list[float]] = {kind: [] for kind in kinds[:2]}
-    for seed in range(options.floors):
-        rng = np.random.default_rng(100 + seed)
+    ends: dict[str, list[tuple[Moment, str]]] = {}
+    moments: list[Moment] = []
+    searches: list[Search] = []
+    tracked: dict[str, list[float]] = {"same": [], "changed": []}
+    runs: list[tuple[PlaceMap, Scene, np.random.Generator]] = []
+    for seed in range(options.first, options.first + options.floors):
+        rng = np.random.default_rng(seed)
         walls, other = office_floor.make_walls(rng), office_floor.make_walls(rng)
-        places = PlaceMap(floor_plan.make_map(walls, office_floor.drive(walls, rng, 200)), 0.02)
-        floors = dict(zip(kinds, (walls, office_floor.change(walls, rng), other), strict=True))
-        for kind, now in floors.items():
-            for start in range(options.starts):
-                poses = office_floor.drive(now, rng, options.keyframes)
-                for name, run in methods.items():
-                    pose, probability, is_localized = run(places, now, poses, np.random.default_rng([seed, start]))
-                    found[kind, name].append((probability, is_right(pose, poses[-1]) and kind != kinds[2], is_localized))
-            if kind in tracked:
-                tracked[kind].append(tracked_share(places, now, office_floor.drive(now, rng, 60), rng))
-    print("| map | method | starts | right [%] | localized [%] | localized and wrong | Brier score |")
-    print("|---" * 7 + "|")
-    for (kind, name), rows in found.items():
-        p, right, localized = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
-        wrong = int((localized * (1.0 - right)).sum())
-        cells = [kind, name, str(len(p)), f"{100 * right.mean():.0f}", f"{100 * localized.mean():.0f}", str(wrong)]
-        print("| " + " | ".join([*cells, f"{np.mean((p - right) ** 2):.3f}"]) + " |")
-    print("\n| map | tracked [%], mean / least |\n|---|---|")
-    for kind, shares in tracked.items():
-        print(f"| {kind} | {100 * np.mean(shares):.1f} / {100 * np.min(shares):.1f} |")
+        places = RecordedSearches(floor_plan.make_map(walls, office_floor.drive(walls, rng, 200)), 0.02)
+        todo = [(places, scene) for _ in range(options.starts) for scene in scenes(walls, other, options.keyframes, rng)]
+        for where, scene in [*todo, equal_rooms(options.keyframes, rng)]:
+            said, found, state = run_localizer(where, scene, f"floor {seed}", rng)
+            moments, searches = [*moments, *said], [*searches, *found]
+            ends.setdefault(scene.kind, []).append((said[-1], state))
+        if options.particles:
+            runs += [(places, scene, np.random.default_rng([seed, i])) for i, (_, scene) in enumerate(todo) if scene.kind in _AMCL_KINDS]
+        for scene in (scene for _, scene in todo[:2] if options.tracked):
+            way = office_floor.drive(scene.walls, rng, options.tracked)
+            tracked[scene.kind].append(tracked_share(places, scene.walls, way, rng))
+    print("| map | drives | right [%] | localized [%] | localized and wrong |")
+    print("|---" * 5 + "|")
+    for line in [*(row(kind, found) for kind, found in ends.items()), *particle_rows(runs)]:
+        print(line)
+    moments += held_out(searches)
+    print(f"\nReliability: number of keyframes and share that is right [%]\n\n{table(moments)}")
+    if options.tracked:
+        print("\n| map | tracked [%], mean / least |\n|---|---|")
+        for kind, shares in tracked.items():
+            print(f"| {kind} | {100 * np.mean(shares):.1f} / {100 * np.min(shares):.1f} |")
+    if options.figure:
+        draw(moments, options.figure)
 
 
 if __name__ == "__main__":

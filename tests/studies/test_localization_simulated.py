@@ -26,7 +26,7 @@ def test_particle_filter_around_the_truth_follows_a_drive() -> None:
     rng, way = np.random.default_rng(3), path((7, 4), (10.5, 4), (10.5, 6.5))
     particles = ParticleFilter(PlaceMap(floor_plan.make_map(), 0.02).grid, 500, rng)
     particles.poses = way[0] + rng.normal(0.0, [0.2, 0.2, 0.1], (500, 3))
-    for _, delta, points in measured(OFFICE, way, rng):
+    for delta, points in measured(OFFICE, way, rng):
         particles.add(delta, np.diag([0.02, 0.02, 0.01]) ** 2, points)
     pose, share, _ = particles.guess()
     assert is_right(pose, way[-1])
