@@ -21,6 +21,7 @@ from localization.maps.place_search import Place, PlaceMap
 from motion_models.se2 import FloatArray, Points2, Pose2
 
 BINS = (0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 1.0)
+_OF_SEARCHES = ("searches, weights of other buildings", "searches, weights of the program")
 _RIDGE = 1e-2
 """Prior of the weights: 1 over the square of a sigma of 10."""
 
@@ -75,7 +76,7 @@ def held_out(searches: Sequence[Search]) -> list[Moment]:
         weights = fit([search for search in searches if search.building != building])
         for search in searches:
             if search.building == building:
-                for kind, w in (("searches, weights of other buildings", weights), ("searches, weights of the program", SEARCH_WEIGHTS)):
+                for kind, w in zip(_OF_SEARCHES, (weights, SEARCH_WEIGHTS), strict=True):
                     found.append(Moment(kind, building, weigh(search.places, search.n_points, w)[0].probability, search.is_right))
     return found
 
@@ -93,14 +94,16 @@ def table(moments: Sequence[Moment]) -> str:
 
 
 def draw(moments: Sequence[Moment], path: Path) -> None:
-    """Reliability diagram of each kind: share right over the mean probability of each bin, with 95 % intervals (Wilson 1927)."""
+    """Reliability diagram of all keyframes and of searches: share right over the mean probability of each bin, with 95 % intervals (Wilson
+    1927)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 5.2), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="0.7", lw=1)
-    for kind in dict.fromkeys(moment.kind for moment in moments):
-        rows = np.array([row for row in _bins(*_arrays(moments, kind)) if row[1]])
+    pooled = [moment if moment.kind in _OF_SEARCHES else moment._replace(kind="keyframes of all kinds") for moment in moments]
+    for kind in dict.fromkeys(moment.kind for moment in pooled):
+        rows = np.array([row for row in _bins(*_arrays(pooled, kind)) if row[1]])
         low, high = _wilson(rows[:, 2], rows[:, 1])
         axes.errorbar(
             rows[:, 0], rows[:, 2], [np.maximum(rows[:, 2] - low, 0), np.maximum(high - rows[:, 2], 0)], marker="o", capsize=3, label=kind
