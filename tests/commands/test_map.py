@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -172,3 +173,29 @@ def test_replay_without_a_map_to_localize_in_exits_with_2(
 ) -> None:
     assert replay(log, tmp_path / "out", *arguments) == 2
     assert message in capsys.readouterr().err
+
+
+def log_with_fixes(path: Path, first_s: int) -> Path:
+    """The room's drive, with a fix of 0.1 m each second from ``first_s`` on: the first one is the origin of the log's plane."""
+    metre = math.degrees(1.0 / 6_371_000.0)
+    fixes = []
+    for second in range(first_s, 20):
+        x, y, _ = rooms.truth(float(second))
+        stamp, cov = bags.START + second * bags.S, 0.01 * np.eye(3)
+        fixes.append(("/fix", bags.fix(stamp, 48.0 + x * metre, 11.0 - y * metre / math.cos(math.radians(48.0)), covariance=cov), stamp))
+    return bags.write_mcap(path, sorted([*rooms.drive(20.0), *fixes], key=lambda record: record[2]))
+
+
+@pytest.mark.extended
+def test_replay_in_a_map_with_positions_is_localized_by_them(tmp_path: Path) -> None:
+    """The room is the same from four sides; both logs have an origin of their own."""
+    saved, first = tmp_path / "placed.skidmap", log_with_fixes(tmp_path / "first.mcap", 0)
+    assert replay(first, tmp_path / "a", "--estimator", "graph", "--positions", "/fix", "--reference", "none", "--save-map", saved) == 0
+    plane = load_map(saved).map.plane
+    assert plane is not None
+    assert plane.origin == pytest.approx((48.0, 11.0, 0.0))
+    assert abs(abs(plane.plane_T_map[2]) - 0.5 * math.pi) < 0.1  # the drive begins to the north
+    second = log_with_fixes(tmp_path / "second.mcap", 4)
+    assert replay(second, tmp_path / "b", "--estimator", "ekf", "--map", saved, "--positions", "/fix", "--reference", "none") == 0
+    assert localization(tmp_path / "b")["state"] == "localized"
+    assert "positions could not be used" not in (tmp_path / "b" / "metrics.json").read_text()

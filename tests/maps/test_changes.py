@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from localization.estimators.map_merge import merge
 from localization.maps.changes import find_changes
@@ -43,12 +44,16 @@ def test_find_changes_names_a_new_box_and_a_missing_one():
     assert 0.05 < found.changed_share < 0.3
 
 
-def test_merge_of_what_is_new_redraws_changed_places_and_leaves_out_the_rest():
+def test_merge_of_what_is_new_redraws_changed_places():
     second = floor_plan.make_map(CHANGED, np.vstack([SECOND, SECOND]))
     found = merge(floor_plan.make_map(), second, 0.02, only_new=True)
     assert 5 < found.added < len(second.poses)
     grid = draw_grid(found.map, 0.1)
     assert 100 in cells(grid, 5.85, 5.05)
     assert cells(grid, 9.0, 5.2) == {0}
+
+
+@pytest.mark.extended
+def test_merge_of_what_is_new_leaves_out_what_the_map_has():
     same = merge(floor_plan.make_map(), floor_plan.make_map(poses=SECOND), 0.02, only_new=True)
     assert same.added < 0.2 * len(SECOND)

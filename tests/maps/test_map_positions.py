@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import zipfile
 from pathlib import Path
@@ -25,6 +26,14 @@ COV = np.diag([0.01, 0.01, 0.005]) ** 2
 PLANE = PositionPlane(
     np.array([40.0, -25.0, 2.0]), np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.002], [0.0, 0.002, 0.001]]), np.array([0.3, 0.1])
 )
+
+
+@functools.cache
+def equal_rooms() -> tuple[np.ndarray, PlaceMap]:
+    """Walls of a corridor with equal rooms, and their map."""
+    rng = np.random.default_rng(1)
+    walls = office_floor.make_equal_rooms(rng)
+    return walls, PlaceMap(floor_plan.make_map(walls, office_floor.drive(walls, rng, 150)), 0.02)
 
 
 def test_position_in_a_map_has_its_covariance() -> None:
@@ -82,17 +91,23 @@ def test_positions_of_two_days_are_in_one_plane() -> None:
         next(move_origin([Reference(0, np.zeros(2), None)], origin, "/uwb"))
 
 
-def test_localizer_among_equal_rooms_with_a_position_finds_its_room() -> None:
+@pytest.mark.parametrize("has_positions", [False, True])
+def test_localizer_among_equal_rooms_lists_them_or_is_told_by_positions(has_positions: bool) -> None:
     """A fix of 1 m excludes the rooms 4 m away, which scans alone can't tell apart."""
-    rng = np.random.default_rng(1)
-    walls = office_floor.make_equal_rooms(rng)
-    localizer = Localizer(PlaceMap(floor_plan.make_map(walls, office_floor.drive(walls, rng, 150)), 0.02))
-    room = path((14.0, 1.0), (13.0, 1.0), (13.0, 1.0), (14.5, 1.0))
+    walls, places = equal_rooms()
+    rng, localizer, room = np.random.default_rng(1), Localizer(places), path((14.0, 1.0), (13.0, 1.0), (13.0, 1.0), (14.5, 1.0))
     for k, delta in enumerate(floor_plan.moves(room)):
         localizer.add(floor_plan.scan(walls, room[k], seed=k), delta, COV)
-        localizer.add_position(PositionFix(room[k, :2] + rng.normal(0.0, 1.0, 2), np.eye(2)))
-    assert localizer.state == "localized"
-    assert np.hypot(*(localizer.pose[:2] - room[-1, :2])) < 0.1
+        if has_positions:
+            localizer.add_position(PositionFix(room[k, :2] + rng.normal(0.0, 1.0, 2), np.eye(2)))
+        else:
+            assert localizer.state == "searching"
+    if has_positions:
+        assert localizer.state == "localized"
+        assert np.hypot(*(localizer.pose[:2] - room[-1, :2])) < 0.1
+    else:
+        assert {-1, 0, 1} <= {round((place.pose[0] - room[-1, 0]) / 4.0) for place in localizer.hypotheses}
+        assert localizer.hypotheses[0].probability < 0.5
 
 
 def test_localizer_far_from_its_positions_is_lost() -> None:
