@@ -123,6 +123,8 @@ class PositionSample:
     """(2,) east, north [m]."""
     covariance: FloatArray
     """(2, 2) [m^2]."""
+    origin: tuple[float, float, float] | None = None
+    """Latitude and longitude [deg] and height [m] of the plane's origin; None for a plane that is nowhere on the earth."""
 
     def __post_init__(self) -> None:
         _check_finite(self, "position", (2,))

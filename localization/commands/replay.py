@@ -38,7 +38,7 @@ from localization.events import Event, PositionSample
 from localization.lifting import write_tum3
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
-from localization.logs.reference_topics import merge_positions, move_origin, read_positions
+from localization.logs.reference_topics import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
@@ -164,10 +164,7 @@ class Replay:
         self._write(head, results, reference)
         if self.save_map is not None:
             save_map(
-                self.save_map,
-                saved_map(
-                    [run for run in runs if run.estimator != LOCALIZER], head, mounts, dataclasses.asdict(self.config), self._origin(log)
-                ),
+                self.save_map, saved_map([run for run in runs if run.estimator != LOCALIZER], head, mounts, dataclasses.asdict(self.config))
             )
         if self.extend_map is not None:
             console.print(self._extend(self.extend_map, runs, head, mounts), markup=False, soft_wrap=True)
@@ -267,16 +264,8 @@ class Replay:
             return []
         if "graph" not in self.estimator.split(",") and self.map is None:
             raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
-        samples = move_origin(log.references(self.positions), self._origin(log), self.positions)
+        samples = log.references(self.positions)
         return read_positions(itertools.islice(samples, 0, None, 2) if self._is_held_out(log) else samples, self.positions)
-
-    def _origin(self, log: Log) -> tuple[float, float, float] | None:
-        """Latitude, longitude [deg] and height [m] of the origin of `--positions`: that of the map, or the first one."""
-        plane = None if self.map is None else load_map(self.map).map.plane
-        if plane is not None:
-            return plane.origin
-        first = None if self.positions is None else next(log.references(self.positions), None)
-        return None if first is None else first.origin
 
     def _reference_name(self, log: Log) -> str | None:
         return self.reference if self.reference is not None else log.reference_topic
@@ -311,15 +300,8 @@ class Replay:
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 
 
-def saved_map(
-    runs: Sequence[Run],
-    head: ReportHead,
-    mounts: Mapping[str, Mount],
-    config: Mapping[str, Any],
-    origin: tuple[float, float, float] | None = None,
-) -> SavedMap:
-    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``,
-    ``origin`` [deg, deg, m] of the positions that were fused."""
+def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:
+    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``."""
     run, keyframes = [(run, run.keyframes) for run in runs if run.keyframes is not None][-1]
     provenance = {
         "log": head.log,
@@ -331,8 +313,7 @@ def saved_map(
         "config": config,
         "versions": dict(head.versions),
     }
-    plane = None if keyframes.plane is None else dataclasses.replace(keyframes.plane, origin=origin)
-    return SavedMap(dataclasses.replace(keyframes, plane=plane), provenance)
+    return SavedMap(keyframes, provenance)
 
 
 def check_overlap(reference: ReferenceTrack | Relations, log: Log) -> None:

@@ -90,6 +90,7 @@ class GraphFusion(FilteredOdometry):
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
         self._waiting: list[PositionSample] = []
         self._is_aligned, self._failure = False, ""
+        self._origin: tuple[float, float, float] | None = None  # of the positions' plane
         self.n_loops = self.n_positions = self._n_late = 0
 
     def step(self, step: Step) -> Estimate:
@@ -134,6 +135,7 @@ class GraphFusion(FilteredOdometry):
     def add_position(self, sample: PositionSample) -> None:
         """A position by GPS. It is placed once the odometry has come to its stamp."""
         self._waiting.append(sample)
+        self._origin = sample.origin
 
     def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
         """Motion (3,) since the last keyframe, and its covariance (3, 3): by the sum of the steps, where that had no matched scan."""
@@ -244,7 +246,8 @@ class GraphFusion(FilteredOdometry):
     @property
     def enu_T_map(self) -> Pose2 | None:
         """(3,) pose of the map in the plane of the positions; None before these have given it."""
-        return self.graph.alignment() if self._is_aligned else None
+        alignment = self.graph.alignment()
+        return None if alignment is None else alignment[0]
 
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory at the stamps of ``filtered``; None unless smoothing, or with fewer than two keyframes."""
@@ -315,7 +318,7 @@ class GraphFusion(FilteredOdometry):
             edge_deltas=np.array([edge.delta for edge in edges]).reshape(-1, 3),
             edge_information=np.array([edge.information for edge in edges]).reshape(-1, 3, 3),
             edge_is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
-            plane=None if alignment is None else PositionPlane(*alignment, self.graph.lever_arm()[0]),
+            plane=None if alignment is None else PositionPlane(*alignment, self.graph.lever_arm()[0], self._origin),
         )
 
     def occupancy(self) -> Grid | None:

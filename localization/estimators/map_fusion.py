@@ -16,6 +16,7 @@ from localization.estimators.estimator import Estimate, Estimator
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.events import PositionSample, Step
 from localization.lidar.registration import is_narrow
+from localization.logs.reference_topics import in_plane
 from localization.maps import KeyframeMap
 from localization.maps.changes import Changes, find_changes
 from localization.maps.grid import Grid
@@ -64,7 +65,7 @@ class MapFusion(FilteredOdometry):
         self._first_s: float | None = None
         self._n_losses, self._waiting_s = 0, 0.0
         self._positions: list[PositionSample] = []
-        self._n_without_plane = 0
+        self._n_unused = 0
         self._drive: list[_DriveKeyframe] | None = [] if is_recording else None
         self._changes: Changes | None = None
 
@@ -112,10 +113,12 @@ class MapFusion(FilteredOdometry):
         due = [sample for sample in self._positions if sample.stamp_ns <= until_ns]
         self._positions = self._positions[len(due) :]
         plane = self.localizer.places.plane
-        if due and plane is not None:
-            fix = plane.to_map(due[-1].position, due[-1].covariance)
-            self.localizer.add_position(fix._replace(way_m=math.hypot(delta[0], delta[1])))
-        self._n_without_plane += len(due) if plane is None else 0
+        position = None if plane is None or not due else in_plane(due[-1], plane.origin)
+        if plane is None or position is None:
+            self._n_unused += len(due)
+            return
+        fix = plane.to_map(position, due[-1].covariance)
+        self.localizer.add_position(fix._replace(way_m=math.hypot(delta[0], delta[1])))
 
     def _record(self) -> None:
         if self._drive is not None:
@@ -225,8 +228,8 @@ class MapFusion(FilteredOdometry):
                 f"the place in the map was lost {self._n_losses} times, for {unknown:.0f} of {total:.0f} s, and is {state} at the end: "
                 "poses of that time are by odometry alone. The robot was carried, or the map is out of date."
             )
-        if self._n_without_plane:
-            unused = f"{self._n_without_plane} positions could not be used: the map was built without"
+        if self._n_unused:
+            unused = f"{self._n_unused} positions could not be used: the map was built without such ones"
             found.append(f"{unused}. Build it with --positions, or leave them out.")
         return [*found, *([] if self._changes is None else _describe(self._changes))]
 

@@ -133,10 +133,6 @@ class PoseGraph:
         values = gtsam.utilities.extractPose2(self._values)  # in order of keys: before x, there may be t
         return np.asarray(values[len(values) - self.count :])
 
-    def alignment(self) -> Pose2:
-        """(3,) ``enu_T_map``, once positions have given it."""
-        return _array(self._values.atPose2(_ALIGNMENT))
-
     def marginal(self, k: int) -> Cov3:
         """(3, 3) covariance of keyframe ``k``."""
         return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))

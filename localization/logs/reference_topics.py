@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -125,23 +124,18 @@ def position_sample(reference: Reference) -> PositionSample | None:
     cov = reference.covariance[:2, :2]
     if not np.isfinite(cov).all() or (np.linalg.eigvalsh(cov) <= 0.0).any():
         cov = _UNKNOWN_SIGMA_M**2 * np.eye(2)
-    return PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2))
+    return PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2), reference.origin)
 
 
-def move_origin(references: Iterable[Reference], origin: tuple[float, float, float] | None, source: str) -> Iterator[Reference]:
-    """``references`` in the plane that has its origin at latitude, longitude [deg] and height [m], by way of the earth's centre. Yaws stay:
-    the axes of two planes 1 km apart differ by 0.01 deg. Raises `LogError` if one of both planes is on the earth and the other is not.
-    """
-    for reference in references:
-        if (reference.origin is None) != (origin is None):
-            kinds = ("positions in metres", "latitude and longitude")
-            here, there = (kinds[plane is not None] for plane in (reference.origin, origin))
-            raise LogError(f"{source} has {here}, and the map was built with {there}. Name the topic that the map was built with.")
-        if reference.origin is None or origin is None:
-            yield reference
-            continue
-        (centre, axes), (to_centre, to_axes) = _plane(reference.origin), _plane(origin)
-        yield replace(reference, position=to_axes @ (centre + axes.T @ reference.position - to_centre), origin=origin)
+def in_plane(sample: PositionSample, origin: tuple[float, float, float] | None) -> FloatArray | None:
+    """(2,) ``sample`` in the plane with another ``origin`` [deg, deg, m], by way of the earth's centre; None where one of both planes is on
+    the earth and the other is not. The axes of planes 1 km apart differ by 0.01 deg."""
+    if (sample.origin is None) != (origin is None):
+        return None
+    if sample.origin is None or origin is None or sample.origin == origin:
+        return sample.position
+    (centre, axes), (to_centre, to_axes) = _plane(sample.origin), _plane(origin)
+    return np.asarray(to_axes @ (centre + axes.T @ sample.position - to_centre))
 
 
 def merge_positions(events: Iterable[Event], positions: list[PositionSample]) -> Iterator[Event]:

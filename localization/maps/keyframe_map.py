@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from localization.maps.position_plane import PositionPlane
 from motion_models import se2
-from motion_models.se2 import FloatArray, Points2
+from motion_models.se2 import FloatArray, Points2, Pose2
 
 IntArray = NDArray[np.int64]
 
@@ -49,6 +49,15 @@ class KeyframeMap:
         """(M, 2) all points in the map's frame [m]."""
         moved = [se2.transform(pose, scan) for pose, scan in zip(self.poses, self.scans(), strict=True) if len(scan)]
         return np.vstack(moved) if moved else np.empty((0, 2))
+
+    def moved(self, to_T_map: Pose2) -> KeyframeMap:
+        """The map in another frame, where this one is at ``to_T_map`` (3,)."""
+        plane = self.plane
+        plane = None if plane is None else replace(plane, plane_T_map=se2.compose(plane.plane_T_map, se2.inverse(to_T_map)))
+        if plane is not None:
+            A = se2.adjoint(to_T_map)
+            plane = replace(plane, covariance=np.asarray(A @ plane.covariance @ A.T))
+        return replace(self, poses=se2.compose(to_T_map, self.poses), plane=plane)
 
     def select(self, kept: IntArray) -> KeyframeMap:
         """The keyframes ``kept`` (N,) in their order, with the motions between these alone."""

@@ -9,7 +9,7 @@ import math
 import queue
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,7 +27,6 @@ from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
 from localization.ros.settings import Names
 from localization.ros.transports.transport import Received, ServiceReply, Transport
-from motion_models import se2
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
 
@@ -190,7 +189,7 @@ class OperatorCommands:
             self._report(f"save_map: nothing is saved: {text}")
             return ServiceReply(False, text)
         mounts = {frame: asdict(mount) for frame, mount in sorted(session.pipeline.mounts.items())}
-        moved = replace(mapped, poses=se2.compose(session.state.start.map_T_start, mapped.poses))
+        moved = mapped.moved(session.state.start.map_T_start)
         saved = SavedMap(moved, {"log": "live topics", "run": session.name, "mounts": mounts, "versions": dict(versions())})
         path = Path(name).with_suffix(".skidmap")
         if path.exists():

@@ -91,7 +91,7 @@ def test_map_fusion_with_positions_in_a_map_without_says_so():
     pipeline = start()
     for event in merge_positions(drive()[:50], [PositionSample(drive()[0].stamp_ns, np.zeros(2), np.eye(2))]):
         pipeline.process(event)
-    assert any("the map was built without" in text for text in pipeline.warnings())
+    assert any("the map was built without such" in text for text in pipeline.warnings())
 
 
 def test_map_fusion_state_written_and_read_gives_the_same_estimates():

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.errors import LogError, MapError
-from localization.events import Reference
-from localization.logs.reference_topics import move_origin, reference_decoder
+from localization.errors import MapError
+from localization.events import PositionSample
+from localization.logs.reference_topics import in_plane, position_sample, reference_decoder
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
@@ -82,13 +82,11 @@ def fix_message(latitude: float, longitude: float):
 def test_positions_of_two_days_are_in_one_plane() -> None:
     """Each log has its first fix as origin."""
     first, second = (reference_decoder("sensor_msgs/msg/NavSatFix") for _ in range(2))
-    origin = first(fix_message(48.1, 11.5), 0).origin
-    expected = first(fix_message(48.102, 11.504), 1).position
+    first(fix_message(48.1, 11.5), 0)
     second(fix_message(48.101, 11.502), 0)
-    (found,) = move_origin([second(fix_message(48.102, 11.504), 1)], origin, "/fix")
-    np.testing.assert_allclose(found.position, expected, atol=0.01)
-    with pytest.raises(LogError, match="positions in metres, and the map was built with latitude"):
-        next(move_origin([Reference(0, np.zeros(2), None)], origin, "/uwb"))
+    expected, other = (position_sample(decode(fix_message(48.102, 11.504), 1)) for decode in (first, second))
+    np.testing.assert_allclose(in_plane(other, expected.origin), expected.position, atol=0.01)
+    assert in_plane(PositionSample(0, np.zeros(2), np.eye(2)), expected.origin) is None
 
 
 @pytest.mark.parametrize("has_positions", [False, True])
