@@ -85,6 +85,7 @@ class Localizer:
         self.hypotheses: Sequence[Hypothesis] = ()
         """Places that a search found, the most probable first."""
         self._initial_left = 0
+        self._is_doubtful = False  # the last scan does not fit, as the first one does after the robot was carried unnoticed
         self._is_reckoned = False  # the pose is by odometry since it was tracked, and was not refuted
         self._searched_m, self._since_search = 0.0, np.zeros((3, 3))
         self._failures, self._wait = 0, 0
@@ -113,7 +114,10 @@ class Localizer:
     @property
     def probability(self) -> float:
         """That the robot is within 0.5 m and 0.2 rad of `pose`; while it is searched, that it is at the first of `hypotheses`."""
-        return sigmoid(self._track_odds) * _within(self._cov) if self.state == "localized" else sigmoid(self._search_odds)
+        if self.state != "localized":
+            return sigmoid(self._search_odds)
+        probability = sigmoid(self._track_odds) * _within(self._cov)
+        return min(probability, LIKELY) if self._is_doubtful else probability
 
     @property
     def covariance(self) -> Cov3:
@@ -183,6 +187,7 @@ class Localizer:
             of_again = self._evidence(again, wide)
             if of_again >= _FITTING:
                 place, cov, evidence = again, wide, of_again
+        self._is_doubtful = evidence < _FITTING
         self._track_odds = min(self._track_odds + evidence, _MAX_LOG_ODDS)
         self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
         if self.state == "localized" and sigmoid(self._track_odds) < _LOST:
@@ -283,7 +288,7 @@ class Localizer:
     def _begin_tracking(self, pose: Pose2, cov: Cov3) -> None:
         """The robot is at ``pose`` (3,) with covariance ``cov`` (3, 3)."""
         self.pose, self._cov, self._track_odds = pose, np.asarray(cov), self._search_odds
-        self._is_tracking, self._is_reckoned, self.state = True, False, "localized"
+        self._is_tracking, self._is_reckoned, self._is_doubtful, self.state = True, False, False, "localized"
         self._initial_left, self._failures, self._wait = 0, 0, 0
 
 

@@ -33,6 +33,7 @@ from tests.studies.localization_reliability import Moment, RecordedSearches, Sea
 
 _COV = np.diag([0.02, 0.02, 0.01]) ** 2
 _CARRIED = np.diag([3.0, 3.0, 1.5]) ** 2
+_MAPPED_SCORE = 0.5
 _AMCL_KINDS = ("same", "changed", "foreign")
 Guess = tuple[np.ndarray, float, bool]
 """Pose (3,), probability, and whether it is said to be localized."""
@@ -102,8 +103,17 @@ class Scene(NamedTuple):
     is_foreign: bool = False
 
 
-def run_localizer(places: RecordedSearches, scene: Scene, floor: str, rng: np.random.Generator) -> tuple[list[Moment], list[Search], str]:
-    """What is published after each keyframe, what the searches found, and the state at the end."""
+class End(NamedTuple):
+    """The last keyframe of a drive."""
+
+    said: Moment
+    state: str
+    is_mapped: bool
+    """Whether its scan at the true pose fits the map."""
+
+
+def run_localizer(places: RecordedSearches, scene: Scene, floor: str, rng: np.random.Generator) -> tuple[list[Moment], list[Search], End]:
+    """What is published after each keyframe, what the searches found, and the end."""
     localizer, moments, searches, covs = Localizer(places), [], [], {scene.carried_at: _CARRIED if scene.is_noticed else _COV}
     for k, (delta, points) in enumerate(measured(scene.walls, scene.poses, rng, scene.carried_at)):
         n_before, truth = len(places.found), scene.poses[k]
@@ -115,7 +125,8 @@ def run_localizer(places: RecordedSearches, scene: Scene, floor: str, rng: np.ra
         is_localized = localizer.state == "localized" or not localizer.hypotheses
         pose = localizer.pose if is_localized else localizer.hypotheses[0].pose
         moments.append(Moment(scene.kind, floor, localizer.probability, is_right(pose, truth) and not scene.is_foreign))
-    return moments, searches, localizer.state
+    is_mapped = not scene.is_foreign and places.align(points, scene.poses[-1]).score >= _MAPPED_SCORE
+    return moments, searches, End(moments[-1], localizer.state, is_mapped)
 
 
 def run_particles(n: int) -> Callable[[PlaceMap, np.ndarray, np.ndarray, np.random.Generator], Guess]:
@@ -180,10 +191,15 @@ def equal_rooms(n: int, rng: np.random.Generator) -> tuple[RecordedSearches, Sce
     return places, Scene("equal rooms", walls, room[:n])
 
 
-def row(kind: str, ends: Sequence[tuple[Moment, str]]) -> str:
-    """Of the last keyframes: share right and localized, and how many are localized and wrong."""
-    right, localized = (np.array(column) for column in zip(*((m.is_right, state == "localized") for m, state in ends), strict=True))
-    return f"| {kind} | {len(ends)} | {100 * right.mean():.0f} | {100 * localized.mean():.0f} | {int((localized & ~right).sum())} |"
+def row(kind: str, ends: Sequence[End]) -> str:
+    """Of the last keyframes: share right and localized of those mapped, and how many of all are localized and wrong."""
+    mapped = [end for end in ends if end.is_mapped]
+    shares = [[end.said.is_right for end in mapped], [end.state == "localized" for end in mapped]]
+    cells = [f"{100 * np.mean(share):.0f}" if mapped else "-" for share in shares]
+    localized = [end for end in ends if end.state == "localized"]
+    return (
+        f"| {kind} | {len(ends)} / {len(mapped)} | {' | '.join(cells)} | {len(localized)} / {sum(not e.said.is_right for e in localized)} |"
+    )
 
 
 def particle_rows(runs: Sequence[tuple[PlaceMap, Scene, np.random.Generator]]) -> list[str]:
@@ -192,7 +208,10 @@ def particle_rows(runs: Sequence[tuple[PlaceMap, Scene, np.random.Generator]]) -
     for n in (500, 5000):
         for kind in dict.fromkeys(scene.kind for _, scene, _ in runs):
             guesses = [(run_particles(n)(places, s.walls, s.poses, rng), s) for places, s, rng in runs if s.kind == kind]
-            ends = [(Moment(kind, "", g[1], is_right(g[0], s.poses[-1]) and not s.is_foreign), "localized" * g[2]) for g, s in guesses]
+            ends = [
+                End(Moment(kind, "", p, is_right(pose, s.poses[-1]) and not s.is_foreign), "localized" * is_sure, not s.is_foreign)
+                for (pose, p, is_sure), s in guesses
+            ]
             lines.append(row(f"{kind}, {n} particles", ends))
     return lines
 
@@ -208,7 +227,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--particles", action="store_true")
     parser.add_argument("--figure", type=Path, help="new file for the reliability diagram, .png or .svg")
     options = parser.parse_args(words)
-    ends: dict[str, list[tuple[Moment, str]]] = {}
+    ends: dict[str, list[End]] = {}
     moments: list[Moment] = []
     searches: list[Search] = []
     tracked: dict[str, list[float]] = {"same": [], "changed": []}
@@ -219,15 +238,15 @@ def main(words: Sequence[str] | None = None) -> None:
         places = RecordedSearches(floor_plan.make_map(walls, office_floor.drive(walls, rng, 200)), 0.02)
         todo = [(places, scene) for _ in range(options.starts) for scene in scenes(walls, other, options.keyframes, rng)]
         for where, scene in [*todo, equal_rooms(options.keyframes, rng)]:
-            said, found, state = run_localizer(where, scene, f"floor {seed}", rng)
+            said, found, end = run_localizer(where, scene, f"floor {seed}", rng)
             moments, searches = [*moments, *said], [*searches, *found]
-            ends.setdefault(scene.kind, []).append((said[-1], state))
+            ends.setdefault(scene.kind, []).append(end)
         if options.particles:
             runs += [(places, scene, np.random.default_rng([seed, i])) for i, (_, scene) in enumerate(todo) if scene.kind in _AMCL_KINDS]
         for scene in (scene for _, scene in todo[:2] if options.tracked):
             way = office_floor.drive(scene.walls, rng, options.tracked)
             tracked[scene.kind].append(tracked_share(places, scene.walls, way, rng))
-    print("| map | drives | right [%] | localized [%] | localized and wrong |")
+    print("| map | drives / mapped | right [%] | localized [%] | localized / wrong |")
     print("|---" * 5 + "|")
     for line in [*(row(kind, found) for kind, found in ends.items()), *particle_rows(runs)]:
         print(line)
