@@ -30,8 +30,11 @@ _MIN_SIGMAS = 4.0
 _MAX_OFFSET_S = 40.0
 """Leap seconds (18, or 37 for TAI) and clocks without NTP."""
 _MIN_OVERLAP_S, _MIN_OVERLAP_SHARE = 20.0, 0.5
-_ALIKE, _UNLIKE = 0.9, 0.5
-"""Correlations from which on chords need not be longer, and below which motions are not alike."""
+_ALIKE = 0.9
+"""Correlation from which on chords need not be longer."""
+_SAME_RUN = 0.8
+"""Correlation without an offset from where on a reference is of the same run, where the drive is too short to be sure: another run of the
+same robot on the same way has 0.4 to 0.94, the same run 0.99, or 0.93 where wheels slip and the reference is coarse."""
 _MIRRORED = -0.35
 """Correlation of turns of opposite sign; GPS of 2 m noise has +0.44 in a healthy log."""
 _MIN_OFFSET_S = 0.3
@@ -102,11 +105,12 @@ class ReferenceComparison:
         """What contradicts the sensors, of a reference of this ``name``; its clock only where it ``has_times`` of its own."""
         found = []
         if self.sigmas < _MIN_SIGMAS:
-            if self.unshifted >= _UNLIKE:
+            if self.unshifted >= _SAME_RUN:
                 return ()
             return (
-                f"{name}: its motion is not that of the robot's sensors at any offset of the clocks up to {_MAX_OFFSET_S:g} s (correlation"
-                f" {self.likeness:.2f} at best): it is of another run or another robot, or its clock is not set.",
+                f"{name}: its motion is not that of the robot's sensors (correlation {self.unshifted:.2f}), at no offset of the clocks"
+                f" up to {_MAX_OFFSET_S:g} s for sure ({self.likeness:.2f} at best): it is of another run or another robot, or its"
+                " clock is not set.",
             )
         if has_times and abs(self.offset_s) >= _MIN_OFFSET_S and _is_clear(self.likeness, self.unshifted):
             leap = next((words for leap, words in _LEAPS_S if abs(abs(self.offset_s) - leap) < 0.25), "")

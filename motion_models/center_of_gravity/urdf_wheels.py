@@ -57,6 +57,8 @@ _FULL_TURN = 6.2
 """Range [rad] from which a joint turns without end: 3.14 to each side is meant so."""
 _LONGEST_M = 20.0
 """Lengths above are not metres: the largest mining trucks are 15 m long."""
+_LONGEST_IN_INCHES = 100.0
+"""Track of 2.5 m; as millimetres, the least of a robot."""
 
 
 class _Wheel(NamedTuple):
@@ -196,8 +198,9 @@ def _check_metres(geometry: WheelGeometry, source: str) -> None:
     lengths = {"track": geometry.track_width_m, "wheelbase": geometry.wheelbase_m, "wheel radius": geometry.wheel_radius_m}
     for name, length in lengths.items():
         if length > _LONGEST_M:
+            unit = "millimetres" if length > _LONGEST_IN_INCHES else "inches (0.0254 m)"
             raise RobotError(
-                f"{source}: its {name} is {length:.4g} m; a URDF has metres, and these may be millimetres: scale it, "
+                f"{source}: its {name} is {length:.4g} m; a URDF has metres, and these may be {unit}: scale it, "
                 "or give lengths by options instead of --urdf."
             )
 

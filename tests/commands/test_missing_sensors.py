@@ -12,6 +12,7 @@ import pytest
 from localization.cli import main
 from tests.helpers import bags
 from tests.helpers.bags import S
+from tests.helpers.entrance_drives import Publishing, Vehicle, drive, write
 from tests.helpers.extended import cases
 
 START = 1_700_000_000 * S
@@ -57,6 +58,15 @@ def test_sentences_on_wheels_alone_name_no_other_sensor(command: str, tmp_path: 
     text = texts(command, log_of(tmp_path / "log.mcap", has_imu=False), tmp_path, capsys)
     assert text
     assert re.findall(f"{GYRO}|{LIDAR}|{REFERENCE}", text) == []
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("command", ["check", "replay"])
+def test_sentences_on_wheels_and_lidar_name_no_gyro(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = Vehicle(0.165, 0.555, 0.512, 0.5, imu_hz=0.0, scan_hz=5.0, beams=120, seed=61)
+    motion = drive(vehicle)
+    text = texts(command, write(tmp_path / "log.mcap", vehicle, motion, Publishing()), tmp_path, capsys)
+    assert re.findall(f"{GYRO}|{REFERENCE}", text) == []
 
 
 @pytest.mark.extended

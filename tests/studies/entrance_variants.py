@@ -497,5 +497,3 @@ HELD_OUT: tuple[Variant, ...] = (
         ).replace("-0.3 0 -0.06", "-0.2 0 -0.006"),
     ),
 )
-
-SETS = {"developed": DEVELOPED, "healthy": HEALTHY, "held_out": HELD_OUT}

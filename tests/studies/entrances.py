@@ -1,6 +1,6 @@
 """Wirings, units, clocks, topics, descriptions and references as practitioners bring them, on robots of many sizes.
 
-`python -m tests.studies.entrances [developed | held_out | healthy] [KIND ...]` prints kind, variant and outcome:
+`python -m tests.studies.entrances [developed | held_out | unseen | healthy] [KIND ...]` prints kind, variant and outcome:
 
 - right: what the log should have been read as, and (but for healthy ones) a sentence or a table that names what was found
 - named: not corrected, but a sentence names it
@@ -39,6 +39,7 @@ from localization.pipeline import Trial
 from motion_models.errors import SkidlocError
 from motion_models.registry import make_model
 from motion_models.robot import Robot
+from tests.helpers import bags
 from tests.helpers.bags import START, S
 from tests.helpers.entrance_drives import Motion, Publishing, Vehicle, drive, write
 
@@ -92,6 +93,9 @@ def wired(
         motion = drive(vehicle)
         log, found = open_checked(write(folder / "log.mcap", vehicle, motion, how), robot(vehicle.robot()))
         text = " ".join([*log.warnings(), log.no_wheels])
+        if how.tilt:  # found during the drive
+            trial = Trial(make_model("skid_steer", log.robot), "odometry")
+            text = " ".join([text, *warnings_of(replay(log.events(), [trial], log.robot, log.mounts, has_lidar=False))])
         if is_undecidable:
             is_named = any(word in text for word in words)
             return Found("right" if found.is_ambiguous and is_named else "misnamed" if text else "silent", text)
@@ -203,6 +207,51 @@ def mounted(name: str, vehicle: Vehicle, how: Publishing, words: Sequence[str]) 
         return outcome_of(is_right, text, words, is_healthy=not words)
 
     return Variant("mounts", name, judge)
+
+
+# point times
+
+
+def pointed(
+    name: str,
+    vehicle: Vehicle,
+    field_name: str,
+    dtype: str,
+    times: Callable[[np.ndarray, float, int], np.ndarray],
+    words: Sequence[str],
+) -> Variant:
+    """Clouds whose points have ``times`` of parts of the sweep (n,), its period [s] and its stamp [ns]: right where they are read to 1 ms.
+
+    With ``words``, times mean nothing, and that is named.
+    """
+
+    def judge(folder: Path) -> Found:
+        motion, period, part = drive(vehicle), 0.1, np.linspace(0.0, 0.999, 80)
+        records = [("/tf_static", bags.tf(START, [("base_link", "lidar", (0.1, 0.0, 0.3), bags.quaternion())]), START)]
+        names = (*vehicle.left, *vehicle.right)
+        columns = list(range(4)) if len(names) == 4 else [0, 2]
+        for t in np.arange(0.0, 8.0, 0.04):
+            i, stamp = motion.at(t), START + round(t * S)
+            records.append(("/joint_states", bags.joint_state(stamp, names, motion.angles[i][columns], motion.rates[i][columns]), stamp))
+        for t in np.arange(0.0, 8.0, period):
+            stamp = START + round(t * S)
+            table = np.zeros(len(part), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), (field_name, dtype)])
+            table["x"], table["y"] = 4.0 * np.cos(math.tau * part), 3.0 * np.sin(math.tau * part)
+            table[field_name] = times(part, period, stamp)
+            records.append(("/points", bags.cloud(stamp, table), stamp + S // 50))
+        log = open_log(bags.write_mcap(folder / "log.mcap", sorted(records, key=lambda record: record[2])), vehicle.robot())
+        pipeline = Trial(make_model("skid_steer", log.robot), "ekf")
+        text = " ".join([*warnings_of(replay(log.events(), [pipeline], log.robot, log.mounts, has_lidar=True)), *log.warnings()])
+        scans = list(log.scans())
+        if words:
+            is_read = all(len(scan.offsets) == 0 for scan in scans)
+            return outcome_of(is_read, text, words)
+        wanted = np.asarray(times(part, period, 0), dtype=float)
+        begin = -period if wanted.min() < 0.0 else 0.0
+        is_right = all(len(s.offsets) == len(part) and np.abs(s.offsets - begin - part * period).max() < 1e-3 for s in scans)
+        return outcome_of(is_right and len(scans) == 80, text, (), is_healthy=False)
+
+    return Variant("point times", name, judge)
 
 
 # references
@@ -369,13 +418,16 @@ def print_shares(found: Sequence[tuple[Variant, Found]]) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """Run the sets and kinds that are named, by default all."""
-    from tests.studies.entrance_variants import SETS
+    from tests.studies.entrance_unseen import UNSEEN
+    from tests.studies.entrance_variants import DEVELOPED, HEALTHY, HELD_OUT
 
-    sets = [name for name in arguments if name in SETS] or list(SETS)
-    kinds = [name for name in arguments if name not in SETS and not name.startswith("-")]
+    variants = {"developed": DEVELOPED, "healthy": HEALTHY, "held_out": HELD_OUT, "unseen": UNSEEN}
+
+    sets = [name for name in arguments if name in variants] or list(variants)
+    kinds = [name for name in arguments if name not in variants and not name.startswith("-")]
     for name in sets:
         print(f"== {name}")
-        chosen = [v for v in SETS[name] if not kinds or v.kind in kinds or any(k in v.name for k in kinds)]
+        chosen = [v for v in variants[name] if not kinds or v.kind in kinds or any(k in v.name for k in kinds)]
         print_shares(run(chosen, "-v" in arguments))
 
 
