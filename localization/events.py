@@ -230,6 +230,8 @@ class Step:
     """None where it was not measured in this step, and for estimators in the plane."""
     is_scan_excluded: bool = False
     """A scan came, and a sensor check left it out."""
+    is_scan_partial: bool = False
+    """A sensor check left out points of ``scan`` that move."""
     rested_s: float = 0.0
     """For how long wheels, gyro and accelerometer have all measured what they do on a robot at rest [s]."""
 

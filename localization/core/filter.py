@@ -166,6 +166,16 @@ def inflate(state: State, name: str, cov: FloatArray) -> State:
     return State(state.layout, state.means, P)
 
 
+def inflate_both(state: State, names: tuple[str, str], cov: FloatArray) -> State:
+    """The state whose two variables ``names`` are off by one and the same independent error more, with covariance ``cov`` (k, k): that of
+    their difference stays as it is."""
+    P = state.P.copy()
+    for a in names:
+        for b in names:
+            P[state.layout.rows[a], state.layout.rows[b]] += cov
+    return State(state.layout, state.means, P)
+
+
 def set_marginal(state: State, name: str, mean: FloatArray, cov: FloatArray) -> State:
     """The state with ``mean`` and ``cov`` (k, k) of the variable ``name`` by another estimator, which has used these measurements too:
     correlations with the other variables are dropped."""

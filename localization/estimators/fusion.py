@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from localization.core.filter import Innovation, clone, inflate, propagate, set_marginal, update
+from localization.core.filter import Innovation, clone, inflate, inflate_both, propagate, set_marginal, update
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, initial_state, wheel_transition
 from localization.core.policies.excitation import Excitation
+from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import PriorOutlier
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
@@ -68,7 +69,7 @@ class EkfFusion(Estimator):
         self.state = initial_state(robot.gyro_noise, corrections, config)
         """Means and covariance at the end of the last step."""
         self._config, self._gyro, self.model, self.corrections, self._sensor = config, robot.gyro_noise, model, corrections, sensor
-        self._wheel_noise, self._slip, self._outlier = WheelNoiseScale(), SweepSlip(), PriorOutlier()
+        self._wheel_noise, self._slip, self._outlier, self._open_way = WheelNoiseScale(), SweepSlip(), PriorOutlier(), OpenWay()
         self._excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
         self.wheels = WheelPrediction(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
         self._turn: Innovation | None = None  # of the gyro, in the last step
@@ -79,16 +80,18 @@ class EkfFusion(Estimator):
     def step(self, step: Step) -> Estimate:
         """Predict, update by the gyro, update by the scan."""
         self.run_deferred()
-        motion = replace(step.predicted, cov=self._wheel_noise.cov(step))
+        motion, unseen = replace(step.predicted, cov=self._wheel_noise.cov(step)), self._open_way.cov(step)
         self._excitation.start_step(motion)
         self._outlier.start_step()
         state = clone(self.state, "pose", "start")
         state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
+        if unseen.any():  # the submap moves along
+            state = inflate_both(state, ("pose", "map"), unseen)
         self._wheel_noise.start_step(state, motion.cov)
         state, self._turn = self._update_turn(state, step)
         self._scan = None
         state, scan = self._update_scan(state, step)
-        motion = replace(motion, cov=motion.cov + self._outlier.cov)
+        motion = replace(motion, cov=motion.cov + unseen + self._outlier.cov)
         self.wheels = WheelPrediction(motion, self.state["corrections"], self._excitation.is_turning)
         self.state = state
         self.counts_by_name["standing"] += step.is_standing
@@ -142,6 +145,7 @@ class EkfFusion(Estimator):
         R = R * (1.0 + step.rested_s / _REPEATED_S) ** 4
         self.counts_by_name["matched"] += 1
         self._excitation.start_scan(state, R)
+        self._open_way.add_scan(R, step)
         state, innovation = update(state, measure_scan(state, match.measured, R), self._excitation.considered())
         self._wheel_noise.learn(innovation)
         self._scan = replace(innovation, S=innovation.S - self._outlier.cov)
@@ -232,15 +236,16 @@ class EkfFusion(Estimator):
         return found if self._sensor is None else {**found, **self._sensor.lost.causes}
 
     def warnings(self) -> list[str]:
-        """A clock offset that is large and certain."""
+        """A long way by wheels alone, and a clock offset that is large and certain."""
         offset, sigma = self.clock_offset_s, math.sqrt(self.state.variance("clock"))
         if abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
-            return []
+            return self._open_way.warnings()
         others = "LiDAR" if not self._has_gyro else "gyro" if self._sensor is None else "LiDAR or gyro"
         direction = "later" if offset > 0.0 else "earlier"
         return [
+            *self._open_way.warnings(),
             f"the wheels' stamps are {abs(offset):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize the"
-            " clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each."
+            " clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each.",
         ]
 
     def map_points(self) -> Points2:

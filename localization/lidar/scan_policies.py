@@ -52,7 +52,7 @@ class MovedRobot:
         """Whether the robot was moved in ``step``, by the ``mapped_share`` of the points of its ``scan`` now and before."""
         before = self._mapped_shares.get(scan.frame_id, 0.0)
         self._mapped_shares[scan.frame_id] = mapped_share
-        if is_matched or before <= _MAPPED or mapped_share >= _UNMAPPED:
+        if is_matched or step.is_scan_partial or before <= _MAPPED or mapped_share >= _UNMAPPED:
             return False
         x, y, yaw = step.predicted.delta
         if math.hypot(x, y) >= _MAX_MOTION or abs(yaw) >= _MAX_MOTION:

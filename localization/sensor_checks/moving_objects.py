@@ -40,16 +40,19 @@ _MIN_MOVED_WITHOUT_GYRO = 0.2
 """The same of a robot whose wheels alone measure its turns."""
 _MIN_UNSURE = 0.06
 """The same from where on it is not sure that the scene is still."""
-_MIN_OFF_M, _MAX_OFF_M = 0.08, 0.25
+_MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
 """Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
 from where on labels show whether they do [m]."""
+_MAX_SLIP_M, _MAX_TURN_SLIP_RAD = 0.15, 0.2
+"""Distance of the estimate from the motion by the wheels since that view, up to which the wheels slip as they do without moving objects
+[m, rad]: a way of .6 m, along which fr079's robot slides by up to 14 deg."""
 _MAX_NIS = 16.3
 """NIS of a matched scan that contradicts the wheels: one of 1,000 by chance (chi^2 of 3 degrees of freedom)."""
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
 """Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
 Wheels that slip in a still scene explain 14 to 33 % by chance where they turn otherwise (fr079 at 168 to 185 s), else 15 to 20 %."""
-_MAX_WHEEL_TURN_RAD = 0.1
-"""Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
+_MAX_WHEEL_TURN_RAD, _SAME_TURN_RAD = 0.1, 0.05
+"""Turn of a rival from the wheels', without a gyro, from where on these have slipped, and up to where both turn alike [rad]."""
 _RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
 """A rival leaves less than this share of what moves; and the share of a scan that it leaves unexplained counts as this much at least."""
 _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
@@ -88,8 +91,10 @@ class MovingObjects(Check):
 
     A scan is compared with one from before under the motion by wheels and gyro. Where one other motion explains all of it, as with wheels
     that slip, nothing is left out: the matcher finds it. Where the points that the wheels do not explain need a motion that does not
-    explain those which they do, the scene has two motions, and that of the wheels is the still world's. Until that is decided, and while
-    objects move, the covariance has the distance of the estimate from the motion by wheels and gyro, since labels showed it first.
+    explain those which they do, the scene has two motions, and that of the wheels is the still world's. Until that is decided, the
+    covariance has the distance of the estimate from the motion by wheels and gyro since labels showed it first. Once it is, the estimate is
+    led back by this distance, which the filter's covariance then has until scans of the still world show the pose. From there on, the
+    distance counts from where both last agreed.
     """
 
     def __init__(self, faults: FaultLog, window: Window) -> None:
@@ -100,12 +105,12 @@ class MovingObjects(Check):
         """With which the last scan was compared."""
         self._is_unsure = False
         """Objects may move, or the wheels slip."""
-        self._suspected: _View | None = None
-        """Before labels began to show that either happens."""
+        self._suspected: FloatArray | None = None
+        """(2, 3) poses before labels began to show that either happens."""
         self._suspected_s = -math.inf
         """Time of the last labels that showed it [s]."""
-        self._since: _View | None = None
-        """Before objects began to move."""
+        self._since: FloatArray | None = None
+        """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
         self._explained: tuple[Fault, ...] = ()
         """Named faults so far that explain what was taken for moving objects."""
         self.report = _Report(faults)
@@ -137,10 +142,14 @@ class MovingObjects(Check):
         references = self._references(lidar)
         if references:
             found = self._label(references[0], profile, points)
+            was_moving = self._since is not None
             self._update(step, lidar, found)
             if lidar.is_active:
+                step = step if was_moving else self._lead_back(step)
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
                 step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
+        elif lidar.is_active:
+            step = without_scan(step)
         if is_due:
             view = _View(now_s, self._poses.copy(), profile)
             lidar.views.append(view)
@@ -151,18 +160,51 @@ class MovingObjects(Check):
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
         self._poses[1] = se2.compose(self._poses[1], delta)
-        inflation, view = self._faults.inflation, self._compared if self._suspected is None else self._suspected
+        inflation, view = self._faults.inflation, self._compared
+        if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
+            self._settle(self._since)
+            self._since = self._poses.copy()
         inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
         inflation.possible = None
-        if self._since is None and view is not None and (self._suspected is not None or self._is_near(view)):
-            off = self._distance(view)
+        begin = self._suspected if self._suspected is not None else view.poses if view is not None and self._is_near(view) else None
+        if self._since is None and begin is not None:
+            off = self._distance(begin)
             is_off = self._is_unsure or _MIN_OFF_M < math.hypot(off[0], off[1]) < _MAX_OFF_M or (nis is not None and nis > _MAX_NIS)
             inflation.possible = off if is_off else None
 
-    def _distance(self, view: _View) -> FloatArray:
-        """(3,) of the motion by the wheels since ``view`` from that by the estimate."""
-        by_wheels, by_estimate = se2.between(view.poses, self._poses)
+    def _distance(self, poses: FloatArray) -> FloatArray:
+        """(3,) of the motion by the wheels since ``poses`` (2, 3) from that by the estimate."""
+        by_wheels, by_estimate = se2.between(poses, self._poses)
         return se2.local(by_estimate, by_wheels)
+
+    def _agree(self, poses: FloatArray) -> bool:
+        """Whether wheels and estimate have moved alike since ``poses`` (2, 3)."""
+        off = self._distance(poses)
+        return bool(math.hypot(off[0], off[1]) < _MAX_SLIP_M and abs(off[2]) < _MAX_TURN_SLIP_RAD)
+
+    def _settle(self, poses: FloatArray) -> None:
+        """What the estimate is off by since ``poses`` (2, 3) stays, if it is more than wheels slip."""
+        if not self._agree(poses):
+            self._faults.inflation.add(self._distance(poses))
+
+    def _lead_back(self, step: Step) -> Step:
+        """``step`` at whose end the estimate is where the wheels lead from `_since`, with the distance to there as its covariance."""
+        assert self._since is not None
+        motion, by_wheels = step.predicted, se2.between(self._since[0], self._poses[0])
+        off = se2.local(se2.compose(se2.between(self._since[1], self._poses[1]), motion.delta), by_wheels)
+        if math.hypot(off[0], off[1]) >= _MIN_OFF_M:
+            motion = replace(motion, delta=se2.retract(motion.delta, off), cov=motion.cov + np.outer(off, off))
+            step = replace(step, predicted=motion, turn=None)
+        self._since = np.array([self._poses[0], se2.compose(self._poses[1], motion.delta)])
+        for lidar in self._lidars.values():
+            lidar.views = deque((self._led_back(view, self._since) for view in lidar.views), maxlen=_MAX_VIEWS)
+        return step
+
+    @staticmethod
+    def _led_back(view: _View, now: FloatArray) -> _View:
+        """``view`` from which the estimate has moved as the wheels have, to the poses ``now`` (2, 3)."""
+        by_wheels = se2.between(now[0], view.poses[0])
+        return view._replace(poses=np.array([view.poses[0], se2.compose(now[1], by_wheels)]))
 
     def _add_motion(self, step: Step) -> None:
         delta = step.predicted.delta
@@ -194,35 +236,39 @@ class MovingObjects(Check):
         """Whether objects move now."""
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        distance = math.hypot(*self._distance(found.view)[:2])
+        distance = math.hypot(*self._distance(found.view.poses)[:2])
         is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
-        is_moving = moved_share >= _MIN_UNSURE and is_standing
+        is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
-            has_turn = step.turn is not None or lidar.is_active
+            turn_off = float(self._distance(found.view.poses)[2])
+            has_turn = step.turn is not None or lidar.is_active or abs(turn_off) < _SAME_TURN_RAD
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE:
-                self._suspected, self._suspected_s = self._suspected or found.view, now_s
+                self._suspected = found.view.poses if self._suspected is None else self._suspected
+                self._suspected_s = now_s
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
             is_moving = unique >= least and (has_turn or moved_share >= _MIN_MOVED_WITHOUT_GYRO)
         is_moving &= moved_share >= _MIN_MOVED
         lidar.shown = lidar.shown + 1 if is_moving else 0
         if is_moving:
             lidar.last_s = now_s
-        again = 1 if is_standing else _AGAIN if step.turn is not None else _AGAIN_WITHOUT_GYRO
+        again = 1 if is_standing else _AGAIN if has_turn else _AGAIN_WITHOUT_GYRO
         lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
         if now_s - self._suspected_s >= _CALM_S:
             self._suspected = None
         self._is_unsure = is_unsure or self._suspected is not None
+        self._window.is_scene_moving = self._suspected is not None or lidar.is_active
         if lidar.is_active:
             self.report.add(moved_share)
-            self._since = self._since or self._suspected or found.view
+            if self._since is None:
+                self._since = found.view.poses if self._suspected is None else self._suspected
         elif self._since is not None and not any(other.is_active for other in self._lidars.values()):
             self._end()
 
     def _end(self) -> None:
-        """No objects move any more: what the estimate is off by stays."""
+        """No objects move any more."""
         if self._since is not None:
-            self._faults.inflation.add(self._distance(self._since))
+            self._settle(self._since)
             self._since = self._suspected = None
 
     def _restart(self) -> None:
@@ -284,4 +330,4 @@ def _with_still(step: Step, is_still: BoolArray) -> Step:
     scan = step.scan
     if scan is None or is_still.sum() < _MIN_POINTS:
         return without_scan(step)
-    return replace(step, scan=scan.select(is_still))
+    return replace(step, scan=scan.select(is_still), is_scan_partial=True)

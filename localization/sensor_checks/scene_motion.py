@@ -56,9 +56,12 @@ class SceneMotion:
 def refine(reference: Profile, points: Points2, motion: Pose2) -> Pose2:
     """``motion`` (3,) of the LiDAR since ``reference`` by those of ``points`` (N, 2), about the LiDAR, that it nearly explains.
 
-    Gauss-Newton for the sum of the squared distances from their lines, and those from ``motion`` as a prior.
+    Gauss-Newton for the sum of the squared distances from their lines, and those from ``motion`` as a prior. What ends farther from
+    ``motion`` than that may be off was led away by points that move: ``motion`` itself is returned.
     """
-    return np.array(_refine(reference.points, reference.normals, points, triple(motion)))
+    found = np.array(_refine(reference.points, reference.normals, points, triple(motion)))
+    off = se2.local(motion, found)
+    return found if math.hypot(off[0], off[1]) < _PRIOR_M and abs(off[2]) < _PRIOR_RAD else motion
 
 
 def label(reference: Profile, now: Profile, points: Points2, motion: Pose2) -> SceneMotion:

@@ -50,6 +50,8 @@ class Window:
         """Whether any scan has come."""
         self.begin_s = self.end_s = 0.0
         """After the first step [s]."""
+        self.is_scene_moving = False
+        """Objects move in the scans: they show no way of the robot."""
         self.registered: Scan | None = None
         """The last scan that ended a bin."""
 
@@ -73,7 +75,8 @@ class Window:
         motion = self._scans.register(*self.project(scan))
         if motion is None or not self._open.has_scan_at_start:
             return np.full(3, np.nan)
-        return motion.delta if motion.has_translation else np.array([np.nan, np.nan, motion.delta[2]])
+        is_known = motion.has_translation and not self.is_scene_moving
+        return motion.delta if is_known else np.array([np.nan, np.nan, motion.delta[2]])
 
     def project(self, scan: Scan) -> tuple[Points2, FloatArray]:
         """Points (M, 2) of ``scan`` in the plane of the body, and where its LiDAR is (2,) [m]."""

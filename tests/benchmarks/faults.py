@@ -5,9 +5,9 @@ python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verb
 `--pairs` prints faults that no check knows by name instead, without the test of pairs of sensors and with it: the largest error of the
 position at its sigma [m], what wheels and scans alone make of the drive, and what is reported.
 
-`--scenes` prints drives among people, vehicles, dust, glass and mirrors (`tests.helpers.moving_scenes`): the error of the position that
-is most sigmas large, of those above 10 cm (else the largest), the error at the end, the largest of wheels and of KISS-ICP alone [m], and
-what is reported. "wrong": over 5 sigma and 10 cm, or over 1 m and 3 sigma, whatever is reported.
+`--scenes` prints drives among people, vehicles, dust, glass and mirrors, and along a bare corridor (`tests.helpers.moving_scenes`): the
+error of the position that is most sigmas large, of those above 10 cm (else the largest), the error at the end, the largest of wheels and
+of KISS-ICP alone [m], and what is reported. "wrong": over 5 sigma and 10 cm, or over 1 m and 3 sigma, whatever is reported.
 """
 
 from __future__ import annotations

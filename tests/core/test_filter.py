@@ -16,6 +16,7 @@ from localization.core.filter import (
     augment,
     clone,
     inflate,
+    inflate_both,
     marginalize,
     propagate,
     set_marginal,
@@ -226,6 +227,9 @@ def test_augment_inflate_and_set_marginal_change_their_own_rows():
     np.testing.assert_array_equal(added.cov("clock"), cov)
     np.testing.assert_array_equal(added.cross_cov("clock", "pose"), np.zeros((2, 3)))
     np.testing.assert_allclose(inflate(state, "bias", cov).P - state.P, np.pad(cov, (6, 0)), atol=1e-15)
+    both = inflate_both(state, ("pose", "start"), np.eye(3)).P - state.P
+    np.testing.assert_allclose(both[:6, :6], np.tile(np.eye(3), (2, 2)), atol=1e-15)
+    assert not both[6:].any()
     given = set_marginal(state, "bias", np.array([1.0, 2.0]), cov)
     np.testing.assert_array_equal(given["bias"], [1.0, 2.0])
     np.testing.assert_array_equal(given.cov("bias"), cov)

@@ -10,6 +10,7 @@ import pytest
 from localization.core.filter import inflate
 from localization.core.motion import FilterConfig, initial_state
 from localization.core.policies.excitation import Excitation
+from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import PriorOutlier
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.events import Step
@@ -73,3 +74,28 @@ def test_prior_outlier_of_a_moved_robot_is_as_wide_as_its_motion():
     np.testing.assert_allclose(state.cov("pose") - STATE.cov("pose"), moved)
     outlier.start_step()
     assert not outlier.cov.any()
+
+
+def test_open_way_covers_a_factor_that_lasts_and_pushes_in_simulated_drives():
+    """The variance that the policy adds, summed over a stretch of 40 m, is that of the way's error over many drives with a factor and a
+    push drawn for each; a scan that shows the way ends the stretch."""
+    rng, n, policy = np.random.default_rng(0), 4000, OpenWay()
+    driven = step_of([0.1, 0.0, 0.0])
+    policy.cov(driven)
+    policy.add_scan(np.diag([100.0, 1e-4, 1e-4]), driven)
+    variance = sum(policy.cov(driven)[0, 0] for _ in range(400))
+    errors = 40.0 * rng.normal(0.0, 1.0 / 9.0, n) + rng.normal(0.0, 4.0 / 3.0, n)
+    assert variance == pytest.approx(np.mean(errors**2), rel=0.1)
+    (warning,) = policy.warnings()
+    assert "40 m along a corridor by wheels alone" in warning
+    policy.add_scan(np.diag([1e-4, 1e-4, 1e-4]), driven)
+    assert not policy.cov(driven).any()
+
+
+def test_open_way_of_a_robot_at_rest_or_of_short_stretches_adds_nothing():
+    policy, resting = OpenWay(), replace(step_of([0.0, 0.0, 0.0], is_standing=True), rested_s=1.0)
+    policy.cov(resting)
+    policy.add_scan(np.diag([100.0, 1e-4, 1e-4]), resting)
+    assert not policy.cov(resting).any()
+    policy.cov(step_of([0.1, 0.0, 0.0]))
+    assert policy.warnings() == []

@@ -19,6 +19,7 @@ from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms
+from tests.helpers.corridors import KINDS, in_corridor
 from tests.helpers.fault_drives import FaultDrive
 from tests.studies.buildings import BUILDINGS
 from tests.studies.honesty import Noise, Room, drive_with, make_rooms
@@ -273,5 +274,6 @@ SCENES: dict[str, Callable[[int], FaultDrive]] = {
     "fr079: crowd of 12 walks along": lambda seed: put_into_scans(fr079(), crowd(12, seed)),
     "glass on both sides": lambda seed: _from_room(_glass_room(), TOUR, seed),
     "wall of mirrors": _mirrored,
+    **{f"bare corridor, {kind}": functools.partial(in_corridor, kind) for kind in KINDS},
 }
 """Drives by name, made by a seed."""

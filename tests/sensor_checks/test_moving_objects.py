@@ -14,6 +14,7 @@ from localization.sensor_checks.scene_motion import MOVED, STILL, align_rest, la
 from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms
+from tests.helpers.corridors import KINDS, in_corridor
 from tests.helpers.event_faults import multiply_wheels
 from tests.helpers.extended import cases
 from tests.helpers.fault_drives import in_room, run
@@ -78,6 +79,24 @@ def test_scene_that_moves_is_in_the_covariance(name: str) -> None:
         assert outcome.worst[0] < 0.1
         assert outcome.pipeline.checks.counts()["scans_with_moving_objects"] > 10
         assert deserialize(*serialize(outcome.pipeline.checks)).counts() == outcome.pipeline.checks.counts()
+
+
+@pytest.mark.extended
+def test_crowd_that_overtakes_leaves_neither_error_nor_covariance() -> None:
+    """The estimate is led back to the motion by the wheels, from where scans of the still world show the pose."""
+    error, sigma = run(SCENES["crowd of 12 overtakes"](1)).last
+    assert error < 0.05
+    assert error < 3.0 * sigma
+    assert sigma < 0.4
+
+
+@pytest.mark.parametrize("kind", cases(KINDS[2:4], usual=[]) + cases([*KINDS[:2], KINDS[4]], usual=[], others=pytest.mark.slow))
+def test_bare_corridor_has_slip_and_pushes_in_the_covariance(kind: str) -> None:
+    outcome = run(in_corridor(kind, 1))
+    is_large = outcome.errors > 0.1
+    assert (outcome.errors < 3.0 * outcome.sigmas + 0.1)[is_large].all(), outcome.least_consistent
+    assert any("m along a corridor by wheels alone, from t = 0 s" in warning for warning in outcome.warnings)
+    assert outcome.last[1] < 0.15 * 83.0  # no more than a factor on the way by the wheels, and pushes
 
 
 @pytest.mark.extended

@@ -31,6 +31,7 @@ from localization.core.filter import Measurement, Transition, set_marginal
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.policies import wheel_noise
 from localization.core.policies.excitation import Excitation
+from localization.core.policies.open_way import OpenWay
 from localization.core.policies.slip import SlipChanges
 from localization.core.state import State
 from localization.estimators import fusion, graph_fusion, pose_graph
@@ -45,6 +46,7 @@ from localization.lidar.scan_matcher import ScanMatcher
 from localization.lidar.scan_sensor import ScanMatchingSensor
 from localization.lidar.submap import VoxelGrid, fill_surface, make_grid
 from localization.logs import open_log
+from localization.sensor_checks.moving_objects import MovingObjects
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import ImuConfig, SensorConfig
@@ -163,6 +165,8 @@ PATCHES: Mapping[str, Patch] = {
     "new surfaces' error of key scans": _attribute(fusion, "key_scan_transition", _without_new),
     "scale of the wheel noise": _attribute(wheel_noise, "_MAX_NOISE_SCALE", 1.0),
     "excitation gate of corrections": _attribute(Excitation, "start_step", lambda self, motion: None),
+    "ways by wheels alone": _attribute(OpenWay, "cov", lambda self, step: np.zeros((3, 3))),
+    "moving objects left out": _attribute(MovingObjects, "apply", lambda self, step: step),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
