@@ -7,10 +7,11 @@ import itertools
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 
-from localization.diagnosis.causes.cause import Cause, Hypothesis, Motion, changed
+from localization.diagnosis.causes.cause import Cause, Hypothesis, Motion, Spell, Stage, changed
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
@@ -18,6 +19,7 @@ from motion_models.base import MotionModel, Twist
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import predict, series_of
 from motion_models.compiled import kernel, subroutine
+from motion_models.diff_drive import DiffDrive
 from motion_models.extended_model import in_series
 from motion_models.friction import FrictionModel
 from motion_models.robot import DIFF_DRIVE, Robot
@@ -26,6 +28,7 @@ from motion_models.se2 import FloatArray
 _DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
 _LEAST_RATE = 0.5  # rad/s
 REST_RATE_RAD_PER_S = 0.25  # rad/s
+_STANDING_RATE = 1e-6  # rad/s of wheels that stand, by which parts of a window in which they do are shares of it
 _LONGEST_S = 3.0
 
 
@@ -99,6 +102,7 @@ _GRAVITY = 9.81
 _GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
 _GYRO_SCALE_SIGMA = 0.03  # sensitivity tolerance of MEMS gyros (see `causes`)
 _MAX_CACHED_TWISTS = 100
+_STAGES = get_args(Stage)
 _LEAST_MU = 0.05  # ice
 _MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
@@ -158,7 +162,7 @@ class DrivePredictor:
         self._lost = find_dropouts(self.batch)
         rolls = np.abs(self.batch.wheels).max(axis=1) > REST_RATE_RAD_PER_S
         self._lost_time = float((self._lost.max(axis=1) * rolls) @ self.batch.dt / max(float(rolls @ self.batch.dt), 1e-9))
-        self._base = quasi_static_twists(self._friction, self._friction.nominal, self.batch.wheels, self.batch.cg)
+        self._base = self._settled_twist()
         self.headings = self._headings()
         first, lead = self.batch.first, self.batch.lead
         self._last = self.batch.ends[np.searchsorted(self.batch.owner, np.arange(len(first) - 1), side="right") - 1]
@@ -169,6 +173,7 @@ class DrivePredictor:
             self.times_s[inside] = start + np.cumsum(dt) - dt - dt[: lead[w]].sum()
         self.kinematic_forces = self._accelerations()
         self._twists: dict[tuple[object, ...], FloatArray] = {}
+        self._rows: dict[tuple[object, ...], FloatArray] = {}
 
     @property
     def has_baseline(self) -> bool:
@@ -177,8 +182,16 @@ class DrivePredictor:
 
     @property
     def nominal_twist(self) -> FloatArray:
-        """(N, 3) by the friction model as the robot file has it, settled [m/s, m/s, rad/s]."""
+        """(N, 3) by the friction model as the robot file has it, settled, and of robots with casters by their geometry
+        [m/s, m/s, rad/s]."""
         return self._base
+
+    def _settled_twist(self) -> FloatArray:
+        batch, robot = self.batch, self.drive.robot
+        if robot.drive == DIFF_DRIVE:
+            model = DiffDrive.from_robot(robot)
+            return model.twist(batch.wheels, batch.cg, model.nominal).value
+        return quasi_static_twists(self._friction, self._friction.nominal, batch.wheels, batch.cg)
 
     @property
     def has_dropouts(self) -> bool:
@@ -237,16 +250,13 @@ class DrivePredictor:
     def discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         """(M, 6) measured minus predicted, as `CHANNELS`: motion in the predicted end's frame; NaN where nothing was measured.
 
-        What holds in a part of the drive changes the windows in it, and one that it shares by its share.
+        What holds in a part of the drive changes the windows in it, and one that it shares by its share (`shares`).
         """
         if not hypothesis.spells:
-            return self._discrepancies(hypothesis)
+            return self._discrepancies(hypothesis).copy()
         lasting = dataclasses.replace(hypothesis, spells={})
         rows = self._discrepancies(lasting)
-        changes = (
-            spell.share(*self.window_times_s)[:, None] * (self._discrepancies(lasting + more) - rows)
-            for spell, more in hypothesis.spells.items()
-        )
+        changes = (self.shares(spell)[:, None] * (self._discrepancies(lasting + more) - rows) for spell, more in hypothesis.spells.items())
         return np.asarray(rows + sum(changes))
 
     @cached_property
@@ -257,8 +267,34 @@ class DrivePredictor:
         total = np.r_[0.0, np.cumsum(batch.dt)]
         return begins, begins + total[batch.ends] - total[batch.first[batch.owner] + batch.lead[batch.owner]]
 
+    def shares(self, spell: Spell) -> FloatArray:
+        """(M,) share of the wheels' way to every measured pose that lies in ``spell``: what moves the robot in another way acts along it,
+        and not while it stands."""
+        begins, ends = self.window_times_s
+        knots, way = self._way
+        at = np.interp(np.stack([np.clip(t, spell.start_s, spell.end_s) for t in (begins, ends)]), knots, way)
+        whole = np.interp(ends, knots, way) - np.interp(begins, knots, way)
+        return np.asarray((at[1] - at[0]) / np.maximum(whole, 1e-12))
+
+    @cached_property
+    def _way(self) -> tuple[FloatArray, FloatArray]:
+        """(n,) starts and ends of all intervals in windows [s], and (n,) the way of both wheels until then [rad]; what stands for a whole
+        window goes by time."""
+        batch = self.batch
+        inside = [slice(first + lead, last) for first, lead, last in zip(batch.first[:-1], batch.lead, self._last, strict=True)]
+        starts, dt = (np.concatenate([values[i] for i in inside]) for values in (self.times_s, batch.dt))
+        steps = dt * (_STANDING_RATE + np.concatenate([np.abs(batch.wheels[i]).sum(axis=1) for i in inside]))
+        way = np.cumsum(steps)
+        return np.column_stack([starts, starts + dt]).ravel(), np.column_stack([way - steps, way]).ravel()
+
     def _discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
-        """`discrepancies` of a hypothesis that holds in the whole drive."""
+        """(M, 6) `discrepancies` of a hypothesis that holds in the whole drive; kept, as searches and linearizations share them."""
+        key = hypothesis.key(*_STAGES)
+        if key not in self._rows:
+            self._rows[key] = self._predicted_discrepancies(hypothesis)
+        return self._rows[key]
+
+    def _predicted_discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
         hypothesis = self.baseline.hypothesis + hypothesis
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)

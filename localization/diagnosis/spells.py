@@ -1,7 +1,7 @@
 """Change points: causes that hold in a part of a drive, as a payload that is taken up on the way.
 
-A cause of signature s_i with an onset at t_0 has the signature s_i w(t_0), w the share of each window after t_0. Its size is fitted beside
-the causes of a set B, and all others within tolerance; with score u and its variance v (sizes in units of their prior),
+A cause of signature s_i with an onset at t_0 has the signature s_i w(t_0), w the share of each window's way after t_0. Its size is fitted
+beside the causes of a set B, and all others within tolerance; with score u and its variance v (sizes in units of their prior),
 
     2 log evidence gained = u^2 / (v + 1) - log(1 + v).
 
@@ -117,7 +117,7 @@ def spell_gains(
     """(bases, tried, spells) twice the log-evidence that each cause ``tried`` gains in each part of the drive, beside the causes of each of
     ``bases``; sizes beyond its bounds gain nothing."""
     problem, noise = state.problem, state.noise
-    shares = np.array([s.share(*predictor.window_times_s) for s in spells])
+    shares = np.array([predictor.shares(s) for s in spells])
     S = noise.whiten(state.signatures).reshape(-1, len(state.causes)) * problem.scale
     y, z = noise.whiten(state.linear).ravel(), noise.whiten(state.nuisances).reshape(S.shape[0], -1)
     without = without_nuisances(z)
@@ -145,7 +145,7 @@ def spell_gains(
 def heldout_lead(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...], option: _Option) -> float:
     """Twice the log-odds of the set with the cause in its part of the drive against those ``chosen`` by windows that were held out, in
     folds: p(fold | rest) = p(all) / p(rest)."""
-    share = option.spell.share(*predictor.window_times_s)
+    share = predictor.shares(option.spell)
     column = state.signatures[..., option.cause, None] * share[:, None, None]
     signatures = np.concatenate([state.signatures, column], axis=-1)
     scale = np.r_[state.problem.scale, state.problem.scale[option.cause]]

@@ -53,6 +53,15 @@ def test_trend_motions_equal_integrated_change_of_twist(predictor: DrivePredicto
         assert moved[window] == pytest.approx([c * dx + s * dy, -s * dx + c * dy, dyaw], abs=1e-4)
 
 
+def test_nominal_twist_of_a_robot_with_casters_is_that_of_its_geometry() -> None:
+    """Its wheels do not skid: it turns by all of the difference of its wheels, not by the share of a robot on four tyres."""
+    robot = load_robot("pioneer_3dx")
+    wheels, g = np.tile([2.0, 5.0], (len(_DT), 1)), robot.geometry
+    drive = [Maneuver(_DT, wheels, np.zeros((1, 3)), np.array([len(_DT)]), np.zeros(2), np.diag([0.004, 0.004, 0.003]) ** 2)]
+    found = make_predictor(drive_of_table("arc", robot, drive, "windows"), make_model("diff_drive", robot)).nominal_twist
+    assert found[0] == pytest.approx([3.5 * g.wheel_radius_m, 0.0, 3.0 * g.wheel_radius_m / g.track_width_m])
+
+
 def test_stiffness_by_power_of_speed_equals_stiffness_at_that_speed() -> None:
     """Wheels of 0.15 m/s, half the speed at which stiffnesses are given: half the stiffness."""
     model = FrictionModel.from_robot(load_robot("husky_a200"))

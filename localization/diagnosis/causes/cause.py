@@ -53,11 +53,6 @@ class Spell(NamedTuple):
     start_s: float
     end_s: float = math.inf
 
-    def share(self, begins_s: FloatArray, ends_s: FloatArray) -> FloatArray:
-        """(n,) share of each interval from ``begins_s`` to ``ends_s`` (n,) that lies in it."""
-        inside = np.minimum(ends_s, self.end_s) - np.maximum(begins_s, self.start_s)
-        return np.asarray(np.clip(inside / np.maximum(ends_s - begins_s, 1e-9), 0.0, 1.0))
-
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -278,6 +273,11 @@ class Cause:
     def _change(self) -> str:
         """The id, of a change on the way with its moment."""
         return self.id if self.at_s is None else f"{self.id}@{self.at_s:g}"
+
+    @property
+    def changes_on_the_way(self) -> bool:
+        """Whether it begins or ends within the drive."""
+        return self.spell is not None or (self.at_s is not None and not self.axis)
 
     @property
     def group(self) -> str:
