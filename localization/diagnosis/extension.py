@@ -45,6 +45,14 @@ _FEWEST_WINDOWS = 16
 """Of a drive: eight in each half, as many as a diagnosis takes."""
 _TWO_SIDED_95 = 1.96
 _NS = 1e-9
+_NOT_WRITTEN = {
+    "time": "on another drive it begins from another state",
+    "place": "a robot file has no map",
+    "wheel angle": "the angle at the start differs from drive to drive",
+    "tilt": "models have no tilt as an input",
+    "sensor": "it does not move the robot",
+}
+"""Why a robot file does not hold an effect, by what it is bound to."""
 _CHANNEL_OF = {"vx": "x", "vy": "y", "wz": "yaw"}
 
 
@@ -142,7 +150,8 @@ def describe_effect(effect: FoundEffect) -> str:
     """A bound effect with its size, unit and what it follows, as a part of a sentence."""
     unit = "" if effect.shape.unit == "1" else f" {effect.shape.unit}"
     size = f"{effect.value:+.3g} (+- {effect.sigma:.1g}){unit}"
-    return f"{effect.shape.component} is {size} x {effect.shape.along} off, bound to a {effect.shape.kind} and not written"
+    why = f"bound to a {effect.shape.kind} and not written: {_NOT_WRITTEN[effect.shape.kind]}"
+    return f"{effect.shape.component} is {size} x {effect.shape.along} off, {why}"
 
 
 def extend(
@@ -165,7 +174,7 @@ def extend(
     whole = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))[0]
     left = _without(drive, predictor, search.removed) if search.effects else drive
     again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config, predictor.baseline)
-    return ExtendedResult(_with_extension(again, extension), extension, whole.robot)
+    return ExtendedResult(_with_extension(again, extension, found), extension, whole.robot)
 
 
 def _check(predictor: DrivePredictor, search: Search, reader: Reader | None) -> HandoverCheck | None:
@@ -234,9 +243,12 @@ class _CorrectedGyro(GyroRecord):
         return None if found is None else dataclasses.replace(found, angle=found.angle - off)
 
 
-def _with_extension(again: DiagnosisResult, extension: Extension) -> DiagnosisResult:
-    """The diagnosis of the extended model, with the terms in its sentence, and its verdict where nothing is left unexplained."""
+def _with_extension(again: DiagnosisResult, extension: Extension, before: DiagnosisResult) -> DiagnosisResult:
+    """The diagnosis of the extended model, with the terms in its sentence, its verdict where nothing is left unexplained, and pictures that
+    begin with the discrepancies of the plain model ``before``."""
     d = again.diagnosis
+    if again.residuals is not None and before.residuals is not None:
+        again = dataclasses.replace(again, residuals=dataclasses.replace(again.residuals, rows=before.residuals.rows))
     verdict = "extended" if d.verdict in ("consistent", "explained") else d.verdict
     rest = "" if d.verdict == "consistent" else f" {d.sentence}"
     rest = f" {extension.describe_effects()}{rest}" if extension.effects else rest

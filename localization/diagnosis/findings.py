@@ -239,7 +239,8 @@ class HandoverCheck:
     after: dict[str, float]
     windows: int
     gain: Interval
-    """Share by which the windows' errors shrink, each component over its root mean square before; 95 % interval over blocks of windows."""
+    """Share by which the windows' errors shrink, of the components that the file changes, over their noise; 95 % interval over blocks of
+    windows."""
     replays: Mapping[str, Replayed] = field(default_factory=dict)
     """By estimator."""
     corrected: tuple[str, ...] = ()
@@ -347,7 +348,7 @@ def evidence(cause: Cause, part: FloatArray, noise: Noise, twice_likelihood: flo
     order = np.argsort(-strength)
     places = [f"{_CHANNEL_WORDS[CHANNELS[c]]} ({100.0 * strength[c] / whole:.0f} %)" for c in order if strength[c] > 0.15 * whole]
     text = f"shows {', '.join(dict.fromkeys(places))}; log-likelihood +{twice_likelihood / 2.0:.0f}"
-    if cause.at_s is not None and not cause.axis:
+    if cause.at_s is not None and cause.changes_on_the_way:
         text += f"; from {cause.at_s:.0f} s on"
     return text
 
@@ -429,12 +430,12 @@ def unit_of(name: str) -> str:
 def correctable_findings(d: Diagnosis) -> list[Finding]:
     """Findings that a robot may be corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing
     whose size depends on one of these; where a part stays unexplained, only what by itself improves windows that it was not fitted to, and
-    nothing that begins or ends within the drive: it may be a step in the place of an unknown change."""
+    nothing that changes within the drive: it may be a step in the place of an unknown change."""
     estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
     contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
     contested |= {f.cause for f in estimated if not f.is_plausible}
     if d.verdict == "unexplained":
-        contested |= {f.cause for f in estimated if f.gain.low <= 0.0 or f.definition.spell is not None}
+        contested |= {f.cause for f in estimated if f.gain.low <= 0.0 or f.definition.changes_on_the_way}
     return [f for f in estimated if f.cause not in contested and f.is_independent_of(contested)]
 
 

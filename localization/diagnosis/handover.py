@@ -36,6 +36,8 @@ _SAME_WINDOW_S = 0.3
 """Windows of two readings of a log that begin so close are one: clocks that are corrected move them by less."""
 _MIN_HALF_WINDOWS = 8
 _BLOCK = 2  # neighbouring windows share their errors: a scan between them, and the floor
+_LEAST_CHANGE = 1e-3
+"""Change of a component over its noise, in the window where it is largest, below which a file does not change it: rounding."""
 _SENSOR_FIELDS = (
     *("wheel_time_offset_s", "gyro_time_offset_s", "gyro_scale", "lidar_offset", "lidar_time_offset_s", "range_scale"),
     "range_bias_m",
@@ -112,17 +114,17 @@ def check_written(predictor: DrivePredictor, noise: Noise, candidate: Candidate,
         written = dataclasses.replace(candidate.corrected, robot=load_robot(path))
         candidate = dataclasses.replace(candidate, corrected=written)
         if reader is None:
-            return _check_predicted(predictor, candidate)
+            return _check_predicted(predictor, noise, candidate)
         return _check_replayed(predictor, noise, candidate, reader)
 
 
-def _check_predicted(predictor: DrivePredictor, candidate: Candidate) -> HandoverCheck | None:
+def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: Candidate) -> HandoverCheck | None:
     """Windows held out, as the file predicts them."""
     drive, hypothesis = predictor.drive, with_sizes(candidate.sizes)
     after = predictor_after(predictor, candidate.corrected, predictor.model.name)
     held = candidate.held[predictor.batch.owner]
     rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
-    found = _compared_rows(rows[0][held], rows[1][held])
+    found = _compared_rows(rows[0][held], rows[1][held], noise.sigmas[held])
     if found is None or drive.kind == "log":
         return found
     weight = np.array([1.0, 1.0, 0.5 * drive.robot.geometry.track_width_m])
@@ -140,7 +142,7 @@ def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidat
     after = DrivePredictor(drive, make_model(name, new), has_inertia=predictor.has_inertia, baseline=predictor.baseline)
     of_marker = _of_reference(with_sizes(candidate.sizes), drive.is_lidar_reference)
     first, second = _paired(predictor.drive, drive, candidate.held)
-    found = _compared_rows(predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second])
+    found = _compared_rows(predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second], noise.sigmas[first])
     if found is None or not drive.has_headings:  # chords between positions are no poses to compare with
         return found
     start_ns = int(predictor.drive.spans_ns[candidate.held, 0].min()) - _LEAD_NS
@@ -168,15 +170,21 @@ def _first_half_sizes(predictor: DrivePredictor, linearization: Linearization, n
     return dict(zip(causes, (float(v) for v in sizes), strict=True))
 
 
-def _compared_rows(before: FloatArray, after: FloatArray) -> HandoverCheck | None:
-    """Discrepancies ``before`` and ``after`` (M, 6) of windows that were held out; None where nothing was measured in both."""
+def _compared_rows(before: FloatArray, after: FloatArray, sigmas: FloatArray) -> HandoverCheck | None:
+    """Discrepancies ``before`` and ``after`` (M, 6) of windows that were held out; None where nothing was measured in both.
+
+    The gain is the share by which errors over their noise ``sigmas`` (M, 6) shrink in the components that the file changes: the scatter of
+    the others, and of a component that is measured less well, would hide it.
+    """
     shown = [c for c in range(4) if all(np.isfinite(r[:, c]).any() for r in (before, after))]
     if not shown:
         return None
     before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[:, c] ** 2))) for c in shown} for r in (before, after))
-    scale = np.array([max(before_rms[CHANNELS[c]], 1e-12) * math.sqrt(len(shown)) for c in shown])
-    squares = [np.sum(np.nan_to_num(r[:, shown] / scale) ** 2, axis=1) for r in (before, after)]
-    gain = root_mean_gain(squares[0], squares[1], np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
+    moved = np.nan_to_num(np.abs(after - before) / sigmas)
+    changed = [c for c in shown if moved[:, c].max() > _LEAST_CHANGE] or shown
+    squares = [np.sum(np.nan_to_num(r[:, changed] / sigmas[:, changed]) ** 2, axis=1) for r in (before, after)]
+    first, second = (s / max(float(squares[0].mean()), 1e-12) for s in squares)
+    gain = root_mean_gain(first, second, np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
     return HandoverCheck(before_rms, after_rms, len(before), gain)
 
 

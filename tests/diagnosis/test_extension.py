@@ -96,7 +96,7 @@ def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> N
     assert extension.check.replays["odometry"].after_m < extension.check.replays["odometry"].before_m
 
 
-@pytest.mark.parametrize("drawn", [pytest.param(range(12), marks=pytest.mark.extended), pytest.param(range(40), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("drawn", [pytest.param(range(8), marks=pytest.mark.extended), pytest.param(range(40), marks=pytest.mark.slow)])
 def test_find_terms_sigmas_are_those_of_their_errors(drawn: range) -> None:
     """The root mean square of errors over sigmas is within the 99 % interval of chi squared; the selection of terms among candidates is
     part of it."""

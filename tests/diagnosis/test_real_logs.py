@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,7 @@ def test_diagnose_68_rotations_names_tracked_point_and_warp(of_rotations: Diagno
     assert of_rotations.gain.low > 0.7
 
 
+@functools.cache
 def runs(contact: str) -> Diagnosis:
     """Of Table 5-2, by the friction model with nothing fitted."""
     robot = dataclasses.replace(load_robot("vaultbot"), options={"friction": {"contact": contact}})
