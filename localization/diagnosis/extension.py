@@ -260,7 +260,7 @@ def _robot_by(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]
     """The robot with terms and kept causes as the windows ``used`` (M,) alone have them, and the sizes of these causes."""
     by_index, terms = sizes_on(predictor, search, used)
     causes, old, name = search.state.causes, predictor.drive.robot.terms, predictor.model.name
-    sizes = {causes[i]: size for i, size in by_index.items() if abs(size) <= causes[i].largest_plausible}
+    sizes = {causes[i]: size for i, size in by_index.items()}
     corrected = correct_robot(predictor, sizes)
     robot = dataclasses.replace(corrected.robot, terms={**old, name: merge_terms(old.get(name, ()), terms)})
     return dataclasses.replace(corrected, robot=robot), sizes

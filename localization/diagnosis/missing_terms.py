@@ -37,7 +37,10 @@ from motion_models.terms import COMPONENTS, Expression, Term, parse_expression
 _POWERS = ("", "{0}", "abs({0})", "{0}^2", "{0}*abs({0})", "sign({0})", "{0}^3")
 """Shapes of one variable: even and odd, to the third power, as slip grows."""
 _OF_CAUSES = frozenset({("vx", "v"), ("vx", "wz"), ("vy", "v"), ("vy", "wz"), ("wz", "v"), ("wz", "wz")})
-"""Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference."""
+"""Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference. A term has them only where such a
+cause would be larger than robots have it."""
+_OF_CAUSES_PRICE = 7.0
+"""Of a term with the shape of a cause, in twice the log-odds: 33 robots have the cause for one that turns so without."""
 _MORE = {
     "vx": ("dv", "abs(dv)", "sign(v)*abs(dv)", "v*abs(dv)", "v*t", "abs(v)*t", "dv*abs(v)"),
     "vy": ("dwz", "v*dwz", "wz*dv", "wz*t", "v*wz*t", "v*dv"),
@@ -56,6 +59,10 @@ _ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
 _COMPLEXITY_PRICE = 1.5
 """Of each factor beyond the first, in twice the log-odds: of two shapes that fit alike the simpler is taken."""
 _ROUNDS, _STEPS = 4, 12
+_SIZE_SHARE = 0.75
+"""Largest size of a cause in the search, over the largest that robots have: by full predictions, and by half of a drive, it differs."""
+_TRIED = 6
+"""Columns that are tried in one place, until one has a size that robots have."""
 _MOST = 4
 """Most terms of one extension."""
 _HALVES = 40
@@ -126,10 +133,10 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
     found: dict[tuple[str, Expression], None] = {}
     for component in COMPONENTS:
         for text in (*texts, *_MORE[component], *(_OF_CG[component] if has_cg else ())):
-            if (component, text) not in _OF_CAUSES:
-                found.setdefault((component, parse_expression(text)))
+            found.setdefault((component, parse_expression(text)))
     base = 2.0 * math.log(len(found) + others) + math.log(max(count, 2))
-    return tuple(Candidate(c, e, base + _complexity(Term(c, e, 0.0))) for c, e in found)
+    more = {(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
+    return tuple(Candidate(c, e, base + _complexity(Term(c, e, 0.0)) + more.get((c, e), 0.0)) for c, e in found)
 
 
 def _complexity(term: Term) -> float:
@@ -195,11 +202,23 @@ class _Regression:
         return np.asarray(np.where(is_usable, score**2 / np.maximum(left, 1e-9), 0.0))
 
 
-def _best_set(problem: _Regression, prices: FloatArray, start: tuple[int, ...], most: int) -> tuple[float, tuple[int, ...]]:
-    """Set of columns of least cost (prices less gains), by adding, dropping and exchanging one at a time from ``start``."""
+def _best_set(
+    problem: _Regression, prices: FloatArray, limits: FloatArray, start: tuple[int, ...], most: int
+) -> tuple[float, tuple[int, ...]]:
+    """Set of columns of least cost (prices less gains), by adding, dropping and exchanging one at a time from ``start``; none with a
+    coefficient beyond its ``limits`` (K, 2)."""
 
     def cost(chosen: tuple[int, ...]) -> float:
-        return float(prices[list(chosen)].sum()) - problem.gain(chosen)
+        i = list(chosen)
+        sizes = problem.fit(chosen)[0] if chosen else np.zeros(0)
+        is_possible = bool(np.all((limits[i, 0] <= sizes) & (sizes <= limits[i, 1])))
+        return float(prices[i].sum()) - problem.gain(chosen) if is_possible else math.inf
+
+    def with_one_more(rest: tuple[int, ...], left: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
+        gains = problem.gains_beside(rest) - prices
+        gains[[*rest, *left]] = -math.inf
+        tried = ((cost((*rest, int(i))), (*rest, int(i))) for i in np.argsort(-gains)[:_TRIED])
+        return next((one for one in tried if one[0] < math.inf), (math.inf, rest))
 
     current, least = start, cost(start)
     for _ in range(_STEPS):
@@ -209,10 +228,7 @@ def _best_set(problem: _Regression, prices: FloatArray, start: tuple[int, ...], 
             if left:
                 tried.append((cost(rest), rest))
             if len(rest) < most:
-                gains = problem.gains_beside(rest) - prices
-                gains[[*rest, *left]] = -math.inf
-                best = int(np.argmax(gains))
-                tried.append((cost((*rest, best)), (*rest, best)))
+                tried.append(with_one_more(rest, left))
         better, chosen = min(tried)
         if better >= least - 1e-6:
             break
@@ -253,11 +269,13 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     own = 2.0 * math.log(len({cause.group for cause in state.causes})) + math.log(max(state.problem.count, 2))
     least = min(c.price for c in candidates)
     prices = np.array([*(own for _ in state.causes), *(c.price for c in candidates), *(least + s.price for s in shapes)])
+    limits = np.full((len(prices), 2), (-math.inf, math.inf))
+    limits[:f] = _size_limits(state)
     noise, chosen, previous = state.noise, named, None
     for _ in range(_ROUNDS):
         problem = design.problem(noise)
         starts = sorted({chosen, named, ()})
-        _, chosen = min(_best_set(problem, prices, start, len(named) + _MOST) for start in starts)
+        _, chosen = min(_best_set(problem, prices, limits, start, len(named) + _MOST) for start in starts)
         terms = tuple(sorted(i for i in chosen if i >= f))
         if terms == previous:
             break
@@ -265,6 +283,13 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
         noise = _noise_without(predictor, state, design.columns[..., list(terms)])
     chosen, stability = _supported(design, noise, chosen, f, rng)
     return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)
+
+
+def _size_limits(state: Linearization) -> FloatArray:
+    """(p, 2) sizes of causes that the search considers: others take the place of a term, and no robot file may hold them."""
+    bounds = np.array([cause.bounds for cause in state.causes])
+    most = _SIZE_SHARE * np.array([cause.largest_plausible for cause in state.causes])[:, None]
+    return np.asarray(np.clip(bounds, -most, most))
 
 
 def _supported(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.diagnosis.diagnose import diagnose
+from localization.diagnosis.diagnose import diagnose, examine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.findings import confirmed_findings
+from localization.diagnosis.extension import extend
+from localization.diagnosis.findings import Diagnosis, confirmed_findings
 from localization.logs import open_log
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
@@ -48,17 +49,36 @@ def test_diagnose_puncture_is_two_causes_from_one_moment(nominal: Drive) -> None
     assert set(by) == {"wheel_radius_difference", "wheel_radius_scale"}
     for cause, size in (("wheel_radius_difference", _PUNCTURE_SHARE), ("wheel_radius_scale", 0.5 * _PUNCTURE_SHARE)):
         assert by[cause].size == pytest.approx(size, abs=2.5 * by[cause].sigma)
-        assert by[cause].definition.spell_95 is not None
-        low, high = by[cause].definition.spell_95[0]
+        spell_95 = by[cause].definition.spell_95
+        assert spell_95 is not None
+        low, high = spell_95[0]
         assert low <= float(nominal.starts_s[np.searchsorted(nominal.starts_s, 0.5 * nominal.starts_s[-1], side="right")]) <= high
     assert found.sentence.startswith("Correct wheel_radius_difference from t = 30 s")
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("name", ["rates saturate", "slip in left turns only"])
-def test_diagnose_effect_outside_catalogue_is_unexplained(nominal: Drive, name: str) -> None:
-    """By a limit, and of motion in one direction; the others are in `tests.studies.unknown_effects`."""
-    found = diagnose(UNKNOWN[name](nominal), make_model("friction", nominal.robot))
+def test_diagnose_rates_that_saturate_are_unexplained(nominal: Drive) -> None:
+    """Further effects outside of the catalogue are in `tests.studies.unknown_effects`."""
+    assert_unexplained(diagnose(UNKNOWN["rates saturate"](nominal), make_model("friction", nominal.robot)))
+
+
+@pytest.mark.extended
+def test_extend_slip_in_left_turns_is_friction_and_a_term(nominal: Drive) -> None:
+    """A part that both sides have is friction, within what robots have, and one that they have with opposite signs a term."""
+    drive, model = UNKNOWN["slip in left turns only"](nominal), make_model("friction", nominal.robot)
+    found = examine(drive, model)
+    assert_unexplained(found.diagnosis)
+    extended = extend(found, drive, model)
+    assert extended.robot is not None
+    assert [term.name for term in extended.robot.terms["friction"]] == ["wz[abs(wz)]"]
+    assert extended.robot.geometry == nominal.robot.geometry
+    assert extended.extension is not None
+    assert extended.extension.check is not None
+    assert extended.extension.check.after["yaw"] < 0.15 * extended.extension.check.before["yaw"]
+
+
+def assert_unexplained(found: Diagnosis) -> None:
+    """It is said that something has no name, and no change on the way is ordered in its place."""
     assert found.verdict == "unexplained"
     is_implausible = any(not f.is_plausible for f in found.findings)
     assert is_implausible or any(row.status == "unexplained" for row in found.discrepancy.values())
