@@ -24,6 +24,7 @@ from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise
 from motion_models.robot_file import load_robot
 from motion_models.se2 import between, log
+from tests.helpers.extended import cases
 from tests.helpers.motion_models import assert_one_agrees, differences, some_drive, some_params
 from tests.helpers.synthetic_steps import (
     DT,
@@ -248,7 +249,7 @@ def test_corrections_with_unexplained_lidar_finish_the_run():
 # --- every model, every form
 
 
-@pytest.mark.parametrize("form", ["constant", "cg_field"])
+@pytest.mark.parametrize("form", cases(["constant", "cg_field"], ("cg_field",)))
 @pytest.mark.parametrize("name", MODELS)
 def test_corrections_of_every_model_and_form_reduce_error(name, form):
     """What a drive both ways shows is known better than at first, and is where the truth is."""

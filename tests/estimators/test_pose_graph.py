@@ -82,7 +82,7 @@ def assert_jacobians_are_numeric(factor: gtsam.CustomFactor, values: gtsam.Value
 # --- Jacobians
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_wheel_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wheels = PreintegratedMotion(rng.normal(size=3), np.eye(3), rng.normal(size=(3, 2)), 0.1 * rng.normal(size=2))
@@ -94,7 +94,7 @@ def test_wheel_factor_has_numeric_jacobians(seed: int) -> None:
     assert_jacobians_are_numeric(factor, values)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_position_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     enu_T_map, pose, offset, lever = 5.0 * rng.normal(size=3), 5.0 * rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
