@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,6 +30,8 @@ _MOST_MEANS = 300
 _LOST_AFTER_S = 1.0
 """A time without a matched scan that is shown as lost [s]: ten scans of a usual LiDAR."""
 _MILLIMETRES, _TENTHS = 3, 1
+_FAULT = re.compile(r"^at t = ([.0-9]+) s: (.*)", re.MULTILINE)
+"""Time and text of a warning of the sensor checks."""
 
 
 Scans = Sequence[tuple[int, FloatArray]]
@@ -76,7 +79,7 @@ def _borders(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations |
 
 
 def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None) -> dict[str, Any]:
-    """One run: path with sigma, errors, innovations, loops, and times without a matched scan."""
+    """One run: path with sigma, errors, innovations, loops, times without a matched scan, and when sensor faults began."""
     trajectory = run.result.run.trajectory
     t = np.asarray((trajectory.stamps_ns - start_ns) * 1e-9, dtype=np.float64)
     poses = run.placed(trajectory.poses)
@@ -98,6 +101,7 @@ def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None
         "nis": _innovations(run, t),
         "loops": _loops(run),
         "lost": _lost(run, t),
+        "faults": [[float(at), text] for at, text in _FAULT.findall("\n".join(run.result.run.warnings))],
         "parameters": {name: _history(rows, start_ns) for name, rows in run.result.run.parameter_history.items()},
     }
 

@@ -117,5 +117,6 @@ def _drive(mapped: KeyframeMap, number: int, ids: IntArray) -> dict[str, Any]:
         "nis": None,
         "loops": [numbers([*mapped.poses[a, :2], *mapped.poses[b, :2], seconds[max(a, b) - ids[0]]], 2) for a, b in own],
         "lost": [],
+        "faults": [],
         "parameters": {},
     }

@@ -11,6 +11,7 @@ import pytest
 from localization.evaluation.references import ReferenceTrack
 from localization.evaluation.scores import score
 from localization.log_replay import Run
+from localization.maps.keyframe_map import KeyframeMap
 from localization.report.interactive import explorer_data
 from localization.report.replay_page import ReportHead, page
 from localization.report.runs import plotted_runs
@@ -35,7 +36,23 @@ change("axis", "way", "change"); found.way = box("time").layout.xaxis.title.text
 found.bands = box("time").layout.shapes.filter(s => s.type === "rect").length;
 found.isStaticHidden = getComputedStyle(document.querySelector("section.static")).display === "none";
 change("aligned", "start", "change"); found.atStart = Math.max(...box("time").data[0].y);
+found.events = [...box("event").options].map(o => o.text).slice(1);
+change("event", 12.3, "change"); found.jumped = box("now").textContent;
+const width = () => {const [low, high] = box("map").layout.xaxis.range; return high - low;};
+found.widths = [width()]; box("map").querySelector('[data-title="Zoom in"]').dispatchEvent(new Event("click")); found.widths.push(width());
+change("slider", 30, "input"); change("axis", "time", "change"); found.widths.push(width());
+const path = box("map").data.findIndex(t => t.name.startsWith("ekf"));
+Plotly.Fx.hover(box("map"), [{curveNumber: path, pointNumber: 100}]); found.hover = box("map").querySelector(".hoverlayer").textContent;
+found.loops = box("map").data.filter(t => t.name.startsWith("1 loops")).map(t => t.x);
+found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;
 """
+
+
+def one_loop():
+    """Three keyframes, of which the last closes a loop with the first."""
+    edges, information = np.array([[0, 1], [0, 2]]), np.tile(np.eye(3), (2, 1, 1))
+    points = np.zeros((0, 2), np.float32), np.zeros(3, np.int64), np.zeros((3, 2))
+    return KeyframeMap(STAMPS[::200], POSES[::200], information[[0, 0, 0]], *points, edges, np.zeros((2, 3)), information, edges[:, 1] == 2)
 
 
 def results():
@@ -62,6 +79,8 @@ def results():
         nis=nis,
         map_points=np.ones((9, 2)),
         parameter_history={"k_0": np.array([[0.0, 0.5, 0.1], [40.0, 0.55, 0.01]])},
+        warnings=("at t = 12.3 s: the gyro's rates stand still.", "another problem."),
+        keyframes=one_loop(),
     )
     reference = ReferenceTrack(STAMPS[::4], POSES[::4, :2], POSES[::4, 2])
     return score([plain, fused], reference), reference
@@ -98,7 +117,7 @@ def test_explorer_run_that_diverged_does_not_set_the_scale():
 
 def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     found, reference = results()
-    seen = run_in_page(page(HEAD, found, reference), PROBE, tmp_path)
+    seen = run_in_page(page(HEAD, found, reference), PROBE, tmp_path, "--window-size=390,900")
     assert seen["at20"][1] == pytest.approx(10.0, abs=0.1)
     assert (seen["text"], seen["log"], seen["way"]) == ("20.0 s", "log", "way [m]")
     assert {"position error [m]", "heading error [deg]", "position sigma [m]", "NIS (3 expected)", "k_0 ± sigma"} == set(seen["titles"])
@@ -107,4 +126,15 @@ def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     assert seen["isStaticHidden"]
     assert seen["bands"] == 1
     assert seen["atStart"] == pytest.approx(2.0, abs=0.01)
+    assert seen["events"] == [
+        "9.9 s: no scan matched for 10.1 s, ekf · diff_drive",
+        "12.3 s: fault: the gyro's rates stand still.",
+        "40.0 s: loop closed, ekf · diff_drive",
+    ]
+    assert seen["jumped"] == "12.3 s"
+    assert np.array(seen["widths"]) / seen["widths"][0] == pytest.approx([1.0, 0.5, 0.5])  # kept while slider and lists are used
+    assert "10.0 s" in seen["hover"]
+    assert "sigma 0.141 m" in seen["hover"]
+    assert seen["loops"] == [[0.0, 20.0, None]]
+    assert seen["overflow"] <= 0
     assert seen["errors"] == []

@@ -91,7 +91,9 @@
       return {type: "rect", xref: "x", yref: "paper", x0: at(from), x1: at(to), y0: 0, y1: 1, line: {width: 0},
               fillcolor: colour(run.colour), opacity: .18, layer: "below"};
     }));
-    return [...bands, {type: "line", xref: "x", yref: "paper", x0: line, x1: line, y0: 0, y1: 1, line: {color: colour("accent"), width: 1.5}}];
+    const faults = runs.flatMap(run => run.faults.map(([t]) => isWay() ? run.way[before(run.t, t)] : t)).map(t => ({type: "line", xref: "x",
+      yref: "paper", x0: t, x1: t, y0: 0, y1: 1, line: {color: colour("red"), width: 1, dash: "dot"}, layer: "below"}));
+    return [...bands, ...faults, {type: "line", xref: "x", yref: "paper", x0: line, x1: line, y0: 0, y1: 1, line: {color: colour("accent"), width: 1.5}}];
   };
 
   const show = t => {
@@ -109,21 +111,28 @@
     Plotly.relayout(box("time"), {shapes: shapes()});
     box("now").textContent = now.toFixed(1) + " s";
   };
-  const draw = () => {
-    const traces = mapTraces(), isNarrow = box("map").clientWidth < 500;
-    const size = isNarrow ? box("map").clientWidth * .9 + 13 * traces.length : Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
-    Plotly.react(box("map"), traces, layout({height: size, dragmode: "pan", uirevision: "map", images: picture(), xaxis: axis("x [m]", {range: data.borders.x}),
-      yaxis: axis("y [m]", {range: data.borders.y, scaleanchor: "x", scaleratio: 1})}), config);
+  // Part of the map that is shown: what was zoomed to stays.
+  const part = name => box("map").layout ? [...box("map").layout[name + "axis"].range] : data.borders[name];
+  const isNarrow = () => box("map").clientWidth < 500;
+  const drawMap = () => {
+    const traces = mapTraces();
+    const size = isNarrow() ? box("map").clientWidth * .9 + 13 * traces.length : Math.min(Math.max(box("map").clientWidth * .62, 300), 620);
+    Plotly.react(box("map"), traces, layout({height: size, dragmode: "pan", images: picture(), xaxis: axis("x [m]", {range: part("x")}),
+      yaxis: axis("y [m]", {range: part("y"), scaleanchor: "x", scaleratio: 1})}), config);
+  };
+  const drawTime = () => {
     const [curves, more] = timeFigure();
-    Plotly.react(box("time"), curves, {...more, showlegend: !isNarrow}, {...config, scrollZoom: false});
+    Plotly.react(box("time"), curves, {...more, showlegend: !isNarrow()}, {...config, scrollZoom: false});
     show(now);
   };
+  const draw = () => { drawMap(); drawTime(); };
 
   for (const name of ["a", "b"]) {
     box(name).add(new Option("–", "-1"));
     runs.forEach((run, i) => box(name).add(new Option(run.label, i)));
   }
-  const events = [...runs.flatMap(run => run.lost.map(l => [l[0], "no scan matched for " + (l[1] - l[0]).toFixed(1) + " s, " + run.label])),
+  const faults = new Map(runs.flatMap(run => run.faults.map(([t, text]) => [text, [t, "fault: " + text]])));  // of several runs once
+  const events = [...faults.values(), ...runs.flatMap(run => run.lost.map(l => [l[0], "no scan matched for " + (l[1] - l[0]).toFixed(1) + " s, " + run.label])),
                   ...runs.flatMap(run => run.loops.map(l => [l[4], "loop closed, " + run.label]))].sort((p, q) => p[0] - q[0]);
   events.forEach(([t, text]) => box("event").add(new Option(t.toFixed(1) + " s: " + text, t)));
   const names = [...new Set(runs.flatMap(run => Object.keys(run.parameters)))];
@@ -136,7 +145,7 @@
   draw();
   box("slider").addEventListener("input", event => show(+event.target.value));
   box("event").addEventListener("change", event => event.target.value && show(+event.target.value));
-  ["axis", "aligned", "a", "b", "parameter"].forEach(name => box(name).addEventListener("change", draw));
+  ["axis", "aligned", "a", "b", "parameter"].forEach(name => box(name).addEventListener("change", drawTime));
   box("time").on("plotly_click", event => {
     const x = event.points[0].x;
     show(isWay() ? runs[0].t[before(runs[0].way, x)] : x);
