@@ -1,27 +1,32 @@
 """The estimator live: how long after a scan its estimate is out, what part of a core it takes, and whether its memory stays flat.
 
-python -m tests.benchmarks.online [steps | latency | start | quarter | soak [HOURS [BEAMS]]]
+python -m tests.benchmarks.online [steps | latency | start | quarter | dashboard | soak [HOURS [BEAMS]]]
 
 `quarter` confines the node to a quarter of a core by a cgroup (as root), as a computer of the Raspberry Pi's class would.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
+from unittest import mock
 
 import numpy as np
 
-from localization.logs import open_log
+from localization.events import Event
+from localization.logs import Log, open_log
 from localization.pipeline import Pipeline, ReplayConfig, Trial
+from localization.ros import dashboard as dashboard_module
+from localization.ros.dashboard import Dashboard
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.settings import LiveRun
 from localization.simulation.experiments import ExperimentConfig
@@ -35,6 +40,8 @@ from tests.benchmarks.online_soak import soak
 from tests.studies.buildings import BUILDINGS
 
 BEAMS = 760
+_DASHBOARD_S = 40.0
+_READER = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1]).read()"
 _SETTLED_S = 3.0
 """What is heard at the start, before the first estimate, comes all at once."""
 
@@ -67,6 +74,8 @@ def in_process(path: Path, robot_name: str, estimator: str, model: str = "skid_s
 
 _FIRST_START = """
 from localization.pipeline import Trial
+from localization.ros import dashboard as dashboard_module
+from localization.ros.dashboard import Dashboard
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.settings import LiveRun
 from motion_models.registry import make_model
@@ -252,6 +261,39 @@ def latency() -> None:
         print("wanted: p99 <= 5 ms, less than 0.10 of a core\n")
 
 
+def dashboard() -> None:
+    """CPU of the whole process, with its server's threads and a page that is open, over that of the estimator's steps alone; the page is
+    sent by the robot's time, as live."""
+    with tempfile.TemporaryDirectory() as name:
+        log = open_log(write_laps(Path(name) / "laps.mcap"), load_robot("vaultbot"))
+        events = list(itertools.takewhile(lambda event: event.stamp_ns < log.start_ns + _DASHBOARD_S * 1e9, log.events()))
+        run_steps(log, events[: len(events) // 4], None)  # compiles
+        page = Dashboard()
+        reader = subprocess.Popen([sys.executable, "-c", _READER, page.address + "events"])
+        seconds = {shown: run_steps(log, events, view) for view, shown in ((None, "alone"), (page, "with a page"), (None, "alone again"))}
+        reader.wait(timeout=60)
+        plain = 0.5 * (seconds["alone"] + seconds["alone again"])
+        print(", ".join(f"{name}: {value:.2f} s" for name, value in seconds.items()), f"of CPU for {_DASHBOARD_S:.0f} s of driving")
+        print(f"the page takes {100 * (seconds['with a page'] / plain - 1):.1f} % of the estimator's time\n")
+
+
+def run_steps(log: Log, events: Sequence[Event], view: Dashboard | None) -> float:
+    """CPU time of the process [s] for ``events``."""
+    pipeline = Pipeline(Trial(make_model("skid_steer", log.robot), "ekf"), log.robot, log.mounts, True, ReplayConfig())
+    if view is not None:
+        view.begin(log.robot, log.mounts)
+    begin = time.process_time()
+    for event in events:
+        estimates = pipeline.process(event)
+        if view is not None:
+            with mock.patch.object(dashboard_module.time, "monotonic", lambda now=event.stamp_ns * 1e-9: now):
+                view.show(event, estimates, pipeline)
+    if view is not None:
+        view.show(None, [], pipeline)
+        view.close()
+    return time.process_time() - begin
+
+
 def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
     if part in ("all", "steps"):
         steps()
@@ -261,6 +303,8 @@ def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
         start()
     if part in ("all", "quarter"):
         quarter()
+    if part in ("all", "dashboard"):
+        dashboard()
     if part in ("all", "soak"):
         soak(float(hours), int(beams))
 

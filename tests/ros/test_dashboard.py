@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import threading
-import time
 import urllib.error
 import urllib.request
 
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 
 from localization.cli import main
-from localization.events import Scan
 from localization.ros import dashboard as module
 from localization.ros.dashboard import Dashboard, Feed, History
 from tests.helpers.browser import CHROMIUM, OPTIONS
@@ -83,25 +80,6 @@ def test_dashboard_serves_this_machine_alone(served):
         asked = urllib.request.Request(dashboard.address + path, headers={} if host is None else {"Host": host})
         with pytest.raises(urllib.error.HTTPError):
             urllib.request.urlopen(asked, timeout=5.0)
-
-
-def test_dashboard_costs_the_estimator_little(monkeypatch):
-    """With a page that is open: time in `show` over that of the estimator's steps; 1 % was measured."""
-    events, mounts = drive_events()
-    dashboard, pipeline = Dashboard(), new_core("ekf")
-    threading.Thread(target=lambda: read_events(dashboard.address), daemon=True).start()
-    dashboard.begin(ROBOT, mounts)
-    steps = shown = 0.0
-    for event in events[: len(events) // 4]:
-        begin = time.thread_time()
-        estimates = pipeline.process(event)
-        middle = time.thread_time()
-        dashboard.show(event, estimates, pipeline)
-        steps, shown = steps + middle - begin, shown + time.thread_time() - middle
-    dashboard.show(None, [], pipeline)
-    dashboard.close()
-    assert any(isinstance(event, Scan) for event in events)
-    assert shown < 0.1 * steps
 
 
 def test_history_of_ten_hours_has_bounded_rows():
