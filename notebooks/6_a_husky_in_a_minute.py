@@ -15,21 +15,40 @@
 # every two seconds of them. `skidloc calibrate` does with any log what this notebook does step by step.
 
 # %%
-import sys
+from dataclasses import replace
 
 import numpy as np
 
 from localization.calibration.calibrate import Cut, calibrated, turning
 from localization.calibration.windows import driven
 from localization.report.notebook import Bars, Panel, Series, picture, table
-from motion_models import make_model, root_mean
+from motion_models import make_model, root_mean, se2
+from motion_models.calibration.cross_validation import cross_validate, learning_curve
+from motion_models.calibration.fit import FitConfig, fit
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.robot import Driver, Geometry, Robot, WheelNoise
 
-sys.path.insert(0, "..")
-from tests.studies import drive_husky
-from tests.studies.real_husky import BEST, FROM_THE_BOX, Unfitted, learning_curve, rows, score
+WINDOW_S = 0.05 * np.ones(39)
+SCATTER = np.diag([0.02, 0.02, 0.01]) ** 2  # of scan matching, from one sample to the next
 
-robot = drive_husky.robot()
-maneuvers = drive_husky.maneuvers(mended=True)
+
+def read_windows(path):
+    """Maneuvers of two seconds, three in each step. The file's positions are in the mean heading of the first five samples, its headings
+    in that of the first: the positions are turned back."""
+    with np.load(path) as data:
+        x, y, yaw = (data[f"icp_{name}"][:, 39] for name in ("x", "y", "yaw"))
+        frame = np.column_stack([np.zeros((len(x), 2)), data["icp_yaw"][:, :5].mean(axis=1)])
+        poses = se2.compose(frame, np.column_stack([x, y, yaw]))
+        poses[:, 2] = se2.wrap_angle(yaw)
+        rates = np.stack([data["left_wheel_vel"], data["right_wheel_vel"]], axis=-1)[:, :39]
+    ends = np.array([39])
+    return [Maneuver(WINDOW_S, rates[i], poses[i : i + 1], ends, cov=SCATTER, group=f"step {i // 3}") for i in range(len(poses))]
+
+
+# wheel radius by the data set, the rest by the Husky's URDF
+geometry = Geometry(wheel_radius_m=0.165, track_width_m=0.5708, wheelbase_m=0.512, mass_kg=46.034)
+robot = Robot("drive_husky", geometry, Driver(geometry.wheel_radius_m, geometry.track_width_m, 1.0))
+maneuvers = read_windows("../tests/data/drive-husky/husky_windows.npz")
 steps = list(dict.fromkeys(m.group for m in maneuvers))
 seconds, metres, radians = driven(maneuvers, robot.geometry.wheel_radius_m, robot.geometry.track_width_m)
 f"{len(maneuvers)} windows of {len(steps)} steps: {seconds:.0f} s, {metres:.0f} m by the wheels"
@@ -69,10 +88,31 @@ table(
 # Errors of position after two seconds, in windows that were not fitted.
 
 # %%
+ALIKE = WheelNoise(**dict.fromkeys(vars(WheelNoise()), 0.0))  # windows are equally long: each counts alike
+SYMMETRIC = {"vx_right": ("vx_left", 1.0), "vy_right": ("vy_left", -1.0), "wz_right": ("wz_left", -1.0)}
+
+
+def fitted(name, names, ties=None, start=None, prior=None):
+    """Plain least squares of the parameters ``names`` of a model, as a function of maneuvers."""
+    model = make_model(name, robot)
+    first = model.nominal.copy()
+    for parameter, value in (start or {}).items():
+        first[model.param_names.index(parameter)] = value
+    config = FitConfig("linear", noise=ALIKE, ties=ties or {}, prior_sigma=prior or {}, strict=False)
+    return lambda maneuvers: fit(model, maneuvers, names, config, first)
+
+
+def as_given(multiplier):
+    """diff_drive with a multiplier of the track, not fitted."""
+    other = replace(robot, driver=replace(robot.driver, wheel_separation_multiplier=multiplier))
+    train, given = fitted("diff_drive", ("wheel_radius",)), make_model("diff_drive", other).nominal
+    return lambda maneuvers: replace(train(maneuvers), params=given)
+
+
 rest = [m for m in maneuvers if m.group not in steps[:8]]
 measured = np.array([m.measured[0] for m in rest])
 off = found.fit.residuals(rest)
-raw = Unfitted(rows()[0]).residuals(rest)
+raw = as_given(1.0)(rest).residuals(rest)
 error, before = (np.hypot(*e[:, :2].T) for e in (off, raw))
 order = np.linspace(0.0, 1.0, len(rest))
 
@@ -117,7 +157,13 @@ picture(
 # %%
 DRAWS = 20
 counts = (1, 2, 3, 4, 8, 16, 96)
-curves = {"free": learning_curve(BEST, maneuvers, counts, DRAWS), "with a prior": learning_curve(FROM_THE_BOX, maneuvers, counts, DRAWS)}
+turn = robot.driver.wheel_radius_m / (1.875 * robot.driver.track_width_m)  # by the multiplier of the Husky's driver
+prior = {"vx_left": 0.01, "wz_left": 0.3 * turn, "vy_left": 0.1 * turn, "longitudinal_slip_curvature": 0.5}
+trained = {
+    "free": fitted("full_linear", free, SYMMETRIC),
+    "with a prior": fitted("full_linear", free, SYMMETRIC, {"wz_left": -turn, "wz_right": turn}, prior),
+}
+curves = {name: learning_curve(train, maneuvers, counts, DRAWS, np.random.default_rng(0)) for name, train in trained.items()}
 lines = []
 for (name, curve), colour, marker in zip(curves.items(), ("blue", "green"), ("o", "s"), strict=True):
     low, middle, high = np.quantile([curve[n] for n in counts], [0.05, 0.5, 0.95], axis=1)
@@ -151,9 +197,19 @@ table(
 # than its wheels predict, about which point, and how much less far it goes on tight arcs: four numbers are as good as twelve.
 
 # %%
-held = {
-    row.title: score(row, maneuvers) for row in rows() if row.title == BEST.title or ("term" not in row.title and " and " not in row.title)
+THREE = ("vx_left", "wz_left", "vy_left")
+models = {
+    "diff_drive, as its geometry says": as_given(1.0),
+    "diff_drive, the driver's multiplier 1.875": as_given(1.875),
+    "diff_drive, fitted": fitted("diff_drive", ("wheel_radius", "wheel_separation_multiplier")),
+    "skid_steer: k, x_CR, y_CR; no scale": fitted("skid_steer", ("k_0", "x_cr_0", "y_cr_0")),
+    "k, scale and x_CR": fitted("full_linear", THREE, SYMMETRIC),
+    "icr, five parameters": fitted("icr", make_model("icr", robot).param_names),
+    "friction: radius, mu_ratio, tracked_x": fitted("friction", ("wheel_radius", "mu_ratio", "tracked_x")),
+    "k, scale, x_CR and longitudinal_slip_curvature": fitted("full_linear", free, SYMMETRIC),
+    "full_linear, all twelve": fitted("full_linear", make_model("full_linear", robot).param_names),
 }
+held = {title: cross_validate(train, maneuvers) for title, train in models.items()}
 intervals = {title: root_mean(h.squared_distance, h.group, np.random.default_rng(0)) for title, h in held.items()}
 picture(
     Bars("held-out position error after 2 s, RMS [m]", list(intervals), {"": [i.value for i in intervals.values()]}), columns=1, row_in=3.4

@@ -97,6 +97,23 @@ def cross_validate(train: Train, maneuvers: Sequence[Maneuver], folds: int = 10)
     return HeldOut(residuals, np.repeat(group, counts), tuple(predictors))
 
 
+def learning_curve(
+    train: Train, maneuvers: Sequence[Maneuver], counts: Sequence[int], draws: int, rng: np.random.Generator
+) -> dict[int, FloatArray]:
+    """Root mean square position error [m] on all other groups after training on so many of ``counts``: (draws,), groups drawn at random."""
+    names = list(dict.fromkeys(m.group for m in maneuvers))
+    curve = {}
+    for count in counts:
+        errors = []
+        for _ in range(draws):
+            taken = set(rng.choice(names, count, replace=False).tolist())
+            predictor = train([m for m in maneuvers if m.group in taken])
+            off = predictor.residuals([m for m in maneuvers if m.group not in taken])
+            errors.append(float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1)))))
+        curve[count] = np.array(errors)
+    return curve
+
+
 def root_mean(squares: FloatArray, group: NDArray[np.int64], rng: np.random.Generator, draws: int = 2000) -> Interval:
     """Root of the mean of ``squares`` (M,), with a bootstrap interval over whole groups (errors within one are correlated)."""
     return _bootstrap(lambda weights, sums, counts: np.sqrt((weights @ sums[0]) / (weights @ counts)), [squares], group, rng, draws)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from motion_models.base import MotionModel
-from motion_models.calibration.cross_validation import HeldOut, cross_validate, root_mean, root_mean_gain
+from motion_models.calibration.cross_validation import HeldOut, cross_validate, learning_curve, root_mean, root_mean_gain
 from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import MODELS, make_model
@@ -128,22 +128,6 @@ def _with(row: Row, term: str) -> Row:
     return Row(row.title, row.model, (*row.free, term), row.ties)
 
 
-def learning_curve(row: Row, maneuvers: Sequence[Maneuver], steps: Sequence[int], draws: int, seed: int = 0) -> dict[int, FloatArray]:
-    """Number of training steps (6 s each) -> (draws,) position RMSE of ``row`` on all other steps; steps drawn at random."""
-    rng = np.random.default_rng(seed)
-    names = list(dict.fromkeys(m.group for m in maneuvers))
-    curve = {}
-    for n in steps:
-        errors = []
-        for _ in range(draws):
-            taken = set(rng.choice(names, n, replace=False).tolist())
-            trained = row.train([m for m in maneuvers if m.group in taken])
-            off = trained.residuals([m for m in maneuvers if m.group not in taken])
-            errors.append(float(np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1)))))
-        curve[n] = np.array(errors)
-    return curve
-
-
 def main() -> None:
     """Print the table."""
     stored, mended = drive_husky.maneuvers(mended=False), drive_husky.maneuvers(mended=True)
@@ -182,7 +166,7 @@ def main() -> None:
 
     print("\nHow much driving the fit needs (40 random draws; median [5 %, 95 %] RMSE on all other steps, mended):")
     steps = (1, 2, 3, 4, 6, 8, 12, 16, 24, 48, 96)
-    bare, prior = (learning_curve(row, mended, steps, 40) for row in (BEST, FROM_THE_BOX))
+    bare, prior = (learning_curve(row.train, mended, steps, 40, np.random.default_rng(0)) for row in (BEST, FROM_THE_BOX))
     print(f"    {'driven':8s} {'free fit':32s} with a prior around the driver's values")
     for n in steps:
         cells = []

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from motion_models import se2
-from motion_models.calibration.cross_validation import root_mean, root_mean_gain
+from motion_models.calibration.cross_validation import learning_curve, root_mean, root_mean_gain
 from motion_models.calibration.maneuvers import Maneuver
 from tests.studies import drive_husky
-from tests.studies.real_husky import BEST, SYMMETRIC, THREE, Row, learning_curve, score
+from tests.studies.real_husky import BEST, SYMMETRIC, THREE, Row, score
 
 GEOMETRY = Row("geometry", "diff_drive")
 K_SCALE_X = Row("k, scale, x_CR", "full_linear", THREE, SYMMETRIC)
@@ -92,7 +92,7 @@ def test_husky_fitted_numbers_are_those_of_straights_and_whole_turns(mended: lis
 
 
 def test_husky_one_minute_calibrates_nearly_as_well_as_twenty(mended: list[Maneuver]) -> None:
-    curve = learning_curve(BEST, mended, (2, 10, 150), 10)
+    curve = learning_curve(BEST.train, mended, (2, 10, 150), 10, np.random.default_rng(0))
     two, ten, many = (np.median(curve[n]) for n in (2, 10, 150))
     assert ten < 1.08 * many
     assert two > ten
