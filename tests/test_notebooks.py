@@ -15,8 +15,9 @@ from tests.helpers.notebooks import FOLDER, read, sources
 SHORTER = {
     "1": {"LOG_S = 1400.0": "LOG_S = 100.0"},
     "4": {
-        'TRIED = ("wheel_radius_difference", "cg_offset_x", "lidar_time_offset", "friction_anisotropy")': 'TRIED = ("lidar_yaw",)',
-        "diagnosed({name: TYPICAL[name]}, seed=1).diagnosis for name": "d for name",
+        '"wheel_radius_difference": 0.02, "cg_offset_x": 0.03, "lidar_time_offset": 0.05, "friction_anisotropy": 0.2': "**HIDDEN",
+        "diagnosed({name: size}, seed=1).diagnosis for": "d for",
+        "clean = diagnosed({}, seed=2).diagnosis": "clean = d",
     },
     "5": {
         "RUNS, STEPS = 40, 150": "RUNS, STEPS = 3, 30",
