@@ -18,6 +18,7 @@ PACKAGES = ("motion_models", "localization")
 CODE = re.compile(r"\{code: (?P<path>\S+) :: (?P<text>[^\n]+?)\}(?=\s|$)")
 MESSAGES = re.compile(r"<!-- messages: (?P<path>\S+) -->")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_BRACES = re.compile(r"\{[^}]*\}")
 _LEAST_LENGTH = 25
 """Of a text that is a sentence and not a part of one."""
 
@@ -77,9 +78,9 @@ def _warning_nodes(tree: ast.AST) -> Iterator[ast.AST]:
 def _texts(node: ast.AST) -> Iterator[str]:
     """Whole texts in an expression."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        yield re.sub(r"\{[^}]*\}", "…", node.value)
+        yield _BRACES.sub("…", node.value)
     elif isinstance(node, ast.JoinedStr):
-        yield "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+        yield "".join(_BRACES.sub("…", str(part.value)) if isinstance(part, ast.Constant) else "…" for part in node.values)
     else:
         for child in ast.iter_child_nodes(node):
             yield from _texts(child)

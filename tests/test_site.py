@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
+import pkgutil
 import re
 from pathlib import Path
 
 import pytest
 
+from localization import sensor_checks
+from localization.sensor_checks.faults import Fault
 from tests.helpers.extended import cases
 
 ROOT = Path(__file__).parents[1]
@@ -65,6 +69,17 @@ def test_messages_of_a_fault_have_their_whole_text():
         text.startswith("the gyro turns opposite to …. It is not used")
         for text in HOOKS.messages("localization/sensor_checks/turn_rates.py")
     )
+
+
+def test_every_fault_of_a_sensor_has_its_text_in_the_lists():
+    """What is made at run time, against what the site finds by reading the code."""
+    for module in pkgutil.iter_modules(sensor_checks.__path__):
+        importlib.import_module(f"{sensor_checks.__name__}.{module.name}")
+    texts = [text for path in HOOKS.modules_with_messages() for text in HOOKS.messages(path)]
+    patterns = [re.compile(".+".join(map(re.escape, text.strip().split("\N{HORIZONTAL ELLIPSIS}")))) for text in texts]
+    faults = [thing for thing in gc.get_objects() if type(thing) is Fault]
+    assert len(faults) >= 15
+    assert [f.message for f in faults if not any(pattern.fullmatch(f.message) for pattern in patterns)] == []
 
 
 def test_equation_becomes_mathml():

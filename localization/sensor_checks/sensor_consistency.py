@@ -21,12 +21,12 @@ from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LI
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2
 
-_MESSAGE = (
-    "for {{seconds:.0f}} s in all the {quantity} by the {first} and those by the {second} differ by more than both sensors' noise"
-    " ({{sigmas:.1f}} sigma: {{difference}} in {{window:.0f}} s). {{cause}} {{use}}"
-)
 DIFFERENCES: Mapping[Pair, Fault] = {
-    pair: Fault(_MESSAGE.format(quantity=pair.quantity, first=pair.first, second=pair.second)) for pair in NAMED
+    pair: Fault(
+        f"for {{seconds:.0f}} s in all the {pair.quantity} by the {pair.first} and those by the {pair.second} differ by more than both"
+        " sensors' noise ({sigmas:.1f} sigma: {difference} in {window:.0f} s). {cause} {use}"
+    )
+    for pair in NAMED
 }
 """What is reported of each pair that differs."""
 PARAMETER_FAR = Fault(
