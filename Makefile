@@ -25,11 +25,12 @@ demo: .venv/kernels
 	@echo "1. Real robot: 68 rotations in place, each at another centre of gravity."
 	$(BIN)/python -m tests.studies.held_out_rotations
 	@echo "2. Simulated drive: the arms take another posture on each lap. Wheels alone, then fused with gyro and LiDAR."
-	$(BIN)/skidloc simulate laps --out $(DEMO)/laps.mcap
-	$(BIN)/skidloc replay $(DEMO)/laps.mcap --robot vaultbot --model diff_drive,skid_steer,friction --estimator odometry,ekf --out $(DEMO)/laps
-	@echo "3. The same laps with a load of 8 kg in the gripper that the robot file does not have: what is wrong with the model?"
-	$(BIN)/skidloc simulate laps --seed 1 --effect payload=8 --out $(DEMO)/load.mcap
-	$(BIN)/skidloc diagnose $(DEMO)/load.mcap --robot vaultbot --out $(DEMO)/load
+	@echo "3. Beside it the same laps with a load of 8 kg in the gripper that the robot file does not have: what is wrong with the model?"
+	@{ $(BIN)/skidloc simulate laps --seed 1 --effect payload=8 --out $(DEMO)/load.mcap && \
+		$(BIN)/skidloc diagnose $(DEMO)/load.mcap --robot vaultbot --out $(DEMO)/load; } > $(DEMO)/load.txt 2>&1 & load=$$!; \
+	$(BIN)/skidloc simulate laps --out $(DEMO)/laps.mcap && \
+	$(BIN)/skidloc replay $(DEMO)/laps.mcap --robot vaultbot --model diff_drive,skid_steer,friction --estimator odometry,ekf --out $(DEMO)/laps; \
+	replayed=$$?; wait $$load; diagnosed=$$?; cat $(DEMO)/load.txt; exit $$((replayed + diagnosed))
 	@echo "Open $(DEMO)/laps/report.html and $(DEMO)/load/diagnosis.html in a browser. Long real logs: make demo-buildings."
 
 # Minutes: the Husky outdoors and two real buildings.
