@@ -29,7 +29,7 @@ demo: .venv/kernels
 	@{ $(BIN)/skidloc simulate laps --seed 1 --effect payload=8 --out $(DEMO)/load.mcap && \
 		$(BIN)/skidloc diagnose $(DEMO)/load.mcap --robot vaultbot --out $(DEMO)/load; } > $(DEMO)/load.txt 2>&1 & load=$$!; \
 	$(BIN)/skidloc simulate laps --out $(DEMO)/laps.mcap && \
-	$(BIN)/skidloc replay $(DEMO)/laps.mcap --robot vaultbot --model diff_drive,skid_steer,friction --estimator odometry,ekf --out $(DEMO)/laps; \
+	$(BIN)/skidloc replay $(DEMO)/laps.mcap --robot vaultbot --model diff_drive,skid_steer --estimator odometry,ekf --out $(DEMO)/laps; \
 	replayed=$$?; wait $$load; diagnosed=$$?; cat $(DEMO)/load.txt; exit $$((replayed + diagnosed))
 	@echo "Open $(DEMO)/laps/report.html and $(DEMO)/load/diagnosis.html in a browser. Long real logs: make demo-buildings."
 
