@@ -25,8 +25,8 @@ demo: .venv/kernels
 	@echo "1. Real robot: 68 rotations in place, each at another centre of gravity."
 	$(BIN)/python -m tests.studies.held_out_rotations
 	@echo "2. Simulated drive: the arms take another posture on each lap. Wheels alone, then fused with gyro and LiDAR."
-	@echo "3. Beside it the same laps with a load of 8 kg in the gripper that the robot file does not have: what is wrong with the model?"
-	@{ $(BIN)/skidloc simulate laps --seed 1 --effect payload=8 --out $(DEMO)/load.mcap && \
+	@echo "3. Beside it two such laps with a load of 8 kg in the gripper that the robot file does not have: what is wrong with the model?"
+	@{ $(BIN)/skidloc simulate laps --config.experiment.laps 2 --seed 1 --effect payload=8 --out $(DEMO)/load.mcap && \
 		$(BIN)/skidloc diagnose $(DEMO)/load.mcap --robot vaultbot --out $(DEMO)/load; } > $(DEMO)/load.txt 2>&1 & load=$$!; \
 	$(BIN)/skidloc simulate laps --out $(DEMO)/laps.mcap && \
 	$(BIN)/skidloc replay $(DEMO)/laps.mcap --robot vaultbot --model diff_drive,skid_steer --estimator odometry,ekf --out $(DEMO)/laps; \
