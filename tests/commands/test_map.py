@@ -150,6 +150,7 @@ def test_replay_extend_map_by_another_building_writes_nothing(log: Path, tmp_pat
     assert not extended.exists()
 
 
+@pytest.mark.extended
 def test_replay_in_another_buildings_map_is_never_localized(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_map(tmp_path / "office.skidmap", SavedMap(floor_plan.make_map(), {}))
     assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", tmp_path / "office.skidmap") == 0

@@ -69,6 +69,7 @@ def test_map_fusion_before_it_is_localized_has_the_maps_extent_as_sigma():
     assert any("never localized" in text for text in pipeline.warnings())
 
 
+@pytest.mark.extended
 def test_map_fusion_with_positions_elsewhere_leaves_the_place():
     """The map's plane is turned and moved; positions that are right keep the place, those 30 m away do not."""
     plane = PositionPlane(np.array([300.0, -200.0, 0.9]), 1e-4 * np.eye(3), np.zeros(2), None)
