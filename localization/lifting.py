@@ -20,6 +20,7 @@ from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
+_PLANAR = [0, 1, 5]
 _LASTING_M = 2.0
 """Way over which errors of roll and pitch last, beside those of the mount, which stay."""
 
@@ -34,6 +35,13 @@ class Pose3:
     """(3, 3) from the body's axes into the world's."""
     covariance: FloatArray
     """(6, 6) of x, y, z, roll, pitch, yaw in the world's axes [m, rad], as in nav_msgs/Odometry."""
+
+    def from_above(self) -> tuple[Pose2, Cov3]:
+        """The planar pose (3,) below it, and the covariance (3, 3) of its right perturbation."""
+        yaw = math.atan2(self.rotation[1, 0], self.rotation[0, 0])
+        c, s = math.cos(yaw), math.sin(yaw)
+        to_body = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.array([self.position[0], self.position[1], yaw]), to_body @ self.covariance[np.ix_(_PLANAR, _PLANAR)] @ to_body.T
 
     def moved(self, delta: Pose2, cov: Cov3) -> Pose3:
         """The pose after a planar motion (3,) in the body's plane, whose right perturbation has ``cov`` (3, 3)."""
@@ -139,6 +147,17 @@ class Trajectory3:
         """(N, 6) of x, y, z, roll, pitch, yaw [m, rad]."""
         return np.sqrt(np.maximum(np.diagonal(self.covariances, axis1=1, axis2=2), 0.0))
 
+    def with_end(self, end: Trajectory3) -> Trajectory3:
+        """The poses before the first of ``end``, and those."""
+        before = self.stamps_ns < end.stamps_ns[0]
+        return Trajectory3(
+            np.concatenate([self.stamps_ns[before], end.stamps_ns]),
+            np.concatenate([self.positions[before], end.positions]),
+            np.concatenate([self.quaternions[before], end.quaternions]),
+            np.concatenate([self.covariances[before], end.covariances]),
+            is_lifted=False,
+        )
+
     def poses(self) -> Iterator[Pose3]:
         """All poses, in order of time."""
         for position, turn, covariance in zip(self.positions, self.quaternions.tolist(), self.covariances, strict=True):
@@ -207,10 +226,7 @@ class SpaceTable:
         own = _trajectory(np.array(self._stamps, dtype=np.int64), np.array(self._numbers), is_lifted=False)
         if before is None:
             return own
-        stamps, positions, quaternions, covariances = (
-            np.concatenate([getattr(before, name), getattr(own, name)]) for name in ("stamps_ns", "positions", "quaternions", "covariances")
-        )
-        return Trajectory3(stamps, positions, quaternions, covariances, is_lifted=False)
+        return before.with_end(own)
 
 
 def _row_of(pose: Pose3) -> FloatArray:

@@ -158,6 +158,8 @@ class _Replay:
         attitude, final = self._pipeline.attitude, filtered if smoothed is None else smoothed
         in_space = self._attitudes.lift(final) if attitude is not None and attitude.is_tilting and len(self._attitudes) else None
         in_space = self._in_space.trajectory(in_space) if len(self._in_space) else in_space
+        if in_space is not None and estimator.smoothed_in_space is not None:
+            in_space = in_space.with_end(estimator.smoothed_in_space)
         plane = self._pipeline.plane
         self._seconds += time.perf_counter() - begin
         return Run(

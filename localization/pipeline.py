@@ -10,8 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from localization.attitude import AttitudeFilter
 from localization.estimators import (
+    ESTIMATORS_IN_SPACE,
     ESTIMATORS_WITH_CORRECTIONS,
     ESTIMATORS_WITH_MAP,
     Estimate,
@@ -21,6 +24,7 @@ from localization.estimators import (
     Plane,
     PriorMap,
     SpaceFusion,
+    SpaceSmoothing,
     make_estimator,
 )
 from localization.events import Event, ImuSample, PositionSample, Scan, Step
@@ -28,7 +32,7 @@ from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from motion_models.base import MotionModel
-from motion_models.online_calibration import Form, add_correction_parameters
+from motion_models.online_calibration import Form, add_correction_parameters, make_corrections
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -71,22 +75,28 @@ class Pipeline:
         self.is_localizing = trial.estimator in ESTIMATORS_WITH_MAP
         self.mounts = dict(mounts)
         """Known mounts by frame, shared with the synchronizer and the estimator."""
-        is_in_space = trial.estimator == "ekf" and config.step.planar is False
-        has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not is_in_space
+        is_in_space = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is False
+        has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not (is_in_space and trial.estimator == "ekf")
         model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         name = trial.estimator if trial.prior is None else "ekf"
         self.estimator: Estimator
+        of_space = robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space
+        smoothing: SpaceSmoothing | None = None
+        if trial.estimator == "graph":
+            corrections = make_corrections(model, trial.corrections)
+            smoothing = SpaceSmoothing(corrections, robot.geometry.track_width_m, config.estimator.graph, is_smoothing)
         if is_in_space:
-            self.estimator = SpaceFusion(robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space)
+            in_space = SpaceFusion(*of_space)
+            self.estimator = in_space if smoothing is None else smoothing.around(in_space, np.zeros(3))
         else:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
             self.estimator = MapFusion(self.estimator, trial.prior, is_recording=is_smoothing)
         self.plane: Plane | None = None
         """The choice between plane and space; None where there is none."""
-        if trial.estimator == "ekf" and config.step.planar is None and has_lidar:
-            self.plane = Plane(robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space)
+        if trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar:
+            self.plane = Plane(*of_space, smoothing)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""

@@ -13,7 +13,9 @@ from localization.estimators.estimator import Estimate, Estimator, LearnedParame
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap
-from localization.estimators.space_fusion import Plane, SpaceFusion
+from localization.estimators.plane import Plane
+from localization.estimators.space_fusion import SpaceFusion
+from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceSmoothing
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
@@ -21,6 +23,7 @@ from motion_models.robot import Mount, Robot
 
 __all__ = [
     "ESTIMATORS",
+    "ESTIMATORS_IN_SPACE",
     "ESTIMATORS_WITH_CORRECTIONS",
     "ESTIMATORS_WITH_MAP",
     "LOCALIZER",
@@ -34,6 +37,8 @@ __all__ = [
     "PriorMap",
     "Residuals",
     "SpaceFusion",
+    "SpaceGraphFusion",
+    "SpaceSmoothing",
     "check_estimator",
     "make_estimator",
 ]
@@ -54,6 +59,8 @@ LOCALIZER = "map"
 """The estimator that needs a saved map: the filter localized in it."""
 ESTIMATORS_WITH_CORRECTIONS = ("ekf", "graph", LOCALIZER)
 """Estimators that correct the motion model on the way."""
+ESTIMATORS_IN_SPACE = ("ekf", "graph")
+"""Estimators whose poses may be in space."""
 ESTIMATORS_WITH_MAP = ("graph", LOCALIZER)
 """Estimators whose poses are ``map_T_body``; the others' are ``odom_T_body``."""
 

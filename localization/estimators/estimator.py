@@ -11,7 +11,7 @@ import numpy as np
 
 from localization.events import PositionSample, Step, Turn
 from localization.lidar import LostScans
-from localization.lifting import Pose3
+from localization.lifting import Pose3, Trajectory3
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid
 from localization.trajectory import Trajectory
@@ -111,6 +111,11 @@ class Estimator(ABC):
 
         ``filtered``: the estimates as they were published, which the estimator does not store. Raises `EstimatorError`."""
         self.run_deferred()
+        return None
+
+    @property
+    def smoothed_in_space(self) -> Trajectory3 | None:
+        """Smoothed poses in space, after `finish`; None where the estimator has none."""
         return None
 
     @property

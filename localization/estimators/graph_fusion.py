@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.bounded_settings import Positive, Settings, Signed
+from localization.core.state import SE2, Group
 from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
@@ -191,7 +192,7 @@ class GraphFusion(FilteredOdometry):
         wheel_cov = wheels.cov + D @ state.cov("corrections", "radius") @ D.T
         if self._is_matched and cov[0, 0] > _OPEN_SHARE * wheel_cov[0, 0]:  # the way is the wheels' alone: it does not show their radius
             return BetweenMeasurement(k - 1, k, delta, block_diag(_NO_INFORMATION, np.linalg.inv(cov[1:, 1:])))
-        return BetweenMeasurement(k - 1, k, *subtract_information(delta, cov, by_wheels, wheel_cov))
+        return BetweenMeasurement(k - 1, k, *subtract_information(SE2, delta, cov, by_wheels, wheel_cov))
 
     def _epoch_cov(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -335,8 +336,10 @@ class GraphFusion(FilteredOdometry):
         return np.vstack(drawn) if drawn else np.empty((0, 2))
 
 
-def subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3) -> tuple[Pose2, Cov3]:
-    """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` (3,) together give ``delta`` (3,).
+def subtract_information(
+    group: Group, delta: FloatArray, cov: FloatArray, prior: FloatArray, prior_cov: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Motion and information of gyro and scans alone, where they and the wheels' ``prior`` together give ``delta``, elements of ``group``.
 
     The wheels have a factor of their own, and each measurement counts once: information C^-1 - C_w^-1, where it is positive. Along
     directions in which gyro and scans have less information than the wheels, their share of the motion is not observable: there it is at
@@ -347,9 +350,9 @@ def subtract_information(delta: Pose2, cov: Cov3, prior: Pose2, prior_cov: Cov3)
     ratios, axes = np.linalg.eigh(whiten @ np.linalg.inv(cov) @ whiten.T)  # information with gyro and scans, over that of the wheels
     gained = np.maximum(ratios - 1.0, 1e-6)
     to_axes = axes.T @ root.T
-    off = to_axes @ se2.local(prior, delta)
+    off = to_axes @ group.local(prior, delta)
     shift = np.linalg.solve(to_axes, off / np.maximum(gained, 1.0))
-    return se2.retract(delta, shift), (to_axes.T * gained) @ to_axes
+    return group.retract(delta, shift), (to_axes.T * gained) @ to_axes
 
 
 def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:

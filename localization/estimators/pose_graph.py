@@ -112,7 +112,7 @@ class PoseGraph:
         """Add ``update`` and solve."""
         self.updates.append(update)
         factors, values = self._factors(update)
-        with _check_solvable():
+        with check_solvable():
             self._isam.update(factors, values)
             if any(between.is_loop for between in update.betweens) or update.alignment is not None:
                 self._iterate()
@@ -169,7 +169,7 @@ class PoseGraph:
         for update in self.updates:
             graph.push_back(self._factors(update)[0])
         assert self.count == count
-        with _check_solvable():
+        with check_solvable():
             values = levenberg_marquardt(graph, values)
             linear = graph.linearize(values)
             marginals = gtsam.Marginals(linear, linear.optimize())
@@ -241,7 +241,7 @@ def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) 
                 H[2] = np.asfortranarray(by_predicted @ se2.right_jacobian(shift) @ D)
         return residual
 
-    return _robust_factor(keys, wheels.cov, error)
+    return robust_factor(keys, wheels.cov, error)
 
 
 def position_factor(position: PositionMeasurement) -> gtsam.CustomFactor:
@@ -255,10 +255,10 @@ def position_factor(position: PositionMeasurement) -> gtsam.CustomFactor:
             H[0], H[1], H[2] = map(np.asfortranarray, jacobians)
         return np.asarray(predicted - position.position)
 
-    return _robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
+    return robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
 
 
-def _robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., FloatArray]) -> gtsam.CustomFactor:
+def robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., FloatArray]) -> gtsam.CustomFactor:
     """Pass a covariance, never a lower-triangular root: GTSAM takes that as diagonal, silently."""
     huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
     return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov)), list(keys), error)
@@ -284,7 +284,7 @@ def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values)
 
 
 @contextlib.contextmanager
-def _check_solvable() -> Iterator[None]:
+def check_solvable() -> Iterator[None]:
     """Raises `EstimatorError` in place of GTSAM's error for systems that rounding makes singular."""
     try:
         yield

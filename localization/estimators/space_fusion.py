@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
-from localization.attitude import AttitudeFilter
 from localization.core.filter import Transition, clone, propagate, update
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.space import (
@@ -24,7 +22,7 @@ from localization.estimators.estimator import NO_POINTS, Estimate, Estimator, tw
 from localization.events import Gravity, Step
 from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size, key_scan_noise
 from localization.lidar.cloud_map import CloudMap, thin
-from localization.lifting import Lifting, Pose3, aligning
+from localization.lifting import Pose3, aligning
 from motion_models import se3
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray, Points2
@@ -71,6 +69,20 @@ class SpaceFusion(Estimator):
         made._lost = planar.lost or made._lost
         made._clock_offset_s = planar.clock_offset_s
         return made
+
+    @property
+    def has_vertical(self) -> bool:
+        """Whether gravity has been measured."""
+        return self._has_vertical
+
+    @property
+    def accelerometer_sigma(self) -> float:
+        """Of the prior of its bias [m/s^2]."""
+        return self._config.accelerometer_m_s2
+
+    def start_key(self) -> None:
+        """Clone the pose as the last keyframe, the variable "key", which all later measurements update as well."""
+        self.state = clone(self.state, "pose", "key")
 
     def step(self, step: Step) -> Estimate:
         """Predict, update by gyro and gravity, update by the cloud."""
@@ -153,20 +165,16 @@ class SpaceFusion(Estimator):
 
     def _estimate(self, step: Step, nis: float | None) -> Estimate:
         pose, P = self.state["pose"], self.state.cov("pose")
-        yaw = math.atan2(pose[1, 0], pose[0, 0])
         world = np.zeros((6, 6))
         world[:3, :3] = world[3:, 3:] = pose[:3, :3]
-        covariance = world @ P @ world.T
-        c, s = math.cos(yaw), math.sin(yaw)
-        to_body = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        planar_cov = to_body @ covariance[np.ix_(_PLANAR, _PLANAR)] @ to_body.T
+        in_space = Pose3(pose[:3, 3], pose[:3, :3], world @ P @ world.T)
+        planar, planar_cov = in_space.from_above()
         twist, twist_cov = step.twist, None
         if step.duration > 0.0:
             delta, cov = self.state.between("start", "pose")
             mean, mean_cov = se3.log(delta)[_PLANAR] / step.duration, cov[np.ix_(_PLANAR, _PLANAR)] / step.duration**2
             measured_over = math.inf if nis is not None or not step.has_wheels else step.duration
             twist, twist_cov = twist_at_end(mean, mean_cov, step.twist_change, measured_over)
-        planar, in_space = np.array([pose[0, 3], pose[1, 3], yaw]), Pose3(pose[:3, 3], pose[:3, :3], covariance)
         return Estimate(step.end_ns, planar, planar_cov, twist, twist_cov, nis, in_space=in_space)
 
     @property
@@ -208,36 +216,6 @@ class SpaceFusion(Estimator):
     def map_points(self) -> Points2:
         """(M, 2) points of the map seen from above [m]."""
         return NO_POINTS if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
-
-
-class Plane:
-    """Poses of an estimator in the plane, until the IMU shows that the ground tilts: from there on they are in space.
-
-    Without a 3D LiDAR they stay in the plane, whatever the ground does: planar scans are not matched in space.
-    """
-
-    def __init__(self, gyro: GyroNoise, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
-        """As `SpaceFusion`."""
-        self._of_space, self._lifting = (gyro, mounts, lidar, config), Lifting()
-        self._pose: Pose3 | None = None
-        self.has_clouds = False
-        """A 3D LiDAR has measured: from the first cloud on there is a choice."""
-        self.left_ns: int | None = None
-        """Stamp of the last estimate in the plane; None while it is not left."""
-
-    def choose(self, estimator: Estimator, attitude: AttitudeFilter | None, start_ns: int) -> Estimator:
-        """``estimator``, or from now on, where the ground has been found to tilt, one in space."""
-        if self._pose is None or self.left_ns is not None or attitude is None or not attitude.is_tilting:
-            return estimator
-        self.left_ns = start_ns
-        return SpaceFusion.continuing(estimator, self._pose, *self._of_space)
-
-    def add(self, estimate: Estimate, attitude: AttitudeFilter | None) -> None:
-        """Lift the ``estimate`` of the estimator in the plane."""
-        if self.left_ns is not None or attitude is None or estimate.covariance is None:
-            return
-        lifted = self._lifting.add(estimate.pose, estimate.covariance, attitude.ground_up, attitude.tilt_variances)
-        self._pose = replace(lifted, position=np.array([estimate.pose[0], estimate.pose[1], lifted.position[2]]))
 
 
 def _align(state: State, gravity: Gravity) -> State:

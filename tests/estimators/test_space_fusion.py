@@ -14,7 +14,7 @@ from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from tests.helpers.hill_scans import MOUNT, make_scene, scans
 from tests.helpers.hills import rolling_drive, with_accelerometer_bias
-from tests.helpers.in_space import IN_SPACE, in_order, run_in_space
+from tests.helpers.in_space import IN_SPACE, aligned_rms, in_order, run_in_space, true_poses
 
 pytestmark = pytest.mark.xdist_group("among_trees")
 
@@ -79,13 +79,18 @@ def test_space_fusion_survives_a_cloud_of_200000_points_and_nan_rings(rolled, am
 
 @pytest.mark.extended
 def test_replay_in_space_gives_its_poses_with_six_by_six_covariances(rolled, among_trees):
-    trial = Trial(make_model("diff_drive", rolled.robot), "ekf")
+    trials = [Trial(make_model("skid_steer", rolled.robot), name) for name in ("ekf", "graph")]
     mounts = {**rolled.mounts, "lidar_link": MOUNT}
-    (run,) = replay(in_order(rolled, among_trees[:30]), [trial], rolled.robot, mounts, True, IN_SPACE)
-    assert run.in_space is not None
-    np.testing.assert_array_equal(run.in_space.positions[:, :2], run.trajectory.poses[:, :2])
-    assert run.in_space.covariances.shape == (len(run.trajectory), 6, 6)
-    assert (np.linalg.eigvalsh(run.in_space.covariances) > -1e-9).all()
+    runs = replay(in_order(rolled, among_trees), trials, rolled.robot, mounts, True, IN_SPACE)
+    for run in runs:
+        assert run.in_space is not None
+        later = run.in_space.stamps_ns[len(run.in_space.stamps_ns) // 2 :]
+        np.testing.assert_allclose(run.in_space.positions[-len(later) :, :2], run.trajectory.poses[-len(later) :, :2], atol=1e-12)
+        assert run.in_space.covariances.shape == (len(run.trajectory), 6, 6)
+        assert (np.linalg.eigvalsh(run.in_space.covariances) > -1e-9).all()
+    ekf, smoothed = (aligned_rms(run.in_space.positions, true_poses(rolled, run.in_space.stamps_ns)[:, :3, 3]) for run in runs)
+    assert smoothed < 1.2 * ekf
+    np.testing.assert_allclose(runs[1].filtered.poses, runs[0].trajectory.poses, atol=1e-6)
 
 
 def test_space_fusion_without_an_imus_mount_is_named(rolled, among_trees):

@@ -1,0 +1,172 @@
+"""Pose graph in space in GTSAM: keyframes, tied by wheels, scans and gravity, with corrections of the motion model and the accelerometer.
+
+    x_k          keyframe poses ``odom_T_body`` on SE(3)
+    c            corrections of the motion model (k, centre of rotation, ... by name)
+    a            bias of the accelerometer, with what its mount is off
+
+Measurements are collected on the way and solved once, by Levenberg-Marquardt. Perturbations act on the right. Tangents are in the order of
+`motion_models.se3`, those of GTSAM have the rotation first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from localization.attitude import GRAVITY
+from localization.core.space import lift
+from localization.estimators.pose_graph import check_solvable, levenberg_marquardt, robust_factor
+from motion_models import se2, se3
+from motion_models.preintegration import PreintegratedMotion
+from motion_models.se2 import FloatArray
+from motion_models.se3 import Transform3
+
+_SWAP = [3, 4, 5, 0, 1, 2]
+"""Rows of GTSAM's tangents in ours, and ours in GTSAM's."""
+_PLANAR = [0, 1, 5]
+_FIRST_POSITION_M, _FIRST_HEADING, _FIRST_TILT = 1e-3, 1e-4, 0.2
+"""Sigmas of the first keyframe, which is the origin of the map [m, rad]; gravity measures its roll and pitch."""
+_CORRECTIONS, _BIAS = gtsam.symbol("c", 0), gtsam.symbol("a", 0)
+
+
+@dataclass(frozen=True)
+class Between:
+    """Motion from keyframe ``k`` to the next one by gyro and scans, with the information (6, 6) of its right perturbation."""
+
+    k: int
+    delta: Transform3
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class GravityMeasurement:
+    """Gravity in the axes of keyframe ``k``."""
+
+    k: int
+    force: FloatArray
+    """(3,) upwards [m/s^2]."""
+    turned: FloatArray
+    """(3, 3) ``key_R_body`` at the measurement: the bias is constant in the body."""
+    variance: float
+    """[m^2/s^4]"""
+
+
+@dataclass
+class SpaceGraph:
+    """`add` keyframes with what was measured since the last one; `smooth` gives their poses by all of it."""
+
+    prior_cov: FloatArray
+    """(c, c) of the corrections, around zero."""
+    accelerometer_sigma: float
+    """[m/s^2]"""
+    poses: list[Transform3] = field(default_factory=list)
+    wheels: list[PreintegratedMotion] = field(default_factory=list)
+    betweens: list[Between] = field(default_factory=list)
+    gravities: list[GravityMeasurement] = field(default_factory=list)
+
+    def smooth(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Poses (K, 4, 4), their covariances (K, 6, 6) and the corrections (c,). Raises `EstimatorError` where there is no solution."""
+        graph, values = self._factors()
+        with check_solvable():
+            values = levenberg_marquardt(graph, values)
+            linear = graph.linearize(values)
+            marginals = gtsam.Marginals(linear, linear.optimize())
+            covs = [marginals.marginalCovariance(gtsam.symbol("x", k))[np.ix_(_SWAP, _SWAP)] for k in range(len(self.poses))]
+        found = np.array([values.atPose3(gtsam.symbol("x", k)).matrix() for k in range(len(self.poses))])
+        return found, np.array(covs), np.asarray(values.atVector(_CORRECTIONS))
+
+    def _factors(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        graph, values, c = gtsam.NonlinearFactorGraph(), gtsam.Values(), len(self.prior_cov)
+        for k, pose in enumerate(self.poses):
+            values.insert(gtsam.symbol("x", k), gtsam.Pose3(pose))
+        values.insert(_CORRECTIONS, np.zeros(c))
+        values.insert(_BIAS, np.zeros(3))
+        first = gtsam.noiseModel.Gaussian.Information(_first_information(self.poses[0])[np.ix_(_SWAP, _SWAP)])
+        graph.add(gtsam.PriorFactorPose3(gtsam.symbol("x", 0), gtsam.Pose3(self.poses[0]), first))
+        graph.add(gtsam.PriorFactorVector(_CORRECTIONS, np.zeros(c), gtsam.noiseModel.Gaussian.Covariance(self.prior_cov)))
+        graph.add(gtsam.PriorFactorVector(_BIAS, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, self.accelerometer_sigma)))
+        for k, wheels in enumerate(self.wheels):
+            graph.add(wheel_factor(k, wheels))
+        for between in self.betweens:
+            noise = gtsam.noiseModel.Gaussian.Information(between.information[np.ix_(_SWAP, _SWAP)])
+            ends = (gtsam.symbol("x", between.k), gtsam.symbol("x", between.k + 1))
+            graph.add(gtsam.BetweenFactorPose3(*ends, gtsam.Pose3(between.delta), noise))
+        for gravity in self.gravities:
+            graph.add(gravity_factor(gravity))
+        return graph, values
+
+
+def _first_information(pose: Transform3) -> FloatArray:
+    """(6, 6) of the first keyframe: its position and the heading of its x axis are the map's, roll and pitch are open.
+
+    With rotation errors e in the body's axes that heading changes by (R_yy e_z - R_yz e_y) / R_xx, for R turned to heading zero.
+    """
+    level = se3.rotation(np.array([0.0, 0.0, -np.arctan2(pose[1, 0], pose[0, 0])])) @ pose[:3, :3]
+    heading = np.array([0.0, -level[1, 2], level[1, 1]]) / level[0, 0]
+    out = np.eye(6) / _FIRST_POSITION_M**2
+    out[3:, 3:] = np.eye(3) / _FIRST_TILT**2 + np.outer(heading, heading) / _FIRST_HEADING**2
+    return out
+
+
+def wheel_factor(k: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
+    """x, y and yaw of log(lift(delta exp(D (c - c0)))^-1 (x_k^-1 x_k+1)): the wheels' motion in the plane of the body."""
+    keys = [gtsam.symbol("x", k), gtsam.symbol("x", k + 1), _CORRECTIONS]
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
+        D = wheels.by_corrections
+        shift = D @ (values.atVector(_CORRECTIONS) - wheels.at)
+        a_T_b = se3.compose(se3.inverse(values.atPose3(keys[0]).matrix()), values.atPose3(keys[1]).matrix())
+        residual = se3.local(lift(se2.retract(wheels.delta, shift)), a_T_b)
+        if H is not None:  # to first order in the residual
+            H[0] = np.asfortranarray(-se3.adjoint(se3.inverse(a_T_b))[np.ix_(_PLANAR, _SWAP)])
+            H[1] = np.asfortranarray(np.eye(6)[np.ix_(_PLANAR, _SWAP)])
+            H[2] = np.asfortranarray(-se2.adjoint(se2.exp(-residual[_PLANAR])) @ se2.right_jacobian(shift) @ D)
+        return np.asarray(residual[_PLANAR])
+
+    return robust_factor(keys, wheels.cov, error)
+
+
+def gravity_factor(measured: GravityMeasurement) -> gtsam.CustomFactor:
+    """g T^T R_k^T e_z + a - f: gravity of a keyframe's attitude in the axes of the body at the measurement.
+
+    GTSAM's own attitude factor has no bias; one that lasts for the drive would count as often as gravity is measured.
+    """
+    key = gtsam.symbol("x", measured.k)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
+        up = values.atPose3(key).matrix()[2, :3]
+        if H is not None:
+            H[0] = np.asfortranarray(GRAVITY * measured.turned.T @ np.hstack([se3.cross(up), np.zeros((3, 3))]))
+            H[1] = np.asfortranarray(np.eye(3))
+        return np.asarray(GRAVITY * measured.turned.T @ up + values.atVector(_BIAS) - measured.force)
+
+    return robust_factor([key, _BIAS], measured.variance * np.eye(3), error)
+
+
+def through_keyframes(
+    odometry: FloatArray, covs_since: FloatArray, nodes: Sequence[int], poses: FloatArray, covs: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (N, 4, 4) and covariances (N, 6, 6) of ``odometry`` (N, 4, 4), whose ``nodes`` (K,) are at ``poses`` with ``covs``.
+
+    What the motion between two nodes has changed by grows evenly along their steps, as in the plane (`trajectory.through_nodes`); after the
+    last node the odometry goes on.
+    """
+    out, spread, noise = np.array(odometry), np.array(covs_since), np.array(covs_since)
+    noise[list(nodes)] = 0.0
+    ends = [*nodes[1:], len(odometry)]
+    for k, (a, b) in enumerate(zip(nodes, ends, strict=True)):
+        to_next = np.zeros(6)
+        if k + 1 < len(nodes):
+            to_next = se3.local(poses[k] @ se3.inverse(odometry[a]) @ odometry[b], poses[k + 1])
+        for i in range(a, b):
+            part, since = (i - a) / (b - a), se3.inverse(odometry[a]) @ odometry[i]
+            out[i] = se3.retract(poses[k] @ since, part * to_next)
+            A = se3.adjoint(se3.inverse(since))
+            spread[i] = A @ covs[k] @ A.T + (1.0 - part) * noise[i]
+            if k + 1 < len(nodes):
+                B = se3.adjoint(se3.inverse(odometry[i]) @ odometry[b])
+                spread[i] = (1.0 - part) * spread[i] + part * (B @ covs[k + 1] @ B.T)
+    return out, spread

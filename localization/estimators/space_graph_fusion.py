@@ -1,0 +1,173 @@
+"""Smoothed poses in space: the filter on SE(3) live, and at the end a graph of its keyframes on SE(3)."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from localization.core.policies.excitation import Excitation
+from localization.core.space import SE3, lift
+from localization.core.state import clip_eigenvalues
+from localization.errors import EstimatorError
+from localization.estimators.estimator import Estimate, Estimator
+from localization.estimators.graph_fusion import GraphConfig, subtract_information
+from localization.estimators.space_fusion import SpaceFusion
+from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, through_keyframes
+from localization.events import Step
+from localization.lidar import LostScans
+from localization.lifting import Pose3, SpaceTable, Trajectory3
+from localization.trajectory import Trajectory
+from motion_models import se2, se3
+from motion_models.online_calibration import Corrections
+from motion_models.preintegration import MotionPreintegration
+from motion_models.se2 import FloatArray, Points2, Pose2
+
+_OPEN_M2, _OPEN_RAD2 = 1.0, 1.0
+"""Variance of z and of roll and pitch by the wheels, which do not measure them [m^2, rad^2]."""
+_NO_SIGMA = 1e-4
+"""Prior sigma of the wheels' radius, which the filter in space does not correct [-]."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceSmoothing:
+    """What a `SpaceGraphFusion` needs beside its filter."""
+
+    corrections: Corrections
+    track_m: float
+    """Track width of the robot [m]."""
+    config: GraphConfig
+    is_smoothing: bool
+    """`finish` is to give the smoothed trajectory; memory then grows with the drive, 424 bytes a step."""
+
+    def around(self, in_space: SpaceFusion, map_T_odom: Pose2) -> SpaceGraphFusion:
+        """The graph behind the filter ``in_space``; ``map_T_odom`` (3,) stays as a graph in the plane has left it."""
+        return SpaceGraphFusion(in_space, self, map_T_odom)
+
+
+class SpaceGraphFusion(Estimator):
+    """`SpaceFusion`, whose keyframes a `SpaceGraph` smooths at the end; its live poses are the filter's.
+
+    The filter's submap grows with the drive and is never left, so that a place that is visited again is matched by the filter itself: the
+    graph has no loops of its own.
+    """
+
+    def __init__(self, odometry: SpaceFusion, smoothing: SpaceSmoothing, map_T_odom: Pose2) -> None:
+        corrections, track_m = smoothing.corrections, smoothing.track_m
+        self.odometry, self._corrections = odometry, corrections
+        self._config, self._is_smoothing = smoothing.config, smoothing.is_smoothing
+        self._map_T_odom = map_T_odom
+        self.graph = SpaceGraph(block_diag(corrections.cov, _NO_SIGMA**2), odometry.accelerometer_sigma)
+        self._excitation = Excitation(track_m, corrections.min_track_over_radius)
+        self._wheels = MotionPreintegration(len(corrections.names))
+        self._stamps_ns, self._poses, self._covs_since = array("q"), array("d"), array("d")
+        self._nodes: list[int] = []
+        self._smoothed: Trajectory3 | None = None
+        self._failure = ""
+
+    def step(self, step: Step) -> Estimate:
+        """The filter's estimate; a keyframe where the robot has gone or turned far enough."""
+        estimate = self.odometry.step(step)
+        self._excitation.start_step(step.predicted)
+        if self.odometry.has_vertical:
+            self._record(step)
+        odometry, pose = (estimate.pose, estimate.covariance), se2.compose(self._map_T_odom, estimate.pose)
+        return replace(estimate, pose=pose, odometry=odometry, map_T_odom=self._map_T_odom)
+
+    def _record(self, step: Step) -> None:
+        state, delta, cov = self.odometry.state, np.eye(4), np.zeros((6, 6))
+        if self.graph.poses:
+            self._wheels.add(step.predicted, self._corrections, self._excitation.is_turning, np.zeros(len(self._corrections.names)))
+            delta, cov = state.between("key", "pose")
+        if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
+            self._stamps_ns.append(step.end_ns)
+            self._poses.extend(state["pose"].ravel())
+            self._covs_since.extend(cov.ravel())
+        c, (way, turn) = self._config, (math.hypot(*delta[:3, 3]), math.hypot(*se3.rotation_vector(delta[:3, :3])))
+        if not self.graph.poses or way > c.keyframe_distance_m or turn > c.keyframe_angle_rad:
+            self._add_keyframe(delta, cov)
+            delta = np.eye(4)
+        if step.gravity is not None:
+            k, force, variance = len(self.graph.poses) - 1, step.gravity.force, step.gravity.variance
+            self.graph.gravities.append(GravityMeasurement(k, force, delta[:3, :3], variance))
+
+    def _add_keyframe(self, delta: FloatArray, cov: FloatArray) -> None:
+        state, n = self.odometry.state, len(self.graph.poses)
+        if n:
+            wheels = self._wheels.with_corrections(np.zeros(len(self._corrections.names)))
+            by_wheels = np.diag([0.0, 0.0, _OPEN_M2, _OPEN_RAD2, _OPEN_RAD2, 0.0])
+            by_wheels[np.ix_([0, 1, 5], [0, 1, 5])] = wheels.cov
+            between = subtract_information(SE3, delta, clip_eigenvalues(cov), lift(wheels.delta), by_wheels)
+            self.graph.wheels.append(wheels)
+            self.graph.betweens.append(Between(n - 1, *between))
+        self.graph.poses.append(state["pose"])
+        if self._is_smoothing:
+            self._nodes.append(len(self._stamps_ns) - 1)
+        self._wheels = MotionPreintegration(len(self._corrections.names))
+        self.odometry.start_key()
+
+    def run_deferred(self) -> None:
+        """The filter's submap."""
+        self.odometry.run_deferred()
+
+    def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
+        """The smoothed trajectory seen from above, at the stamps of ``filtered``; None unless smoothing, or with one keyframe."""
+        self.run_deferred()
+        if not self._is_smoothing or filtered is None or len(self._nodes) < 2:
+            return None
+        try:
+            poses, covs, _ = self.graph.smooth()
+        except EstimatorError as error:
+            self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
+            return None
+        stamps = np.array(self._stamps_ns, dtype=np.int64)
+        odometry, since = np.array(self._poses).reshape(-1, 4, 4), np.array(self._covs_since).reshape(-1, 6, 6)
+        smoothed, spread = through_keyframes(odometry, since, self._nodes, poses, covs)
+        smoothed = lift(self._map_T_odom) @ smoothed
+        table, planar = SpaceTable(), filtered.poses.copy()
+        planar_covs = None if filtered.covariances is None else filtered.covariances.copy()
+        rows = np.searchsorted(filtered.stamps_ns, stamps)
+        for stamp, row, pose, cov in zip(stamps.tolist(), rows.tolist(), smoothed, spread, strict=True):
+            world = np.kron(np.eye(2), pose[:3, :3])
+            in_space = Pose3(pose[:3, 3], pose[:3, :3], world @ cov @ world.T)
+            table.add(stamp, in_space)
+            planar[row], above = in_space.from_above()
+            if planar_covs is not None:
+                planar_covs[row] = above
+        self._smoothed = table.trajectory()
+        return Trajectory(filtered.stamps_ns, planar, planar_covs)
+
+    @property
+    def smoothed_in_space(self) -> Trajectory3 | None:
+        """Poses in space by all measurements, once `finish` has smoothed them."""
+        return self._smoothed
+
+    @property
+    def clock_offset_s(self) -> float:
+        """See `SpaceFusion.clock_offset_s`."""
+        return self.odometry.clock_offset_s
+
+    @property
+    def lost(self) -> LostScans:
+        """See `SpaceFusion.lost`."""
+        return self.odometry.lost
+
+    def parameters(self) -> Mapping[str, tuple[float, float]]:
+        """See `SpaceFusion.parameters`."""
+        return self.odometry.parameters()
+
+    def counts(self) -> Mapping[str, int]:
+        """Those of the filter, and the keyframes."""
+        return {**self.odometry.counts(), "keyframes": len(self.graph.poses)}
+
+    def warnings(self) -> list[str]:
+        """Those of the filter, and whether smoothing failed."""
+        return [*self.odometry.warnings(), *([self._failure] if self._failure else [])]
+
+    def map_points(self) -> Points2:
+        """See `SpaceFusion.map_points`."""
+        return self.odometry.map_points()
