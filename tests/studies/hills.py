@@ -6,15 +6,16 @@ The measurements are two independent sets, turning in place on inclined planes, 
 elliptic cones, steps of 1 ms or less); nothing of the law is fitted to them. The first is of a robot of a Husky's size, 10 s, about 540
 degrees; the second gives k and the centre of rotation over all headings, mu 0.6 and contacts that slide (slip_stiffness 100). The third
 table replays wheels and IMU of drives in MuJoCo (`tests.helpers.mujoco_hills`): turns in place, and 2 min over hills; some minutes of
-computing. The last one adds a 3D LiDAR (`python -m tests.studies.hills clouds` prints it alone; `nees` the NEES over seeds). Needs the
-extra `mujoco`.
+computing. The last one adds a 3D LiDAR (`python -m tests.studies.hills clouds [--trees A:B] [--grass A:B]` prints it alone; `nees` the NEES
+over seeds). Needs the extra `mujoco`.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
-import sys
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -181,30 +182,30 @@ _CLOUD_DRIVE_S = 40.0
 _MAX_RANGE_M, _MIN_RANGE_M = 50.0, 0.3
 
 
-def print_clouds() -> None:
-    """Sixteen rings on hills: KISS-ICP alone by its defaults, KISS-ICP started by our prediction, and the filter in space."""
+def print_clouds(drives: Sequence[tuple[int, str]] = CLOUD_DRIVES, seconds: float = _CLOUD_DRIVE_S) -> None:
+    """Sixteen rings on hills: the filter in space, and other front ends by their defaults, alone or started by our prediction.
+
+    Accelerometers have a bias that is drawn from its prior. GenZ-ICP and small_gicp have a row where they are installed.
+    """
     print("\n| seed | scene | estimator | ATE [m] | greatest error [m] | mean NEES (6 expected) | s of CPU |\n" + "|---" * 7 + "|")
-    for seed, scene in CLOUD_DRIVES:
-        made = drive(Wander(seed), _CLOUD_DRIVE_S, seed=seed)
+    for seed, scene in drives:
+        made = with_accelerometer_bias(drive(Wander(seed), seconds, seed=seed), seed)
         clouds = list(scans(made, make_scene(made, seed, *_SCENES[scene]), seed=seed))
         begin = time.process_time()
         ours, _ = run_in_space(made, clouds)
-        seconds = time.process_time() - begin
+        taken = time.process_time() - begin
         largest = np.linalg.norm(ours.errors[_SETTLED:, :3], axis=1).max()
-        print(
-            f"| {seed} | {scene} | ours | {ours.ate:.3f} | {largest:.3f} | {ours.nees[_SETTLED:].mean():.1f} | {seconds:.0f} |", flush=True
-        )
-        for name, register in (("KISS-ICP", kiss_alone), ("KISS-ICP, our prediction", kiss_from_prediction)):
+        print(f"| {seed} | {scene} | ours | {ours.ate:.3f} | {largest:.3f} | {ours.nees[_SETTLED:].mean():.1f} | {taken:.0f} |", flush=True)
+        for name, register in FRONT_ENDS.items():
             begin = time.process_time()
-            found, stamps = register(made, clouds)
-            seconds = time.process_time() - begin
-            true = true_poses(made, stamps)
-            first = (
-                np.array([se3.inverse(true[0]) @ t for t in true])[:, :3, 3]
-                - np.array([se3.inverse(found[0]) @ f for f in found])[:, :3, 3]
-            )
+            try:
+                found, stamps = register(made, clouds)
+            except ImportError:
+                continue
+            taken, true = time.process_time() - begin, true_poses(made, stamps)
+            first = (se3.inverse(true[0]) @ true)[:, :3, 3] - (se3.inverse(found[0]) @ found)[:, :3, 3]
             ate = aligned_rms(found[:, :3, 3], true[:, :3, 3])
-            print(f"| {seed} | {scene} | {name} | {ate:.3f} | {np.linalg.norm(first, axis=1).max():.3f} | - | {seconds:.0f} |", flush=True)
+            print(f"| {seed} | {scene} | {name} | {ate:.3f} | {np.linalg.norm(first, axis=1).max():.3f} | - | {taken:.0f} |", flush=True)
 
 
 NEES_DRIVES = tuple((seed, "trees and walls") for seed in range(1, 13)) + tuple((seed, "open grass") for seed in (2, 4, 6, 8))
@@ -248,18 +249,23 @@ def kiss_alone(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatAr
     return np.array(found), np.array([cloud.stamp_ns + SWEEP_NS for cloud in clouds])
 
 
-def kiss_from_prediction(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatArray]:
-    """As `kiss_alone`, with motion and deskewing by the filter in space without clouds: wheels, gyro and gravity."""
-    without, pipeline = run_in_space(made, [])
-    del pipeline
+def _predicted(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatArray, Iterator[FloatArray]]:
+    """Stamps (N,), poses (N, 4, 4) and deskewed clouds (n, 3) in the body frame, by the filter in space without clouds: wheels, gyro and
+    gravity."""
+    without, _ = run_in_space(made, [])
     by_wheels = HillDrive(made.robot, made.mounts, [], without.stamps_ns, without.poses[:, :3, 3], without.poses[:, :3, :3])
-    kiss, nothing, pose, found = _kiss(), np.empty(0), np.eye(4), []
     stamps = np.array([cloud.middle_ns for cloud in clouds])
-    middles = true_poses(by_wheels, stamps)
     begins, ends = true_poses(by_wheels, stamps - SWEEP_NS // 2), true_poses(by_wheels, stamps + SWEEP_NS // 2)
-    for i, cloud in enumerate(clouds):
-        twist = se3.log(se3.inverse(begins[i]) @ ends[i]) / (1e-9 * SWEEP_NS)
-        points = Sweep(_in_body(cloud), cloud.times_from_middle, False).deskew_in_space(twist)
+    twists = (se3.log(se3.inverse(a) @ b) / (1e-9 * SWEEP_NS) for a, b in zip(begins, ends, strict=True))
+    points = (Sweep(_in_body(c), c.times_from_middle, False).deskew_in_space(twist) for c, twist in zip(clouds, twists, strict=True))
+    return stamps, true_poses(by_wheels, stamps), points
+
+
+def kiss_from_prediction(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatArray]:
+    """As `kiss_alone`, with motion and deskewing by our prediction."""
+    stamps, middles, deskewed = _predicted(made, clouds)
+    kiss, nothing, pose, found = _kiss(), np.empty(0), np.eye(4), []
+    for i, points in enumerate(deskewed):
         guess = pose @ (se3.inverse(middles[i - 1]) @ middles[i] if i else np.eye(4))
         source, downsampled = kiss.voxelize(kiss.preprocessor.preprocess(points, nothing, np.eye(4)))
         sigma = kiss.adaptive_threshold.get_threshold()
@@ -272,11 +278,59 @@ def kiss_from_prediction(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArra
     return np.array(found), stamps
 
 
+def genz_alone(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatArray]:
+    """GenZ-ICP by its defaults; its poses are at the middle of the sweep."""
+    from genz_icp.config import load_config as load_genz  # type: ignore[import-not-found]  # of tests/league/requirements.txt
+    from genz_icp.genz_icp import GenZICP  # type: ignore[import-not-found]
+
+    config = load_genz(None)
+    config.data.min_range, config.data.max_range = _MIN_RANGE_M, _MAX_RANGE_M
+    genz, found = GenZICP(config), []
+    for cloud in clouds:
+        genz.register_frame(_in_body(cloud), 1e9 * cloud.offsets / SWEEP_NS)
+        found.append(genz.last_pose.copy())
+    return np.array(found), np.array([cloud.middle_ns for cloud in clouds])
+
+
+def gicp_from_prediction(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatArray]:
+    """small_gicp's scan-to-model odometry (voxels of .25 and 1 m, as its examples), with motion and deskewing by our prediction."""
+    import small_gicp  # type: ignore[import-not-found]  # of tests/league/requirements.txt
+
+    stamps, middles, deskewed = _predicted(made, clouds)
+    target, pose, found = small_gicp.GaussianVoxelMap(1.0), np.eye(4), []
+    for i, points in enumerate(deskewed):
+        source, _ = small_gicp.preprocess_points(points, 0.25)
+        pose = pose @ (se3.inverse(middles[i - 1]) @ middles[i] if i else np.eye(4))
+        if i and source.size():
+            pose = small_gicp.align(target, source, pose).T_target_source
+        target.insert(source, pose)
+        found.append(pose)
+    return np.array(found), stamps
+
+
+FRONT_ENDS = {
+    "KISS-ICP": kiss_alone,
+    "KISS-ICP, our prediction": kiss_from_prediction,
+    "GenZ-ICP": genz_alone,
+    "small_gicp, our prediction": gicp_from_prediction,
+}
+
+
 def main() -> None:
     """Print the tables."""
-    if chosen := [print_it for name, print_it in (("clouds", print_clouds), ("nees", print_nees)) if name in sys.argv[1:]]:
-        for print_it in chosen:
-            print_it()
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("table", nargs="?", choices=("all", "clouds", "nees"), default="all")
+    parser.add_argument("--trees", default="", metavar="A:B", help="seeds of drives among trees and walls, of the table clouds")
+    parser.add_argument("--grass", default="", metavar="A:B", help="seeds on open grass, of the table clouds")
+    parser.add_argument("--seconds", type=float, default=_CLOUD_DRIVE_S, help="length of these drives")
+    given = parser.parse_args()
+    if given.table == "nees":
+        print_nees()
+        return
+    named = (("trees and walls", given.trees), ("open grass", given.grass))
+    drives = [(seed, scene) for scene, seeds in named if seeds for seed in range(*map(int, seeds.split(":")))]
+    if given.table == "clouds":
+        print_clouds(drives or CLOUD_DRIVES, given.seconds)
         return
     print(
         "| slope | mu | CG [m] | slid downhill: MuJoCo = flat model's error | with the law | left | turned more: MuJoCo | law |\n"
