@@ -213,6 +213,22 @@ def odometry(topic: str, frame: str, child: str) -> MessageLayout:
     return MessageLayout(topic, "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 2), ("f8", 1)), build)
 
 
+def odometry_in_space(topic: str, frame: str, child: str) -> MessageLayout:
+    """Parts: x, y, z; x, y, z and w of the quaternion; vx, vy and wz of the body. Covariances are zero: they are exact."""
+
+    def build(stamp: Any, place: Array, turned: Array, speed: Array, turn: Array) -> Any:
+        pose = _T["geometry_msgs/msg/Pose"](position=_point(place), orientation=_quaternion(turned))
+        twist = _T["geometry_msgs/msg/Twist"](linear=_vector((*speed, 0)), angular=_vector((0, 0, *turn)))
+        return _T["nav_msgs/msg/Odometry"](
+            header=_header(stamp, frame),
+            child_frame_id=child,
+            pose=_T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+            twist=_T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+        )
+
+    return MessageLayout(topic, "nav_msgs/msg/Odometry", (("f8", 3), ("f8", 4), ("f8", 2), ("f8", 1)), build)
+
+
 def point(topic: str, frame: str) -> MessageLayout:
     """Part: x, y, z [m]."""
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from localization.bounded_settings import Count, Positive, Settings, up_to
+from localization.bounded_settings import Count, Positive, Seed, Settings, up_to
 from localization.errors import SimulationError
 from localization.simulation.world import WORLDS, World
 from motion_models import se2
@@ -164,9 +164,13 @@ class ExperimentConfig(Settings):
     """How much of an experiment is driven."""
 
     laps: Count = 3
-    """Laps of `laps`, `corridor` (to and fro), `slippery_patch`, `ramp` and `payload_pickup` (before and after)."""
+    """Laps of `laps`, `corridor` (to and fro), `slippery_patch`, `ramp`, `hills` and `payload_pickup` (before and after)."""
     hours: Positive = 10.0
     """Length of `soak` [h]."""
+    hills_seed: Seed = 0
+    """Seed of the ground of `hills`."""
+    hills_slope_deg: Annotated[float, up_to(10)] = 6.0
+    """Median slope of `hills` [deg]."""
     payload_kg: float = 8.0
     """What `payload_pickup` takes up [kg]."""
     speed_m_s: Annotated[float, up_to(2)] = 0.6
@@ -184,6 +188,8 @@ class Experiment:
     """Pose of the body in the world."""
     phases: Callable[[Robot, ExperimentConfig], Iterator[Phase]]
     with_gps: bool = False
+    has_hills: bool = False
+    """The ground has waves (`ExperimentConfig.hills_seed`)."""
     slope_deg: float = 0.0
     """By which the floor rises towards the world's +x [deg]."""
 
@@ -339,6 +345,19 @@ def _ramp(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
     yield Rest(3.0)
 
 
+_HILLS = np.array([[8.0, 2.0], [10.0, 8.0], [2.0, 9.0], [-6.0, 5.0], [-8.0, -3.0], [-2.0, -9.0], [7.0, -7.0], [0.0, 0.0]])
+
+
+def _hills(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
+    yield Rest(3.0)
+    for lap in range(config.laps):
+        yield Route(_HILLS[:4], config.speed_m_s, name=f"out_{lap + 1}")
+        yield OpenLoop(f"turn_{lap + 1}", constant(0.0, 0.6), 10.0)
+        yield Route(_HILLS[4:], config.speed_m_s, name=f"back_{lap + 1}")
+        yield OpenLoop(f"turn_back_{lap + 1}", constant(0.0, -0.6), 10.0)
+    yield Rest(3.0)
+
+
 def _soak(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
     """Never ends by itself: the simulation ends it after `ExperimentConfig.hours`."""
     postures = _postures(robot) if robot.arms is not None else None
@@ -363,6 +382,7 @@ _ALL = (
     Experiment(
         "ramp", "turns in place and arcs on a ramp of 8 degrees, which the IMU measures", "hall", (3.0, 0.0, 0.5), _ramp, slope_deg=8.0
     ),
+    Experiment("hills", "laps and turns in place over hills with trees, for a 3D LiDAR", "hills", (0.0, 0.0, 0.0), _hills, has_hills=True),
     Experiment("soak", "laps for hours, with GPS", "rooms", (0.0, -4.0, 0.0), _soak, with_gps=True),
 )
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in _ALL}

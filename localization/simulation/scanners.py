@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from localization.bounded_settings import Below, Count, Positive, Settings, Share, Signed, at_least
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
+from localization.simulation.hill_sensors import BODY_ABOVE_FLOOR_M, ring_ranges
 from localization.simulation.vehicle import SampleClock, TrueMotion, pose_at, seconds
 from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
 from motion_models.compiled import kernel
@@ -171,8 +172,6 @@ def _cast_sweeps(starts: FloatArray, sweep: BeamPattern, scene: Scene, ranges: F
             ranges[k, i] = found
 
 
-_BODY_ABOVE_FLOOR_M = 0.13
-"""Height of the body frame, that of the Husky's wheel axles [m]."""
 _CLOUD_FIELDS = {"x": "f4", "y": "f4", "z": "f4", "intensity": "f4", "ring": "u2", "time": "f4"}
 
 
@@ -191,7 +190,8 @@ class SpinningScanner:
         rng: np.random.Generator,
     ) -> None:
         self._config, self._world, self._grid, self._rng, self._start_ns = config, world, make_grid(world.walls), rng, start_ns
-        self._mount, self._height = np.array([mount.x, mount.y, mount.yaw]), mount.z + _BODY_ABOVE_FLOOR_M
+        self._real = mount
+        self._mount, self._height = np.array([mount.x, mount.y, mount.yaw]), mount.z + BODY_ABOVE_FLOOR_M
         self._late_ns = round(late_s * 1e9)
         self._elevation = np.radians(np.linspace(config.lowest_deg, config.highest_deg, config.rings))
         self.layout = message_templates.point_cloud(topic, frame, config.rings, config.columns, _CLOUD_FIELDS)
@@ -208,21 +208,17 @@ class SpinningScanner:
 
     def _turn(self, start_s: float, track: TrueMotion) -> NDArray[np.uint8]:
         c = self._config
-        level = np.empty((1, c.columns))
         column_s, step = 1.0 / c.rate_hz / c.columns, -2.0 * math.pi / c.columns  # clockwise, as they turn
-        beams = BeamPattern(column_s, math.pi, step, self._mount, 2.0 * c.max_range_m)
-        scene = Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s)
-        _cast_sweeps(np.array([start_s]), beams, scene, level)
-        # Walls reach from floor to ceiling: each ring hits the wall, or the floor or the ceiling before it.
-        up = np.tan(self._elevation)[:, None]
+        azimuth = math.pi + step * np.arange(c.columns, dtype=np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
-            flat = np.where(up > 0.0, (self._world.ceiling_m - self._height) / up, np.where(up < 0.0, -self._height / up, np.inf))
-            flat = np.minimum(level, flat)
-            ranges = flat / np.cos(self._elevation)[:, None]
+            if len(self._world.waves):
+                rows = track.at(np.asarray(start_s + column_s * np.arange(c.columns), dtype=np.float64))
+                ranges = ring_ranges(rows, self._real, (azimuth, self._elevation), c.max_range_m, self._grid, self._world.waves)
+            else:
+                ranges = self._level_ranges(start_s, track, column_s, step)
             ranges = c.measure(ranges, self._rng)
             lost = ~((ranges > c.min_range_m) & (ranges < c.max_range_m)) | (self._rng.random(ranges.shape) < c.dropout)
         ranges[lost] = np.nan
-        azimuth = math.pi + step * np.arange(c.columns)
         cloud = np.zeros((c.rings, c.columns), dtype=list(_CLOUD_FIELDS.items()))
         across = ranges * np.cos(self._elevation)[:, None]
         cloud["x"], cloud["y"] = across * np.cos(azimuth), across * np.sin(azimuth)
@@ -231,3 +227,14 @@ class SpinningScanner:
         cloud["ring"] = np.arange(c.rings)[:, None]
         cloud["time"] = column_s * np.arange(c.columns)
         return np.frombuffer(cloud.tobytes(), dtype=np.uint8)
+
+    def _level_ranges(self, start_s: float, track: TrueMotion, column_s: float, step: float) -> FloatArray:
+        """(rings, columns) true ranges on a level floor."""
+        c, level = self._config, np.empty((1, self._config.columns))
+        beams = BeamPattern(column_s, math.pi, step, self._mount, 2.0 * c.max_range_m)
+        scene = Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s)
+        _cast_sweeps(np.array([start_s]), beams, scene, level)
+        # Walls reach from floor to ceiling: each ring hits the wall, or the floor or the ceiling before it.
+        up = np.tan(self._elevation)[:, None]
+        flat = np.where(up > 0.0, (self._world.ceiling_m - self._height) / up, np.where(up < 0.0, -self._height / up, np.inf))
+        return np.asarray(np.minimum(level, flat) / np.cos(self._elevation)[:, None])

@@ -11,10 +11,13 @@ from typing import Annotated, Literal, Protocol
 import numpy as np
 
 from localization.bounded_settings import Allowed, Positive, Settings, Share, Signed
+from localization.lifting import quaternion as rotation_quaternion
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
+from localization.simulation.hill_sensors import body_poses, imu_motion
 from localization.simulation.injected_faults import TrueRobot
 from localization.simulation.scanners import PlanarScanner, ScannerConfig, SpinningConfig, SpinningScanner
+from localization.simulation.terrain import NO_WAVES
 from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistribution, SampleClock, TrueMotion, seconds
 from localization.simulation.world import World
 from motion_models.robot import Mount, Robot
@@ -161,6 +164,8 @@ class ImuSensor:
         rng: np.random.Generator,
     ) -> None:
         self._config, self._mount, self._tilt, self._start_ns, self._rng = config, mount, tilt, start_ns, rng
+        self.waves = NO_WAVES
+        """(n, 4) hills below the robot (`simulation.terrain`); none on a plane."""
         self._bias = rng.normal(0.0, config.gyro_bias_sigma, 3) + mount.rotation().T @ np.array([0.0, 0.0, gyro_bias])
         rate_sigma, force_sigma = (noise * math.sqrt(config.rate_hz) for noise in (config.gyro_noise, config.force_noise))
         self._sigmas = rate_sigma, force_sigma
@@ -173,7 +178,23 @@ class ImuSensor:
         if not len(ticks):
             return []
         n, period = len(ticks), 1.0 / self._config.rate_hz
-        now, before = track.at(seconds(ticks)), track.at(seconds(ticks) - period)
+        if len(self.waves):
+            rates, force = imu_motion(track, seconds(ticks), period, self._mount, self.waves)
+        else:
+            rates, force = self._level_motion(track, seconds(ticks), period)
+        body_R_imu = self._mount.rotation()
+        bias = self._bias + np.cumsum(self._rng.normal(0.0, self._config.gyro_bias_walk * math.sqrt(period), (n, 3)), axis=0)
+        self._bias = bias[-1]
+        turning = (1.0 + self._config.gyro_scale) * rates
+        rates = turning @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
+        forces = force @ body_R_imu + self._rng.normal(0.0, self._sigmas[1], (n, 3))
+        late_ns = round(self._config.late_s * 1e9)
+        stamps = [self._start_ns + int(t) for t in ticks]
+        return [Message(self.layout, stamp, stamp + late_ns, (rates[i], forces[i])) for i, stamp in enumerate(stamps)]
+
+    def _level_motion(self, track: TrueMotion, times: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
+        """Rates and specific forces (n, 3) in the body's axes on a plane."""
+        now, before, n = track.at(times), track.at(times - period), len(times)
         vx, vy, wz = now[:, TWIST].T
         ax, ay, alpha = ((now - before)[:, TWIST] / period).T  # over its own period, as an IMU does
         x, y, theta = self._mount.x, self._mount.y, now[:, 2]
@@ -185,15 +206,7 @@ class ImuSensor:
                 np.full(n, _GRAVITY * math.cos(self._tilt)),
             ]
         )
-        body_R_imu = self._mount.rotation()
-        bias = self._bias + np.cumsum(self._rng.normal(0.0, self._config.gyro_bias_walk * math.sqrt(period), (n, 3)), axis=0)
-        self._bias = bias[-1]
-        turning = np.column_stack([np.zeros(n), np.zeros(n), (1.0 + self._config.gyro_scale) * wz])
-        rates = turning @ body_R_imu + bias + self._rng.normal(0.0, self._sigmas[0], (n, 3))
-        forces = force @ body_R_imu + self._rng.normal(0.0, self._sigmas[1], (n, 3))
-        late_ns = round(self._config.late_s * 1e9)
-        stamps = [self._start_ns + int(t) for t in ticks]
-        return [Message(self.layout, stamp, stamp + late_ns, (rates[i], forces[i])) for i, stamp in enumerate(stamps)]
+        return np.column_stack([np.zeros(n), np.zeros(n), wz]), force
 
 
 class GpsSensor:
@@ -237,9 +250,12 @@ def _geodetic(config: GpsConfig, east: float, north: float) -> FloatArray:
 class TruthSensor:
     """The body's true pose and twist, and, where asked for, the nominal centre of gravity."""
 
-    def __init__(self, rate_hz: float, robot: Robot, masses: MassDistribution, with_cg: bool, start_ns: int) -> None:
-        self._masses, self._start_ns = masses, start_ns
-        self.layout = message_templates.odometry(robot.topics.reference, "world", "base_link")
+    def __init__(
+        self, rate_hz: float, robot: Robot, masses: MassDistribution, with_cg: bool, start_ns: int, waves: FloatArray = NO_WAVES
+    ) -> None:
+        self._masses, self._start_ns, self._waves = masses, start_ns, waves
+        of = message_templates.odometry_in_space if len(waves) else message_templates.odometry
+        self.layout = of(robot.topics.reference, "world", "base_link")
         self.cg_form = message_templates.point(robot.topics.center_of_gravity, "base_link") if with_cg else None
         self._ticks = SampleClock(rate_hz)
 
@@ -250,11 +266,14 @@ class TruthSensor:
             return []
         rows = track.at(seconds(ticks))
         half = 0.5 * rows[:, 2]
-        heading = np.column_stack([np.sin(half), np.cos(half)])
+        places, headings = rows[:, POSE][:, :2], np.column_stack([np.sin(half), np.cos(half)])
+        if len(self._waves):
+            places, rotations = body_poses(rows, self._waves)
+            headings = np.array([rotation_quaternion(rotation) for rotation in rotations])
         found = []
         for i, tick in enumerate(ticks):
             stamp = self._start_ns + int(tick)
-            found.append(Message(self.layout, stamp, stamp, (rows[i, POSE][:2], heading[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
+            found.append(Message(self.layout, stamp, stamp, (places[i], headings[i], rows[i, TWIST][:2], rows[i, TWIST][2:])))
         if self.cg_form is not None:
             for tick, cg in zip(ticks, self._masses.nominal_cg(seconds(ticks)), strict=True):
                 stamp = self._start_ns + int(tick)
@@ -316,11 +335,13 @@ def make_sensors(
     mounts, topics = nominal_mounts(robot), robot.topics
     config = with_faults(config, reality)
     sensors: list[Sensor] = [
-        TruthSensor(config.truth_hz, robot, masses, config.center_of_gravity, START_NS),
+        TruthSensor(config.truth_hz, robot, masses, config.center_of_gravity, START_NS, world.waves),
         EncoderSensor(config.encoders, robot, masses, reality.wheels_late_s, reality.encoder_lost, START_NS, encoders),
     ]
     if config.imu.rate_hz > 0.0:
-        sensors.append(ImuSensor(config.imu, topics.imu, IMU, mounts[IMU], reality.gyro_bias, reality.body.slope, START_NS, imu))
+        measured = ImuSensor(config.imu, topics.imu, IMU, mounts[IMU], reality.gyro_bias, reality.body.slope, START_NS, imu)
+        measured.waves = world.waves
+        sensors.append(measured)
     fixes = dataclasses.replace(config.gps, rate_hz=1.0) if with_gps and config.gps.rate_hz == 0.0 else config.gps
     if fixes.rate_hz > 0.0:
         sensors.append(GpsSensor(fixes, "/fix", GPS, START_NS, gps))

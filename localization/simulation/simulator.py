@@ -28,6 +28,7 @@ from localization.simulation.experiments import (
 )
 from localization.simulation.injected_faults import TrueRobot, apply_faults
 from localization.simulation.sensors import START_NS, SensorConfig, make_sensors, nominal_mounts, transforms
+from localization.simulation.terrain import make_waves
 from localization.simulation.vehicle import CG, COLUMNS, POSE, Body, MassDistribution, TrueMotion, VehicleConfig, VehicleState, advance
 from localization.simulation.world import clearance
 from motion_models.center_of_gravity.parts import require_support
@@ -94,12 +95,16 @@ class Simulation:
         if abs(self._steps_per_control * self.config.vehicle.step_s - _CONTROL_S) > 1e-9:
             raise SimulationError(f"vehicle.step_s is {self.config.vehicle.step_s:g} s; it must divide the control period, {_CONTROL_S} s.")
         self.world = experiment.make_world()
+        if experiment.has_hills:
+            self.world = replace(self.world, waves=make_waves(self.config.experiment.hills_seed, self.config.experiment.hills_slope_deg))
+            if self.config.sensors.lidar == "2d":
+                raise SimulationError("planar scanners are not simulated on hills. Pass --config.sensors.lidar 3d, or none.")
         self._marks: list[Message] = []
         self.runs: list[RunRecord] = []
         """Named phases that are over."""
         self.lidar_mount = nominal_mounts(robot)[self.config.sensors.lidar_frame]
         """The LiDAR's mount in the log's /tf_static."""
-        body = replace(Body.from_robot(robot), slope=math.radians(experiment.slope_deg))
+        body = replace(Body.from_robot(robot), slope=math.radians(experiment.slope_deg), waves=self.world.waves)
         self.reality = apply_faults(TrueRobot(body, self.lidar_mount), effects)
         self._body = self.reality.body
         self._masses = MassDistribution(robot)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from localization.bounded_settings import Positive, Settings, up_to
 from localization.errors import SimulationError
+from localization.simulation.terrain import NO_WAVES
 from localization.simulation.vehicle_dynamics import Chassis, DynamicsInput, Plant, derivatives, integrate
 from motion_models.center_of_gravity.cg_model import CgModel, Posture, posture_for
 from motion_models.center_of_gravity.files import arms_model, arms_postures
@@ -75,6 +76,8 @@ class Body:
     """The left wheels grip more by half of this share, the right ones less."""
     cg_offset: tuple[float, float] = (0.0, 0.0)
     """How far the CG really lies from where arms and robot file have it [m]."""
+    waves: FloatArray = field(default_factory=lambda: NO_WAVES)
+    """(n, 4) hills (`simulation.terrain`)."""
     yields: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Shear of a loose floor layer, on which the contacts ride [s, s/m, s/rad]: vy += a vx wz; wz *= 1 - b |vx|; vx -= c vx |wz|."""
 
@@ -178,7 +181,7 @@ def advance(
         np.ascontiguousarray(cg),
         out,
         config.step_s,
-        Plant(body.chassis(config), mass, inertia, along, np.array(body.yields), patches, config.motor_lag_s, ramp),
+        Plant(body.chassis(config), mass, inertia, along, np.array(body.yields), patches, config.motor_lag_s, ramp, body.waves),
     )
     if failed >= 0:
         raise SimulationError(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.simulation.terrain import axes, ground, over_ground
 from motion_models.compiled import kernel, subroutine
 from motion_models.friction.contact import Tyre, contact, loads, rolling
 from motion_models.se2 import FloatArray
@@ -224,6 +225,8 @@ class Plant(NamedTuple):
     motor_lag_s: float
     ramp: float
     """Largest change of the wheel rates' set points [rad/s^2]."""
+    waves: FloatArray
+    """(n, 4) hills (`simulation.terrain`); none on a plane."""
 
 
 @kernel
@@ -281,9 +284,22 @@ def _sheared(vx: float, vy: float, wz: float, yields: FloatArray) -> tuple[float
 
 @subroutine
 def _inputs_at(
-    t: float, rolls: tuple[float, float], heading: float, cg: FloatArray, grips: tuple[float, float, float, float], plant: Plant
+    t: float,
+    rolls: tuple[float, float],
+    pose: tuple[float, float, float],
+    cg: FloatArray,
+    grips: tuple[float, float, float, float],
+    plant: Plant,
 ) -> DynamicsInput:
     """What acts on the robot ``t`` seconds after the start of the step, at wheel rates ``rolls`` [rad/s]."""
+    heading, gravity = pose[2], plant.body.gravity
+    force_x, force_y = -plant.slope_gravity * plant.mass * math.cos(heading), plant.slope_gravity * plant.mass * math.sin(heading)
+    lighter = 0.0  # normal to the ground: its curvature is left out
+    if plant.waves.shape[0]:
+        _, z_x, z_y, _, _, _ = ground(pose[0], pose[1], plant.waves)
+        e1, e2, n_z = axes(heading, z_x, z_y)
+        force_x, force_y = -plant.mass * gravity * e1[2], -plant.mass * gravity * e2[2]
+        lighter = gravity * (n_z - 1.0)
     return DynamicsInput(
         plant.body.radius_left * rolls[0],
         plant.body.radius_right * rolls[1],
@@ -299,9 +315,9 @@ def _inputs_at(
         cg[3] + t * cg[5],
         cg[4],
         cg[5],
-        cg[6],
-        -plant.slope_gravity * plant.mass * math.cos(heading),
-        plant.slope_gravity * plant.mass * math.sin(heading),
+        cg[6] + lighter,
+        force_x,
+        force_y,
     )
 
 
@@ -336,7 +352,7 @@ def _step(
             t = i * h + share * h
             roll_l = wheel_response(state[6], targets[0], slopes[0], lag, t)[0]
             roll_r = wheel_response(state[7], targets[1], slopes[1], lag, t)[0]
-            now = _inputs_at(t, (roll_l, roll_r), theta + share * h * guess[2], cg, grips, plant)
+            now = _inputs_at(t, (roll_l, roll_r), (x, y, theta + share * h * guess[2]), cg, grips, plant)
             if math.isnan(first_xi):  # only at the very start: afterwards the rate is known from the step before
                 quasi_static = derivatives(vx, vy, wz, xi, eta, now, body)
                 first_xi, first_eta = (quasi_static.xi - xi) / body.tyre_lag, (quasi_static.eta - eta) / body.tyre_lag
@@ -356,6 +372,8 @@ def _step(
             heading = from_theta + GAMMA * h * by_theta
             c, s = math.cos(heading), math.sin(heading)
             by_x, by_y = c * su - s * sv, s * su + c * sv
+            if plant.waves.shape[0]:
+                by_x, by_y, by_theta = over_ground(su, sv, by_theta, x, y, heading, plant.waves)
             guess = (u, v, w)
         vx, vy, wz = guess
         x, y, theta = from_x + GAMMA * h * by_x, from_y + GAMMA * h * by_y, from_theta + GAMMA * h * by_theta

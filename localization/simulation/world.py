@@ -31,6 +31,8 @@ class World:
     """(k, 6) each walks to and fro from x0, y0 to x1, y1 [m] at a speed [m/s], as a cylinder of a radius [m]."""
     patches: FloatArray = field(default_factory=_none(5))
     """(k, 5) rectangles x0, y0, x1, y1 [m] of other floor, with a factor of the friction."""
+    waves: FloatArray = field(default_factory=_none(4))
+    """(n, 4) hills (`simulation.terrain`); none on level ground."""
     ceiling_m: float = math.inf
     """Height of the ceiling [m]; inf outdoors."""
 
@@ -115,6 +117,13 @@ def yard() -> World:
     return World(np.concatenate([box(-20, -20, 20, 20), box(-20, 12, -14, 20), *trees]))
 
 
+def hills() -> World:
+    """60 x 60 m of grass with trees and a few walls; its waves are those of the experiment."""
+    places = [(-12, 9), (9, 12), (14, -8), (-9, -13), (3, 17), (-17, -3), (17, 4), (-4, 13), (6, -14), (-15, 16), (20, 18), (-21, -18)]
+    trees = [pillar(x, y, 0.25) for x, y in places]
+    return World(np.concatenate([box(-30, -30, 30, 30), box(-20, 4, -18, 11), line(12, -18, 21, -13), *trees]))
+
+
 WORLDS: dict[str, Callable[[], World]] = {
     "hall": hall,
     "lab": lab,
@@ -122,6 +131,7 @@ WORLDS: dict[str, Callable[[], World]] = {
     "corridor": corridor,
     "slippery": slippery,
     "yard": yard,
+    "hills": hills,
 }
 """Worlds by name."""
 
@@ -296,3 +306,13 @@ def _distance(x: float, y: float, xa: float, ya: float, xb: float, yb: float) ->
     f = ((x - xa) * ex + (y - ya) * ey) / square if square > 0.0 else 0.0
     f = min(1.0, max(0.0, f))
     return math.sqrt((x - xa - f * ex) ** 2 + (y - ya - f * ey) ** 2)
+
+
+@kernel
+def cast_rays(origins: FloatArray, directions: FloatArray, longest: float, grid: Grid, ranges: FloatArray) -> None:
+    """Fill ``ranges`` (n, r) of rays from ``origins`` (n, 3) along unit ``directions`` (n, r, 3): to the first wall, of any height."""
+    for n in range(directions.shape[0]):
+        for r in range(directions.shape[1]):
+            dx, dy = directions[n, r, 0], directions[n, r, 1]
+            flat = math.hypot(dx, dy)
+            ranges[n, r] = cast(origins[n, 0], origins[n, 1], math.atan2(dy, dx), longest, grid) / max(flat, 1e-9)

@@ -380,7 +380,7 @@ def test_experiment_each_is_driven_to_its_end(name):
         assert sum(1 for _ in simulation.messages()) > 1000
         assert simulation.runs
         assert simulation.time_s > 60.0
-    assert simulate(name.replace("_", "-"), ROBOT).experiment.name == name
+    assert simulate(name.replace("_", "-"), ROBOT, config=config).experiment.name == name
 
 
 def test_open_loop_scores_ideal_robot_are_zero_but_for_motor_lag():
