@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from localization.log_replay import replay
-from localization.pipeline import ReplayConfig, Trial
+from localization.pipeline import Pipeline, ReplayConfig, Trial
+from localization.ros.state_serialization import deserialize, serialize
 from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from tests.helpers.hill_scans import MOUNT, make_scene, scans
@@ -133,3 +134,20 @@ def test_space_fusion_of_planar_scans_is_named(rolled, among_trees):
     flat = [dataclasses.replace(scan, is_planar=True) for scan in among_trees]
     _, pipeline = run_in_space(rolled, flat, "diff_drive")
     assert any("planar scans were not matched" in warning for warning in pipeline.warnings())
+
+
+@pytest.mark.extended
+def test_graph_in_space_cut_and_resumed_gives_the_same_bits(rolled, among_trees):
+    """From a checkpoint with keyframes, wheels and gravity in it."""
+    events = in_order(rolled, among_trees[:32])
+    trial = Trial(make_model("diff_drive", rolled.robot), "graph")
+    whole = Pipeline(trial, rolled.robot, {**rolled.mounts, "lidar_link": MOUNT}, True, IN_SPACE)
+    for event in events[:-120]:
+        whole.process(event)
+    resumed = deserialize(*serialize(whole))
+    assert len(resumed.estimator.graph.poses) > 1
+    pairs = [(a, b) for event in events[-120:] for a, b in zip(whole.process(event), resumed.process(event), strict=True)]
+    assert len(pairs) > 2
+    for one, other in pairs:
+        np.testing.assert_array_equal(one.in_space.position, other.in_space.position)
+        np.testing.assert_array_equal(one.in_space.covariance, other.in_space.covariance)
