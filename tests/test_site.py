@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import importlib.util
 import pkgutil
 import re
@@ -73,11 +72,10 @@ def test_messages_of_a_fault_have_their_whole_text():
 
 def test_every_fault_of_a_sensor_has_its_text_in_the_lists():
     """What is made at run time, against what the site finds by reading the code."""
-    for module in pkgutil.iter_modules(sensor_checks.__path__):
-        importlib.import_module(f"{sensor_checks.__name__}.{module.name}")
+    modules = [importlib.import_module(f"{sensor_checks.__name__}.{m.name}") for m in pkgutil.iter_modules(sensor_checks.__path__)]
     texts = [text for path in HOOKS.modules_with_messages() for text in HOOKS.messages(path)]
     patterns = [re.compile(".+".join(map(re.escape, text.strip().split("\N{HORIZONTAL ELLIPSIS}")))) for text in texts]
-    faults = [thing for thing in gc.get_objects() if type(thing) is Fault]
+    faults = [thing for module in modules for thing in vars(module).values() if isinstance(thing, Fault)]
     assert len(faults) >= 15
     assert [f.message for f in faults if not any(pattern.fullmatch(f.message) for pattern in patterns)] == []
 

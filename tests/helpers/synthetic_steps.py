@@ -55,7 +55,7 @@ class PoseSensor:
         self.next: ScanMatch | None = None
         self.lost, self.moved = LostScans(), MovedRobot()
 
-    def measure(self, step, prior, cov, twist, offset):
+    def measure(self, step, prior, cov, offset):
         return self.next
 
     def refine(self, match, twist):
