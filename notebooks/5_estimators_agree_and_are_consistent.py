@@ -43,8 +43,8 @@ class OptimisticSensor(PoseSensor):
         super().__init__()
         self.factor = factor
 
-    def measure(self, step, prior, cov, twist, jump):
-        found = super().measure(step, prior, cov, twist, jump)
+    def measure(self, step, prior, cov, offset):
+        found = super().measure(step, prior, cov, offset)
         return None if found is None else replace(found, cov=found.cov * self.factor**2)
 
 

@@ -51,8 +51,8 @@ _MAX_NIS = 16.3
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
 """Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
 Wheels that slip in a still scene explain 14 to 33 % by chance where they turn otherwise (fr079 at 168 to 185 s), else 15 to 20 %."""
-_MAX_WHEEL_TURN_RAD, _SAME_TURN_RAD = 0.1, 0.05
-"""Turn of a rival from the wheels', without a gyro, from where on these have slipped, and up to where both turn alike [rad]."""
+_MAX_WHEEL_TURN_RAD = 0.1
+"""Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
 _RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
 """A rival leaves less than this share of what moves; and the share of a scan that it leaves unexplained counts as this much at least."""
 _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
@@ -111,6 +111,8 @@ class MovingObjects(Check):
         """Time of the last labels that showed it [s]."""
         self._since: FloatArray | None = None
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
+        self._is_by_scans = False
+        """The estimate is by scans, too: one by wheels alone is where they lead."""
         self._explained: tuple[Fault, ...] = ()
         """Named faults so far that explain what was taken for moving objects."""
         self.report = _Report(faults)
@@ -145,7 +147,7 @@ class MovingObjects(Check):
             was_moving = self._since is not None
             self._update(step, lidar, found)
             if lidar.is_active:
-                step = step if was_moving else self._lead_back(step)
+                step = self._lead_back(step) if self._is_by_scans and not was_moving else step
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
                 step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
         elif lidar.is_active:
@@ -160,6 +162,7 @@ class MovingObjects(Check):
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
         self._poses[1] = se2.compose(self._poses[1], delta)
+        self._is_by_scans |= nis is not None
         inflation, view = self._faults.inflation, self._compared
         if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
             self._settle(self._since)
@@ -240,8 +243,7 @@ class MovingObjects(Check):
         is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
-            turn_off = float(self._distance(found.view.poses)[2])
-            has_turn = step.turn is not None or lidar.is_active or abs(turn_off) < _SAME_TURN_RAD
+            has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE:
                 self._suspected = found.view.poses if self._suspected is None else self._suspected
