@@ -239,12 +239,12 @@ class MovingObjects(Check):
         """Whether objects move now."""
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        distance = math.hypot(*self._distance(found.view.poses)[:2])
+        off = self._distance(found.view.poses)
+        distance = math.hypot(off[0], off[1])
         is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
-            turn_off = float(self._distance(found.view.poses)[2])
-            has_turn = step.turn is not None or lidar.is_active or abs(turn_off) < _SAME_TURN_RAD
+            has_turn = step.turn is not None or lidar.is_active or abs(off[2]) < _SAME_TURN_RAD
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE:
                 self._suspected = found.view.poses if self._suspected is None else self._suspected
