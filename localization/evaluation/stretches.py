@@ -76,7 +76,7 @@ def _distances(
     claimed = np.einsum("ni,nij,nj->n", in_body, grown[:, :2, :2], in_body)
     of_noise = noise[last] + noise[first] + 2.0 * (1.0 - c) * lever_sigma_m**2
     use = is_covariance(grown) & (of_noise <= _MAX_NOISE_SHARE * (claimed + of_noise)) & (claimed > 0.0)
-    use &= length > 5.0 * np.sqrt(claimed + of_noise)
+    use &= length**2 > 25.0 * (claimed + of_noise)
     measured = np.hypot(*(part.positions[last] - part.positions[first]).T)
     # noise across a displacement makes it longer by sigma^2 / (2 l) in the mean
     errors = measured - length - of_noise / (2.0 * np.maximum(length, 1e-12))
