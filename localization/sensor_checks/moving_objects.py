@@ -51,8 +51,8 @@ _MAX_NIS = 16.3
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
 """Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
 Wheels that slip in a still scene explain 14 to 33 % by chance where they turn otherwise (fr079 at 168 to 185 s), else 15 to 20 %."""
-_MAX_WHEEL_TURN_RAD, _SAME_TURN_RAD = 0.1, 0.05
-"""Turn of a rival from the wheels', without a gyro, from where on these have slipped, and up to where both turn alike [rad]."""
+_MAX_WHEEL_TURN_RAD = 0.1
+"""Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
 _RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
 """A rival leaves less than this share of what moves; and the share of a scan that it leaves unexplained counts as this much at least."""
 _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
@@ -239,19 +239,17 @@ class MovingObjects(Check):
         """Whether objects move now."""
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        off = self._distance(found.view.poses)
-        distance = math.hypot(off[0], off[1])
+        distance = math.hypot(*self._distance(found.view.poses)[:2])
         is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
-            has_turn = step.turn is not None or lidar.is_active or abs(off[2]) < _SAME_TURN_RAD
+            has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE:
                 self._suspected = found.view.poses if self._suspected is None else self._suspected
                 self._suspected_s = now_s
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
-            least_moved = _MIN_MOVED if step.turn is not None or lidar.is_active else _MIN_MOVED_WITHOUT_GYRO
-            is_moving = unique >= least and moved_share >= least_moved
+            is_moving = unique >= least and (has_turn or moved_share >= _MIN_MOVED_WITHOUT_GYRO)
         is_moving &= moved_share >= _MIN_MOVED
         lidar.shown = lidar.shown + 1 if is_moving else 0
         if is_moving:
