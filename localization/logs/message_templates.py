@@ -201,14 +201,7 @@ def odometry(topic: str, frame: str, child: str) -> MessageLayout:
     """Parts: x, y; z and w of the heading's quaternion; vx, vy and wz of the body. Covariances are zero: they are exact."""
 
     def build(stamp: Any, place: Array, heading: Array, speed: Array, turn: Array) -> Any:
-        pose = _T["geometry_msgs/msg/Pose"](position=_point((*place, 0)), orientation=_quaternion((0, 0, *heading)))
-        twist = _T["geometry_msgs/msg/Twist"](linear=_vector((*speed, 0)), angular=_vector((0, 0, *turn)))
-        return _T["nav_msgs/msg/Odometry"](
-            header=_header(stamp, frame),
-            child_frame_id=child,
-            pose=_T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-            twist=_T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
-        )
+        return _exact_odometry(_header(stamp, frame), child, ((*place, 0), (0, 0, *heading)), (speed, turn))
 
     return MessageLayout(topic, "nav_msgs/msg/Odometry", (("f8", 2), ("f8", 2), ("f8", 2), ("f8", 1)), build)
 
@@ -217,16 +210,21 @@ def odometry_in_space(topic: str, frame: str, child: str) -> MessageLayout:
     """Parts: x, y, z; x, y, z and w of the quaternion; vx, vy and wz of the body. Covariances are zero: they are exact."""
 
     def build(stamp: Any, place: Array, turned: Array, speed: Array, turn: Array) -> Any:
-        pose = _T["geometry_msgs/msg/Pose"](position=_point(place), orientation=_quaternion(turned))
-        twist = _T["geometry_msgs/msg/Twist"](linear=_vector((*speed, 0)), angular=_vector((0, 0, *turn)))
-        return _T["nav_msgs/msg/Odometry"](
-            header=_header(stamp, frame),
-            child_frame_id=child,
-            pose=_T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-            twist=_T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
-        )
+        return _exact_odometry(_header(stamp, frame), child, (place, turned), (speed, turn))
 
     return MessageLayout(topic, "nav_msgs/msg/Odometry", (("f8", 3), ("f8", 4), ("f8", 2), ("f8", 1)), build)
+
+
+def _exact_odometry(header: Any, child: str, at: tuple[Sequence[float] | Array, ...], moving: tuple[Array, Array]) -> Any:
+    """Odometry without covariance: ``at`` position (3,) and quaternion (4,), ``moving`` by vx, vy and wz of the body."""
+    pose = _T["geometry_msgs/msg/Pose"](position=_point(at[0]), orientation=_quaternion(at[1]))
+    twist = _T["geometry_msgs/msg/Twist"](linear=_vector((*moving[0], 0)), angular=_vector((0, 0, *moving[1])))
+    return _T["nav_msgs/msg/Odometry"](
+        header=header,
+        child_frame_id=child,
+        pose=_T["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+        twist=_T["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
+    )
 
 
 def point(topic: str, frame: str) -> MessageLayout:
