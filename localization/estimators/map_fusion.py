@@ -254,6 +254,6 @@ def _describe(changes: Changes) -> list[str]:
     rest = len(changes.places) - len(named)
     more = f", and {rest} more" if rest else ""
     return [
-        f"the map no longer fits at {len(changes.places)} places, {100 * changes.changed_share:.0f} % of the walls that were seen: "
+        f"the map no longer fits at {len(changes.places)} places, {100 * changes.changed_share:.0f} % of the walls that were measured: "
         f"{'; '.join(named)}{more}. --extend-map writes a map with them."
     ]

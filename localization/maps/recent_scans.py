@@ -1,7 +1,7 @@
 """The scans of the last keyframes, joined by the odometry, and by each other where the odometry is wider than they are.
 
 After a robot was carried, or its submap lost, the filter goes on by wheels alone: after a few turns the scans would no longer belong
-together. Neighbouring keyframes see the same walls, so that each scan is aligned with those before it.
+together. Neighbouring scans measure the same walls, so that each scan is aligned with those before it.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class RecentScans:
         self._keys.clear()
 
     def move(self, motion: Motion, points: Points2) -> Motion:
-        """The robot has moved by ``motion``, and sees ``points`` (N, 2) of the body frame [m]. Returns the motion as the scans have it,
-        where they know more of it."""
+        """Add ``motion``, at whose end ``points`` (N, 2) of the body frame are measured [m]. Returns the motion by scans and odometry where
+        the odometry is wide."""
         if not is_narrow(motion.cov):
             self.clear()  # carried, or driven blind
         motion = self._aligned(motion, points)
@@ -115,8 +115,8 @@ class RecentScans:
         if mahalanobis(delta, fit.pose, cov) > _FARTHEST_SQUARE:
             self.clear()
             return motion
-        R = np.linalg.inv(fit.information + OPEN_INFORMATION) * max(fit.sum_squares / fit.n_inliers, 1.0)
-        return Motion(fit.pose, np.linalg.inv(np.linalg.inv(cov) + np.linalg.inv(R)))
+        by_scans = (fit.information + OPEN_INFORMATION) / max(fit.sum_squares / fit.n_inliers, 1.0)
+        return Motion(fit.pose, np.asarray(np.linalg.inv(np.linalg.inv(cov) + by_scans), dtype=float))
 
 
 def _is_partial(points: Points2) -> bool:

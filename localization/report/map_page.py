@@ -79,7 +79,7 @@ def change_blocks(found: Mapping[str, Any]) -> list[html.Block]:
         return []
     share = 100.0 * float(found["changed_share"])
     listed = "; ".join(f"{p['kind']} at x {p['x']:.1f} m, y {p['y']:.1f} m ({p['size_m']:.1f} m)" for p in places)
-    return [html.Paragraph(f"Of the saved map's walls that were seen, {share:.1f} % have changed: {listed}.")]
+    return [html.Paragraph(f"Of the saved map's walls that were measured, {share:.1f} % have changed: {listed}.")]
 
 
 def _explorer_data(mapped: KeyframeMap, grid: Grid) -> dict[str, Any]:

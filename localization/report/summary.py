@@ -40,7 +40,7 @@ _MIN_SIGMA_FACTOR = 1.25  # the band of thousands of innovations is so narrow th
 
 
 _MIN_SHOWN_FACTOR = 1.5
-"""In sigma; what a drive shows is said where smaller errors of the covariances stay hidden."""
+"""In sigma; a verdict states what a drive can show where smaller errors of the covariances stay hidden."""
 
 
 def verdict(results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> str:

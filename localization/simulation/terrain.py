@@ -95,7 +95,7 @@ def poses_on(planar: FloatArray, waves: FloatArray, above_m: float) -> tuple[Flo
 
 @kernel
 def cast_at_ground(origins: FloatArray, directions: FloatArray, longest: float, waves: FloatArray, ranges: FloatArray) -> None:
-    """Shorten ``ranges`` (n, r) of rays from ``origins`` (n, 3) along unit ``directions`` (n, r, 3) to where they meet the ground.
+    """Shorten ``ranges`` (n, r) of rays from ``origins`` (n, 3) along unit ``directions`` (n, r, 3) to where they intersect the ground.
 
     A ray goes on by no more than its height over the steepest fall of the ground below it.
     """
