@@ -23,9 +23,8 @@ from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
-GRAVITY = 9.81
-"""[m/s^2]"""
 _NS = 1e-9
 _MAX_GAP_S = 0.5
 """Without a sample for longer, the vertical starts anew."""

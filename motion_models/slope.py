@@ -10,6 +10,9 @@ import numpy as np
 from motion_models.base import Twist
 from motion_models.se2 import FloatArray
 
+GRAVITY = 9.81
+"""[m/s^2]"""
+
 
 @dataclass(frozen=True)
 class Slope:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from localization.attitude import GRAVITY, AttitudeFilter
+from localization.attitude import AttitudeFilter
 from localization.events import ImuSample
 from motion_models.robot import GyroNoise, Mount
+from motion_models.slope import GRAVITY
 
 RADIUS, TRACK, HZ, STEP_S = 0.165, 0.57, 100.0, 0.05
 BIAS = np.array([0.003, -0.004, 0.002])

@@ -13,7 +13,6 @@ from typing import Annotated
 
 import numpy as np
 
-from localization.attitude import GRAVITY
 from localization.bounded_settings import Settings, at_least
 from localization.core.filter import Measurement, Transition
 from localization.core.state import Layout, State, Vector
@@ -22,6 +21,7 @@ from motion_models import se3
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 from motion_models.se3 import Transform3
+from motion_models.slope import GRAVITY
 
 
 @dataclass(frozen=True)

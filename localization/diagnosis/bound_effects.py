@@ -18,6 +18,7 @@ from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, mov
 from motion_models import se2
 from motion_models.calibration.prediction import series_of
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
 _CELLS = (2, 3, 4)
 """Patches of floor along each side of the area that was driven, in grids."""
@@ -29,7 +30,6 @@ _MIN_TILT_M_S2 = 0.05
 """Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
 _WARM_UP_SHARE = 0.25
 """Time constant of what warms up, over the drive's length."""
-_GRAVITY = 9.81
 _PRICE = 3.0
 """Of an effect that holds in this drive alone, in twice the log-odds beside terms."""
 
@@ -170,13 +170,13 @@ def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> Densities:
     drive, batch = predictor.drive, predictor.batch
     if drive.forces is None or drive.kind != "log":
         return []
-    left = (drive.forces - predictor.kinematic_forces) / _GRAVITY
+    left = (drive.forces - predictor.kinematic_forces) / GRAVITY
     left = left - np.median(left, axis=0)
     owner = np.repeat(np.arange(len(batch.first) - 1), np.diff(batch.first))
     found: Densities = []
     speed = np.hypot(twist[:, 0], 0.5 * drive.robot.geometry.track_width_m * twist[:, 2])
     for k, axis in ((0, "pitch"), (1, "roll")):
-        if _GRAVITY * left[:, k].std() < _MIN_TILT_M_S2:
+        if GRAVITY * left[:, k].std() < _MIN_TILT_M_S2:
             continue
         found.append((BoundShape(("vx", "vy")[k], f"speed times {axis}", "tilt", "1/rad"), speed * left[owner, k]))
     return found

@@ -24,6 +24,7 @@ from motion_models.extended_model import in_series
 from motion_models.friction import FrictionModel
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
 _DROP = (0.4, 0.62)  # one of two encoders silent; the rate of a side is their mean
 _LEAST_RATE = 0.5  # rad/s
@@ -98,7 +99,6 @@ def _like(a: float, b: float) -> bool:
 
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
-_GRAVITY = 9.81
 _GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
 _GYRO_SCALE_SIGMA = 0.03  # sensitivity tolerance of MEMS gyros (see `causes`)
 _MAX_CACHED_TWISTS = 100
@@ -327,7 +327,7 @@ class DrivePredictor:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)
             turned = np.sinc(batch.measured[:, 2] / (2.0 * math.pi))  # mean of what turns with the body, over its value in the middle
-            sx, sy = (_GRAVITY * math.sin(rise) * turned for rise in hypothesis.slope)
+            sx, sy = (GRAVITY * math.sin(rise) * turned for rise in hypothesis.slope)
             out[:, 4] = drive.forces[:, 0] - self.kinematic_forces[:, 0] - (c * sx + s * sy)
             out[:, 5] = drive.forces[:, 1] - self.kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out

@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from localization.attitude import GRAVITY
 from localization.core.space import lift
 from localization.estimators.pose_graph import check_solvable, levenberg_marquardt, robust_factor
 from motion_models import se2, se3
 from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import FloatArray
 from motion_models.se3 import Transform3
+from motion_models.slope import GRAVITY
 
 _SWAP = [3, 4, 5, 0, 1, 2]
 """Rows of GTSAM's tangents in ours, and ours in GTSAM's."""

@@ -10,10 +10,10 @@ from localization.simulation.world import Grid, cast_rays
 from motion_models import se3
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
 BODY_ABOVE_FLOOR_M = 0.13
 """Height of the body frame, that of the Husky's wheel axles [m]."""
-_GRAVITY = np.array([0.0, 0.0, 9.81])
 
 
 def body_poses(rows: FloatArray, waves: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -31,7 +31,7 @@ def imu_motion(track: TrueMotion, times: FloatArray, period: float, mount: Mount
     acceleration = (places[0] - 2.0 * places[1] + places[2]) / period**2
     turns = np.einsum("nji,njk->nik", rotations[1], rotations[0])
     rates = np.array([se3.rotation_vector(turn) for turn in turns]) / period
-    return rates, np.einsum("nji,nj->ni", rotations[1], acceleration + _GRAVITY)
+    return rates, np.einsum("nji,nj->ni", rotations[1], acceleration + np.array([0.0, 0.0, GRAVITY]))
 
 
 def ring_ranges(

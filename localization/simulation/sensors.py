@@ -22,9 +22,9 @@ from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistributio
 from localization.simulation.world import World
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
 _EQUATOR_M, _FLATTENING = 6378137.0, 1.0 / 298.257223563
-_GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
@@ -198,12 +198,12 @@ class ImuSensor:
         vx, vy, wz = now[:, TWIST].T
         ax, ay, alpha = ((now - before)[:, TWIST] / period).T  # over its own period, as an IMU does
         x, y, theta = self._mount.x, self._mount.y, now[:, 2]
-        down = _GRAVITY * math.sin(self._tilt)
+        down = GRAVITY * math.sin(self._tilt)
         force = np.column_stack(
             [
                 ax - vy * wz - alpha * y - wz**2 * x + down * np.cos(theta),
                 ay + vx * wz + alpha * x - wz**2 * y - down * np.sin(theta),
-                np.full(n, _GRAVITY * math.cos(self._tilt)),
+                np.full(n, GRAVITY * math.cos(self._tilt)),
             ]
         )
         return np.column_stack([np.zeros(n), np.zeros(n), wz]), force

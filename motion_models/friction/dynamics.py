@@ -18,9 +18,10 @@ import numpy as np
 from motion_models.compiled import kernel, subroutine
 from motion_models.friction.contact import CREEP, contact, loads, rolling
 from motion_models.friction.equilibrium import Floor
-from motion_models.friction.model import GRAVITY, FrictionModel, check_parameters, floor_of
+from motion_models.friction.model import FrictionModel, check_parameters, floor_of
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
 _THESIS_GYRATION_SQUARED = (0.43**2 + 0.27**2) / 12.0  # m^2; Appendix A's I / m
 _CLOSURE_STEPS = 12

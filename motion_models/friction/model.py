@@ -40,10 +40,8 @@ from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, Free, Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Triple
-from motion_models.slope import Slope, SlopeTwist
+from motion_models.slope import GRAVITY, Slope, SlopeTwist
 
-GRAVITY = 9.81
-"""[m/s^2]"""
 STIFFNESS: Mapping[str, float] = {"isotropic": 10.0, "thesis": 13.333}
 """slip_stiffness by contact law where a robot's file names none: Appendix A's, and 10 from `tests.studies.contact_law`."""
 CENTRIPETAL = False

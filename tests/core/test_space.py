@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.attitude import GRAVITY
 from localization.core.filter import propagate
 from localization.core.measurements.scan import measure_scan
 from localization.core.space import (
@@ -22,6 +21,7 @@ from localization.events import BodyTurn, Gravity, Step
 from motion_models import se3
 from motion_models.base import Motion
 from motion_models.robot import GyroNoise
+from motion_models.slope import GRAVITY
 
 POSE = se3.exp(np.array([1.0, 2.0, 0.3, 0.1, -0.15, 2.0]))
 DELTA = np.array([0.08, 0.01, 0.12])

@@ -6,10 +6,10 @@ import itertools
 
 import numpy as np
 
-from localization.attitude import GRAVITY
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, through_keyframes
 from motion_models import se2, se3
 from motion_models.preintegration import PreintegratedMotion
+from motion_models.slope import GRAVITY
 
 _PLANAR = [0, 1, 5]
 _BETWEEN_SIGMAS = np.array([0.01, 0.01, 0.02, 0.004, 0.004, 0.003])

@@ -13,8 +13,8 @@ import numpy as np
 
 from motion_models.base import Twist
 from motion_models.friction import FrictionModel
-from motion_models.friction.model import GRAVITY
 from motion_models.se2 import FloatArray
+from motion_models.slope import GRAVITY
 
 _STEPS = 60
 _HALVINGS = 12

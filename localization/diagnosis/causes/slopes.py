@@ -1,7 +1,7 @@
 """Causes that show where gravity pulls along the floor: the height of the centre of gravity, and the floor's grip.
 
-On a slope the line of gravity through the centre of gravity (CG) meets the floor h tan(tilt) farther downhill, and the pull along the
-floor counts over mu. On a level floor h shifts loads only while speeds change, and mu only scales the rolling resistance.
+On a slope the vertical through the centre of gravity (CG) intersects the floor h tan(tilt) farther downhill, and the pull along the floor
+counts over mu. On a level floor h shifts loads only while speeds change, and mu only scales the rolling resistance.
 """
 
 from __future__ import annotations
