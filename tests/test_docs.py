@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
+from tests.helpers.checkout import ROOT, enter_checkout
 from tests.helpers.compare import logs
 
-ROOT = Path(__file__).parents[1]
 DOCUMENTS = sorted(
     path
     for path in (
@@ -41,17 +41,7 @@ def test_documents_have_commands() -> None:
     assert len(PAGES) >= 7
 
 
-def enter_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Go to a folder with the data of this repository, its longest log cut to the first fifth."""
-    data, long = Path("tests/data"), Path("tests/data/husky-outdoor-gps/test1.bag")
-    (tmp_path / long.parent).mkdir(parents=True)
-    (tmp_path / long).write_bytes((ROOT / long).read_bytes()[: (ROOT / long).stat().st_size // 5])
-    for folder in (ROOT / data).iterdir():
-        if folder.name != long.parent.name:
-            (tmp_path / data / folder.name).symlink_to(folder)
-    monkeypatch.chdir(tmp_path)
-
-
+@pytest.mark.rendered
 @pytest.mark.parametrize("command", README_COMMANDS)
 def test_command_of_a_readme_runs(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     enter_checkout(tmp_path, monkeypatch)

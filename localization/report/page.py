@@ -9,6 +9,7 @@ The colours are Okabe and Ito's ("Color universal design", 2008), which colour-b
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -267,11 +268,16 @@ def bullets(texts: Sequence[str], summary: str = "") -> list[Block]:
 
 def render(page: Page) -> str:
     """HTML of ``page``."""
-    environment = Environment(
+    template = _environment().get_template("page.html")
+    return template.render(page=page, light={**_PAPER, **COLOURS}, dark={**_DARK_PAPER, **DARK_COLOURS}).lstrip() + "\n"
+
+
+@functools.cache
+def _environment() -> Environment:
+    """Keeps the templates that it has compiled."""
+    return Environment(
         loader=PackageLoader("localization.report"), autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
     )
-    template = environment.get_template("page.html")
-    return template.render(page=page, light={**_PAPER, **COLOURS}, dark={**_DARK_PAPER, **DARK_COLOURS}).lstrip() + "\n"
 
 
 def write_new(path: str | Path, content: bytes) -> None:

@@ -27,6 +27,7 @@ DATA = Path(__file__).parents[1] / "data"
 GRID = DATA / "vaultbot" / "rotation_grid.csv"
 
 
+@pytest.mark.rendered
 def test_diagnose_table_writes_findings_page_and_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, again = tmp_path / "out", tmp_path / "again"
     assert main(["diagnose", str(GRID), "--robot", "vaultbot", "--out", str(out), "--json", str(tmp_path / "d.json")]) == 0

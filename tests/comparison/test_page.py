@@ -12,6 +12,8 @@ from localization.comparison.statistics import closing, find, headline
 from localization.errors import OutputError
 from tests.helpers.report import PageText, without_scripts
 
+pytestmark = pytest.mark.rendered
+
 HEAD = CompareHead("vaultbot", "/ground_truth/odom", "table.csv", {"skidloc": "0.1.0"})
 LOGS = [f"runs/drive_{i}.mcap" for i in range(20)]
 

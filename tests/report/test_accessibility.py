@@ -13,6 +13,8 @@ from tests.helpers.browser import violations_of
 from tests.helpers.extended import cases
 from tests.helpers.report import HEAD, run, track
 
+pytestmark = pytest.mark.rendered
+
 WINDOWS = {"desktop": "--window-size=1280,900", "phone": "--window-size=390,900"}
 THEMES = {"light": "--blink-settings=preferredColorScheme=1", "dark": "--blink-settings=preferredColorScheme=0"}
 

@@ -18,6 +18,8 @@ from localization.report.runs import plotted_runs
 from localization.trajectory import Trajectory
 from tests.helpers.browser import run_in_page
 
+pytestmark = pytest.mark.rendered
+
 SCANS = [(k * 4_000_000_000, np.array([[2.0, 1.0], [2.0, -1.0]])) for k in range(11)]
 HEAD = ReportHead("drive.mcap", "husky_a200", "2026-01-02 03:04:05 UTC", 40.0, [], {}, "c0ffee", SCANS)
 STAMPS = np.arange(401, dtype=np.int64) * 100_000_000

@@ -36,6 +36,8 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error, without_scripts
 
+pytestmark = pytest.mark.rendered
+
 # ---- words
 
 
