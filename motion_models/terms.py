@@ -3,8 +3,9 @@
     [models.skid_steer.terms]
     vy = {"wz*abs(wz)" = [-0.12, 0.01, "m s"]}      # vy = the model's + c wz |wz| with c = -0.12 +- 0.01 m s
 
-A term is a coefficient times a product of `VARIABLES`, each as it is, to a power (v^2), or in abs() or sign(); its sigma is that of the
-coefficient, and the unit may be left out. Terms are zero at rest: at least one factor is a motion.
+A term is a coefficient times a product of `VARIABLES`, each as it is, to a power (v^2), or in abs() or sign(); rise(t,T) is what warms up
+with the time constant T [s], 1 - exp(-t/T). Its sigma is that of the coefficient, and the unit may be left out. Terms are zero at rest: at
+least one factor is a motion.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ _MAX_POWER = 4
 """Largest power of a variable: higher ones of noisy rates are noise."""
 _LARGEST = 1e6
 """Largest coefficient, in SI units."""
+_TIME_CONSTANTS_S = (0.1, 1e5)
+"""Least and largest time constant of a rise [s]: a sample, and more than a day."""
 _MOST_TERMS = 32
 """Most terms of one model: each is a parameter that the filter may correct."""
 
@@ -71,6 +74,7 @@ _SYNONYMS = {
 }
 """Other names of the variables, for errors that name the nearest one."""
 _FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
+_RISE = re.compile(r"rise\(t,(\d+(?:\.\d+)?(?:e\d+)?)\)")
 
 
 class Factor(NamedTuple):
@@ -78,15 +82,22 @@ class Factor(NamedTuple):
 
     variable: str
     form: str
-    """Empty, abs or sign."""
+    """Empty, abs, sign or rise."""
     power: int
+    time_constant_s: float = 0.0
+    """Of a rise [s]."""
 
     def __str__(self) -> str:
+        if self.form == "rise":
+            return f"rise({self.variable},{self.time_constant_s:.4g})"
         name = f"{self.form}({self.variable})" if self.form else self.variable
         return name if self.power == 1 else f"{name}^{self.power}"
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Value and derivative by the variable ``x`` (n,); at the kinks of abs and sign the derivative is the mean of both sides', 0."""
+        if self.form == "rise":
+            left = np.exp(-x / self.time_constant_s)
+            return np.asarray(1.0 - left), np.asarray(left / self.time_constant_s)
         if self.form == "sign":
             return np.asarray(np.sign(x) ** self.power), np.zeros_like(x)
         base, slope = (np.abs(x), np.sign(x)) if self.form else (x, np.ones_like(x))
@@ -116,8 +127,8 @@ class Expression:
         )
 
     def dimension(self) -> tuple[int, int]:
-        """Powers of metre and second in its unit; signs have none."""
-        has_unit = [f for f in self.factors if f.form != "sign"]
+        """Powers of metre and second in its unit; signs and rises have none."""
+        has_unit = [f for f in self.factors if f.form not in ("sign", "rise")]
         return sum(VARIABLES[f.variable].metres * f.power for f in has_unit), sum(VARIABLES[f.variable].seconds * f.power for f in has_unit)
 
     def evaluate(self, values: Mapping[str, FloatArray]) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -138,7 +149,11 @@ def parse_expression(text: str, where: str = "term") -> Expression:
     'wz*abs(wz)'
     """
     powers: dict[tuple[str, str], int] = {}
+    rises: list[Factor] = []
     for part in re.sub(r"\*\*", "^", text.replace(" ", "")).split("*"):
+        if part.startswith("rise("):
+            rises.append(_rise(part, text, where))
+            continue
         found = _FACTOR.fullmatch(part)
         if found is None:
             raise RobotError(
@@ -153,11 +168,23 @@ def parse_expression(text: str, where: str = "term") -> Expression:
         if not 1 <= powers[name, form] <= _MAX_POWER:
             raise RobotError(f"{where}: power {powers[name, form]} of {name} in {text[:60]!r}; powers are 1 to {_MAX_POWER}.")
     order = sorted(powers, key=lambda key: (_NAMES.index(key[0]), ("", "abs", "sign").index(key[1])))
-    expression = Expression(tuple(Factor(name, form, powers[name, form]) for name, form in order))
+    expression = Expression((*(Factor(name, form, powers[name, form]) for name, form in order), *rises))
     if not any(VARIABLES[f.variable].is_motion for f in expression.factors):
         motions = ", ".join(name for name, v in VARIABLES.items() if v.is_motion)
         raise RobotError(f"{where}: {text[:60]!r} would move a robot that stands; multiply it by one of {motions}.")
     return expression
+
+
+def _rise(part: str, text: str, where: str) -> Factor:
+    """The factor that ``part`` of ``text`` writes, as ``rise(t,30)``. Raises `RobotError`."""
+    found = _RISE.fullmatch(part)
+    low, high = _TIME_CONSTANTS_S
+    if found is None or not low <= float(found[1]) <= high:
+        raise RobotError(
+            f"{where}: cannot read {part[:40]!r} in {text[:60]!r}; a rise is of t, with a time constant of {low:g} to {high:g} s, "
+            "as rise(t,30)."
+        )
+    return Factor("t", "rise", 1, float(found[1]))
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,6 @@ _MIN_TURNS = 3.0
 """Turns of a wheel in a drive from which on effects of its angle can be separated from those of time."""
 _MIN_TILT_M_S2 = 0.05
 """Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
-_WARM_UP_SHARE = 0.25
-"""Time constant of what warms up, over the drive's length."""
 _PRICE = 3.0
 """Of an effect that holds in this drive alone, in twice the log-odds beside terms."""
 
@@ -81,18 +79,14 @@ Densities = list[tuple[BoundShape, FloatArray]]
 
 
 def _of_time(predictor: DrivePredictor, twist: FloatArray) -> Densities:
-    """What warms up, with a quarter of the drive as its time constant, or wears with the distance."""
-    v, wz, t = twist[:, 0], twist[:, 2], predictor.times_s
-    whole = float(t.max()) if len(t) else 0.0
-    if predictor.drive.kind != "log" or whole <= 0.0:
+    """What wears with the distance; what warms up is a term."""
+    if predictor.drive.kind != "log":
         return []
-    warm = 1.0 - np.exp(-t / (_WARM_UP_SHARE * whole))
-    way = np.cumsum(np.abs(v) * predictor.batch.dt)
-    found: Densities = []
-    for name, component, motion in (("distance", "vx", v), ("turning", "wz", wz)):
-        found.append((BoundShape(component, f"{name}, growing as what warms up", "time", "1"), motion * warm))
-        found.append((BoundShape(component, f"{name} times the way driven", "time", "1/m"), motion * way))
-    return found
+    way = np.cumsum(np.abs(twist[:, 0]) * predictor.batch.dt)
+    return [
+        (BoundShape(component, f"{name} times the way driven", "time", "1/m"), twist[:, i] * way)
+        for name, component, i in (("distance", "vx", 0), ("turning", "wz", 2))
+    ]
 
 
 def _places(predictor: DrivePredictor, twist: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ _FEWEST_WINDOWS = 16
 _TWO_SIDED_95 = 1.96
 _NS = 1e-9
 _NOT_WRITTEN = {
-    "time": "on another drive it begins from another state",
+    "time": "another drive begins after another way",
     "place": "a robot file has no map",
     "wheel angle": "the angle at the start differs from drive to drive",
     "tilt": "models have no tilt as an input",
@@ -86,6 +86,8 @@ class Extension:
         known = "no physical cause known"
         if self.replaced:
             known += f"; it explains the drive better than {' and '.join(self.replaced)}"
+        if any("t" in t.term.expression.variables for t in self.terms):
+            known += "; t counts from the start of each drive, so that it holds for drives that start as this one did"
         text = f"{', and '.join(parts)} beyond {self.model} ({known}); "
         if self.check is None or not self.is_better:
             return f"{text}on the other half of the drive it improves nothing beyond the noise, so it is not written"

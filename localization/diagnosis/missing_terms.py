@@ -47,6 +47,12 @@ _MORE = {
     "wz": ("dwz", "abs(dwz)*sign(wz)", "wz*abs(dv)", "wz*dv", "v*dwz", "wz*t", "v*t", "dv", "abs(wz)*t"),
 }
 """Accelerations and time."""
+_WARMING = {"vx": "v", "wz": "wz"}
+"""Motion whose share changes while tyres and gears warm up, by component."""
+_TIME_CONSTANTS = (0.125, 0.25, 0.5)
+"""Of what warms up, over the drive's length: slower is a drift with t, and faster is over before it is measured."""
+_SHORTEST_S = 16.0
+"""Drive in which a drift can be distinguished from what warms up: eight windows [s]."""
 _OF_CG = {
     "vx": ("v*cg_x", "wz*cg_y", "v*cg_y", "abs(wz)*cg_x"),
     "vy": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x"),
@@ -130,9 +136,12 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
     powers = list(itertools.product(_POWERS, _POWERS))[1:]
     texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
     has_cg = bool(np.std(predictor.batch.cg, axis=0).max() > _CG_MOVES_M)
+    whole = float(predictor.batch.t.max(initial=0.0))
+    rises = [f"rise(t,{share * whole:.2g})" for share in _TIME_CONSTANTS if whole > _SHORTEST_S]
     found: dict[tuple[str, Expression], None] = {}
     for component in COMPONENTS:
-        for text in (*texts, *_MORE[component], *(_OF_CG[component] if has_cg else ())):
+        warming = [f"{_WARMING[component]}*{rise}" for rise in rises] if component in _WARMING else []
+        for text in (*texts, *_MORE[component], *warming, *(_OF_CG[component] if has_cg else ())):
             found.setdefault((component, parse_expression(text)))
     base = 2.0 * math.log(len(found) + others) + math.log(max(count, 2))
     more = {(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}

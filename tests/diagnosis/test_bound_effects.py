@@ -28,7 +28,7 @@ FOREIGN: dict[str, tuple[Effect, str, float]] = {
     "encoder scale that grows with speed": (lambda m: (-0.12 * m.v * abs(m.v), 0.0, 0.0), "vx[v*abs(v)]", -0.12),
     "tyres that warm up": (
         lambda m: (0.05 * m.v * (1.0 - np.exp(-4.0 * m.share)), 0.0, 0.0),
-        "vx[distance, growing as what warms up]",
+        "vx[v*rise(t,24)]",
         0.05,
     ),
 }

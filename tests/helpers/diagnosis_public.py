@@ -17,6 +17,7 @@ import dataclasses
 import importlib.util
 import math
 import pickle
+import re
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -57,6 +58,8 @@ FLAT_K = (0.45, 0.65)
 """k of turns in place on flat ground that skid-steer robots have (`docs`, thesis: .55); MuJoCo's contacts must give it."""
 _NS = 1e-9
 _MIN_SIGMAS = 3.0
+_RISE = re.compile(r"rise\(t,[^)]*\)")
+"""What warms up, of any time constant."""
 
 
 class Hidden(NamedTuple):
@@ -80,9 +83,7 @@ EFFECTS: Mapping[str, Hidden] = {
     "encoder scale with speed": _law(lambda m: (-0.12 * m.v * abs(m.v), 0.0, 0.0), "vx[v*abs(v)]", -0.12),
     "sideways slip wz |wz|": _law(lambda m: (0.0, 0.1 * m.wz * abs(m.wz), 0.0), "vy[wz*abs(wz)]", 0.1),
     "pull v^2 wz": _law(lambda m: (0.0, 0.0, -0.6 * m.v**2 * m.wz), "wz[v^2*wz]", -0.6),
-    "tyres warm up": _law(
-        lambda m: (0.05 * m.v * (1.0 - np.exp(-4.0 * m.share)), 0.0, 0.0), "vx[distance, growing as what warms up]", 0.05
-    ),
+    "tyres warm up": _law(lambda m: (0.05 * m.v * (1.0 - np.exp(-4.0 * m.share)), 0.0, 0.0), "vx[v*rise]", 0.05),
     "wheel_radius_difference": Hidden(None, frozenset({"wheel_radius_difference"}), 0.02, "wheel_radius_difference"),
     "lidar_offset_x": Hidden(None, frozenset({"lidar_offset_x"}), 0.05, "lidar_offset_x"),
     "payload": Hidden(None, frozenset({"payload", "cg_offset_x"}), 8.0, "payload"),
@@ -307,6 +308,7 @@ def score(method: str, name: str, drives: tuple[Drive, Drive, Drive], baseline: 
     """One row: ``drives`` are the one to diagnose, the fresh one, and the fresh one without the effect."""
     measured, fresh, floor = drives
     answer, hidden = METHODS[method][0](measured, baseline), EFFECTS[name]
+    answer = answer._replace(names=tuple(_RISE.sub("rise", n) for n in answer.names))
     is_named = bool(set(answer.names[:1]) & hidden.names)
     if hidden.names:  # a cause that cannot be separated from the first counts as named, as in the other tables
         is_named = is_named or (method == "skidloc" and bool(set(answer.names) & hidden.names) and "[" not in answer.names[0])

@@ -32,7 +32,8 @@ def windows(robots: Sequence[Robot], model: str, seed: int) -> list[Maneuver]:
         dt = np.full(_INTERVALS, _DT)
         true = preintegrate(made, dt, rates, robot.center_of_gravity, made.nominal, WheelNoise()).delta
         measured = se2.compose(true, se2.exp(SIGMA * rng.normal(size=3)))[None]
-        found.append(Maneuver(dt, rates, measured, np.array([_INTERVALS]), robot.center_of_gravity, np.diag(SIGMA**2), str(i)))
+        cov, start_s = np.diag(SIGMA**2), i * _INTERVALS * _DT
+        found.append(Maneuver(dt, rates, measured, np.array([_INTERVALS]), robot.center_of_gravity, cov, str(i), start_s=start_s))
     return found
 
 

@@ -39,6 +39,7 @@ def husky(entry: str, model: str = "diff_drive") -> Robot:
         ("vy", "v*cg_y", "v*cg_y", "1/m", True),
         ("vx", "left", "left", "m", False),
         ("wz", "t*wz", "wz*t", "1/s", True),
+        ("vx", "rise(t, 20.0)*v", "v*rise(t,20)", "1", True),
     ],
 )
 def test_expression_is_written_in_one_way_with_its_unit(component: str, text: str, written: str, unit: str, is_symmetric: bool) -> None:
@@ -66,6 +67,8 @@ def test_term_value_is_that_of_python() -> None:
         ('vy = {"wz + v" = 1}', "cannot read"),
         ('vy = {"__import__(os)" = 1}', "cannot read"),
         ('vy = {"wz^9" = 1}', "power 9 of wz"),
+        ('vx = {"v*rise(v,20)" = 1}', "a rise is of t, with a time constant of 0.1 to 100000 s"),
+        ('vx = {"v*rise(t,0)" = 1}', "a rise is of t"),
         ('vy = {"wz" = [1, -1]}', "sigma not below 0"),
         ('vy = {"wz" = [nan, 1]}', "must be value"),
         ('vy = {"wz" = [1, 1, "m/s"]}', "the unit of 'wz' is 'm', found 'm/s'"),
