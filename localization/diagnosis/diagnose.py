@@ -39,13 +39,14 @@ from localization.diagnosis.linearization import (
     make_predictor,
 )
 from localization.diagnosis.model_error import ModelError, find_model_error, size_error, unmodelled_by
-from localization.diagnosis.noise import slow_turn_sigmas
+from localization.diagnosis.noise import slip_sigmas, slow_turn_sigmas
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
     has_tolerated_substitute,
     heldout_gain,
     heldout_log_odds,
+    is_correction_worse,
     max_statistic,
     p_value,
     problems_without_a_fold,
@@ -132,9 +133,18 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
     predictor, first, error = _linearize_with_model_error(make_predictor(drive, model, baseline), config)
     rng = np.random.default_rng(config.seed)
-    linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
+    linearization, chosen = _choose_parts(predictor, first, error, *_choose_causes(predictor, first))
     chosen = _drop_insignificant(linearization, chosen, rng, config)
+    if chosen and _is_worse_with(predictor, linearization, chosen):
+        linearization, chosen = first, ()
     return _conclude(_Searched(predictor, first, linearization, error), chosen, rng, config)
+
+
+def _is_worse_with(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...]) -> bool:
+    """Whether a correction of the causes ``chosen`` alone, at the sizes that are named, makes discrepancies larger than they are."""
+    sizes = linearization.problem.fit_by_likelihood(chosen)[0]
+    named = with_sizes({linearization.causes[i]: float(size) for i, size in zip(chosen, sizes, strict=True)})
+    return is_correction_worse(predictor, linearization.noise, predictor.discrepancies(named))
 
 
 class _Searched(NamedTuple):
@@ -193,16 +203,17 @@ def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Lin
 
 
 def _choose_parts(
-    predictor: DrivePredictor, first: Linearization, linearization: Linearization, chosen: tuple[int, ...]
+    predictor: DrivePredictor, first: Linearization, error: ModelError, linearization: Linearization, chosen: tuple[int, ...]
 ) -> tuple[Linearization, tuple[int, ...]]:
     """The drive and the causes ``chosen`` on it, or the best set with causes in a part of the drive, where these explain it better."""
-    spells = find_spells(predictor, linearization, chosen)
+    log_odds = error.log_odds if error.is_shown else 0.0
+    spells = find_spells(predictor, linearization, chosen, log_odds)
     if not spells:
         return linearization, chosen
     state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *spells), {}, TOLERANCE))
     if not any(state.causes[i].spell for i in best):
         return linearization, chosen
-    more = find_spells(predictor, state, best)
+    more = find_spells(predictor, state, best, log_odds)
     if more:
         kept = [state.causes[i] for i in best if state.causes[i].spell]
         state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *kept, *more), {}, TOLERANCE))
@@ -300,10 +311,11 @@ def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> t
 
 
 def _reference_sigmas(predictor: DrivePredictor) -> FloatArray:
-    """(M, 3) noise that a drive has to have: of the motion reference, and of turns by wheels so slow that the model was never measured."""
+    """(M, 3) noise that a drive has to have: of the motion reference, of turns by wheels so slow that the model was never measured, and of
+    contacts that are not the model's."""
     given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
     given[:, 2] = np.hypot(given[:, 2], slow_turn_sigmas(predictor))
-    return np.asarray(given)
+    return np.asarray(np.hypot(given, slip_sigmas(predictor)))
 
 
 def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:

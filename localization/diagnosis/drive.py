@@ -149,32 +149,46 @@ class _Recorder:
         return np.array([np.zeros(3) if slope is None else slope for slope in slopes])
 
 
-class _Imu:
-    """Keeps the gyro's and the accelerometers' whole record."""
+class ImuRecord:
+    """The gyro's and the accelerometers' whole record.
+
+    An accelerometer at r off the body's origin measures f + alpha x r + omega x (omega x r), f the specific force there (Titterton & Weston
+    2004, sec. 3.5); about the vertical alone the planar part is f + alpha (-r_y, r_x) - omega^2 (r_x, r_y).
+    """
 
     def __init__(self, robot: Robot, mounts: Any) -> None:
         self._mounts = mounts
         self.gyro = GyroRecord(robot.gyro_noise, mounts)
         self.stamps: list[int] = []
         self.forces: list[FloatArray] = []
+        self._rates: list[float] = []
+        self._at = np.zeros(2)
 
     def insert(self, sample: ImuSample) -> None:
+        """Append ``sample``; samples come in order of time."""
         self.gyro.insert(sample)
         self.stamps.append(sample.stamp_ns)
-        self.forces.append(self._mounts.get(sample.frame_id, Mount()).rotation() @ sample.linear_acceleration)
+        mount = self._mounts.get(sample.frame_id, Mount())
+        rotation = mount.rotation()
+        self._at = np.array([mount.x, mount.y])
+        self.forces.append(rotation @ sample.linear_acceleration)
+        self._rates.append(float(rotation[2] @ sample.angular_velocity))
 
     def means(self, spans: IntArray) -> FloatArray | None:
-        """(W, 2) mean force in each span; None where gravity is not upright, or missing."""
+        """(W, 2) mean force in each span at the body's origin; None where gravity is not upright, or missing."""
         if not self.stamps:
             return None
         stamps, forces = np.array(self.stamps), np.array(self.forces)
         if not is_gravity(float(np.median(forces[:, 2]))):
             return None
-        total = np.vstack([np.zeros(3), np.cumsum(forces, axis=0)])
+        rates = np.array(self._rates)
+        planar = forces[:, :2] + rates[:, None] ** 2 * self._at
+        total = np.vstack([np.zeros(2), np.cumsum(planar, axis=0)])
         a, b = np.searchsorted(stamps, spans[:, 0]), np.searchsorted(stamps, spans[:, 1])
         if np.any(b - a < 3):
             return None
-        return np.asarray(((total[b] - total[a]) / (b - a)[:, None])[:, :2])
+        angular = (rates[b - 1] - rates[a]) / ((stamps[b - 1] - stamps[a]) * _NS)
+        return np.asarray((total[b] - total[a]) / (b - a)[:, None] - angular[:, None] * np.array([-self._at[1], self._at[0]]))
 
 
 class _Postures:
@@ -241,7 +255,7 @@ def drive_of_events(
 ) -> Drive:
     """Cut ``events`` into windows whose motion the ``reference`` (and its name) measures, and store what else was measured in each."""
     inner, words = reference
-    recorder, imu = _Recorder(inner), _Imu(robot, mounts)
+    recorder, imu = _Recorder(inner), ImuRecord(robot, mounts)
     frame = ""
     wheel_stamps: list[int] = []
 

@@ -424,6 +424,15 @@ def mirrored(columns: FloatArray) -> FloatArray:
     return np.stack([*ahead, *aside], axis=-1)
 
 
+def relative_speeds(predictor: DrivePredictor) -> FloatArray:
+    """(M,) how much faster the wheels roll than in the mean of the drive, over that mean: slips of contacts that do not follow the model's
+    law depend on the speed as well."""
+    batch = predictor.batch
+    speeds = np.array([np.sqrt(np.mean(np.square(batch.wheels[inside]))) for inside in batch.intervals()])
+    mean = max(float(speeds.mean()), 1e-9)
+    return np.asarray(speeds / mean - 1.0)
+
+
 _GIVE_S = 0.01
 """Sigma of how far wheels slip while speeds change, over the change: MuJoCo's contacts stop a slip within 5 to 9 ms [s]."""
 

@@ -13,7 +13,7 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with_sizes
 from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, give_columns, mirrored, slip_columns
+from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, give_columns, mirrored, relative_speeds, slip_columns
 from localization.diagnosis.floor_slope import find_floor_slope
 from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
 from motion_models.base import MotionModel
@@ -323,5 +323,6 @@ def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArr
             columns.append(predictor.signature(hypothesis, cause, rows)[..., None] * (cause.plausible / FLAT))
         columns.append(give_columns(predictor) / FLAT)
     if predictor.unmodelled.slip_share:
-        columns.append(mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT))
+        slips = mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT)
+        columns += [slips, slips * relative_speeds(predictor)[:, None, None]]
     return np.where(np.isfinite(rows)[..., None], np.concatenate(columns, axis=-1), np.nan)

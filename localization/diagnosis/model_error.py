@@ -28,8 +28,9 @@ _RICHEST_SHARE = 0.05
 _MAX_LOG_ODDS = 7.0
 """Twice the log-likelihood that errors of the model may gain: odds of 33. Of 100 drives by the tyres of the model 4 have more, of 80 by
 MuJoCo's contacts 74."""
-_MAX_SHARE = 0.01
-"""Largest sigma of slips that a diagnosis tolerates, over the wheels' way; larger ones are an effect without a name."""
+_SLIP_SHARE = 0.01
+"""Sigma of slips that a diagnosis tolerates where the drive shows that the contacts are not the model's, over the wheels' way: the median
+of six healthy drives by MuJoCo's contacts. Larger ones are an effect without a name."""
 CG_OFFSETS = ("cg_offset_x", "cg_offset_y")
 """Causes that move the centre of gravity, along x and y."""
 _LEAST_LEVER_M = 0.05
@@ -81,9 +82,8 @@ def find_model_error(predictor: DrivePredictor, linearization: Linearization) ->
 
 
 def unmodelled_by(predictor: DrivePredictor, error: ModelError) -> Unmodelled:
-    """What the model's ``error`` adds to the nuisances of a diagnosis: no larger slips than other contacts make."""
-    share = min(error.share, _MAX_SHARE) if error.is_shown else 0.0
-    return dataclasses.replace(predictor.unmodelled, slip_share=share)
+    """What the model's ``error`` adds to the nuisances of a diagnosis: slips as large as other contacts make, and no larger."""
+    return dataclasses.replace(predictor.unmodelled, slip_share=_SLIP_SHARE if error.is_shown else 0.0)
 
 
 def cg_prior_sigmas(robot: Robot) -> FloatArray:

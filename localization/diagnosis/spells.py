@@ -47,8 +47,9 @@ class _Option(NamedTuple):
     spell: Spell
 
 
-def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> tuple[Cause, ...]:
-    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes does; none for tables and short drives.
+def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...], error_log_odds: float = 0.0) -> tuple[Cause, ...]:
+    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes does, by more than the ``error_log_odds`` that
+    errors of the contact model gain on it; none for tables and short drives.
 
     Where one of those ``chosen`` holds in a part of the drive, others are tried in this part alone: one event may change several things, as
     a tyre that loses air changes the mean of all radii and the difference of both sides.
@@ -65,7 +66,7 @@ def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[i
     prices = 2.0 * math.log(len(spells)) + math.log(max(state.problem.count, 2)) * np.array(moments)
     for option in itertools.chain.from_iterable(_options(state, b, tried, spells, prices - g) for b, g in zip(bases, gains, strict=True)):
         name = state.causes[option.cause].id
-        if option.cost < min(least - _MARGIN, options[name].cost if name in options else math.inf):
+        if option.cost < min(least - max(_MARGIN, error_log_odds), options[name].cost if name in options else math.inf):
             options[name] = option
     best = sorted(options.values())[:_MOST]
     if not best or heldout_lead(predictor, state, chosen, best[0]) <= 0.0:

@@ -7,14 +7,14 @@ import pytest
 
 from localization.calibration.motion_references import TrackMotionReference, Wheels
 from localization.diagnosis.diagnose import examine
-from localization.diagnosis.drive import Drive, MessageLoss, StandstillTurn, find_message_loss, find_standstill_turn
+from localization.diagnosis.drive import Drive, ImuRecord, MessageLoss, StandstillTurn, find_message_loss, find_standstill_turn
 from localization.evaluation.references import ReferenceTrack
 from localization.events import ImuSample, WheelSample
 from localization.gyro import GyroRecord
 from localization.wheel_buffer import WheelBuffer
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
-from motion_models.robot import GyroNoise
+from motion_models.robot import GyroNoise, Mount
 from motion_models.robot_file import load_robot
 
 PERIOD_NS = 20_000_000
@@ -49,6 +49,20 @@ def test_find_message_loss_of_most_messages_is_counted(share: float) -> None:
 def test_find_message_loss_irregular_messages_have_no_period() -> None:
     stamps = np.cumsum(np.random.default_rng(0).exponential(0.02, 500) * 1e9).astype(np.int64)
     assert find_message_loss(stamps) is None
+
+
+@pytest.mark.parametrize("angular", [0.0, 0.2])
+def test_imu_record_off_the_middle_gives_the_force_in_the_middle(angular: float) -> None:
+    """0.2 m ahead and 0.3 m to the right: f + alpha (-y, x) - omega^2 (x, y); the force in the middle is (0.5, -0.1) m/s^2."""
+    x, y, force = 0.2, -0.3, np.array([0.5, -0.1])
+    record = ImuRecord(load_robot("husky_a200"), {"imu": Mount(x=x, y=y)})
+    for i in range(101):
+        rate = 0.8 + angular * i * PERIOD_NS * 1e-9
+        planar = force + angular * np.array([-y, x]) - rate**2 * np.array([x, y])
+        record.insert(ImuSample(i * PERIOD_NS, np.array([0.0, 0.0, rate]), np.r_[planar, 9.81], "imu"))
+    means = record.means(np.array([[0, 100 * PERIOD_NS]]))
+    assert means is not None
+    assert means[0] == pytest.approx(force, abs=1e-9)
 
 
 def gyro(rate: float) -> GyroRecord:

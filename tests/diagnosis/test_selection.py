@@ -14,7 +14,13 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization, make_regression
 from localization.diagnosis.noise import given_noise
-from localization.diagnosis.selection import heldout_log_odds, problems_without_a_fold, simplest_set, strongest_beyond_tolerance
+from localization.diagnosis.selection import (
+    heldout_log_odds,
+    is_correction_worse,
+    problems_without_a_fold,
+    simplest_set,
+    strongest_beyond_tolerance,
+)
 from motion_models.se2 import FloatArray
 
 WINDOWS, SIGMA, TOLERANCE = 40, 0.01, 0.35
@@ -50,6 +56,18 @@ def predictive_log_density(state: Linearization, chosen: tuple[int, ...]) -> flo
         V = np.linalg.inv(a.T @ a + np.linalg.inv(prior))
         total += multivariate_normal(b @ V @ a.T @ y[fold != f], b @ V @ b.T + np.eye(len(b))).logpdf(y[fold == f])
     return total
+
+
+def test_is_correction_worse_where_discrepancies_grow() -> None:
+    """What is tolerated of one cause is no harm, ten times that is; windows that are outliers do not count."""
+    state = made_up(np.zeros(4), np.random.default_rng(0))
+    predictor = cast(DrivePredictor, SimpleNamespace(discrepancies=lambda hypothesis: state.rows))
+    large = 10.0 * WITHIN[0] * state.signatures[..., 0]
+    assert is_correction_worse(predictor, state.noise, state.rows + large)
+    assert not is_correction_worse(predictor, state.noise, state.rows + 0.1 * large)
+    weights = np.where(np.arange(WINDOWS) < 4, 0.0, 1.0)
+    outliers = np.where(weights[:, None] == 0.0, 1.0, 0.0)
+    assert not is_correction_worse(predictor, dataclasses.replace(state.noise, weights=weights), state.rows + outliers)
 
 
 @pytest.mark.parametrize("seed", range(3))
