@@ -4,7 +4,7 @@ Understood are plain values, numpy arrays and numbers, the usual containers, and
 without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays keep their
 layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
 
-Long lists of numbers, and of frozen dataclasses or named tuples of numbers and arrays, are written as columns: hours of them must not
+Long lists and deques of numbers, and of frozen dataclasses or named tuples of numbers and arrays, are written as columns: hours of them must not
 take longer than a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed, that makes
 no difference.
 
@@ -101,10 +101,11 @@ class _Writer:
         if kind is list:
             packed = self._packed(value)
             return ["p", *packed] if packed else ["l", *map(self.put, value)]
+        if kind is deque:
+            packed = self._packed(value)
+            return ["Q", value.maxlen, *packed] if packed else ["q", value.maxlen, *map(self.put, value)]
         if kind is dict:
             return ["d", *([self.put(k), self.put(v)] for k, v in value.items())]
-        if kind is deque:
-            return ["q", value.maxlen, *map(self.put, value)]
         if kind is array:
             return ["a", value.typecode, self._array(np.array(value))]
         if kind is slice:
@@ -113,8 +114,8 @@ class _Writer:
             return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
         raise CheckpointError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
-    def _packed(self, values: list[Any]) -> list[Json] | None:
-        """A long list of numbers, of equal rows of numbers, or of frozen dataclasses or named tuples: the last seconds of wheels are
+    def _packed(self, values: list[Any] | deque[Any]) -> list[Json] | None:
+        """A long sequence of numbers, of equal rows of numbers, or of frozen dataclasses or named tuples: the last seconds of wheels are
         thousands."""
         if len(values) < _PACKED_AT_LEAST:
             return None
@@ -238,6 +239,8 @@ class _Reader:
             queue.extend(map(self.get, rest[1:]))
         elif kind == "p":
             self._made[index] = self._list(*rest)
+        elif kind == "Q":
+            self._made[index] = deque(self._list(*rest[1:]), maxlen=rest[0])
         elif kind == "m":
             self._made[index] = self._array(rest[0])
         elif kind == "v":
