@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,7 +22,7 @@ from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount, Robot
 
 _POLL_S, _SETTLE_S, _REPORT_PERIOD_S = 0.1, 1.0, 30.0
-_MAX_BACKLOG = 20_000
+MAX_BACKLOG = 20_000
 """Messages that are stored before the start; the oldest are dropped."""
 
 TF, TF_STATIC, TF_TYPE = "/tf", "/tf_static", "tf2_msgs/msg/TFMessage"
@@ -75,10 +76,12 @@ class TopicDiscovery:
         report: Callable[[str], None],
         is_over: Callable[[], bool],
         is_ready: Callable[[], bool] = lambda: True,
+        patience_s: float = math.inf,
     ) -> DiscoveredTopics:
         """Wait for wheels or a LiDAR, for the topics ``needed``, and for at most ``wait_s`` [s] for others that are published.
 
-        Until ``is_ready``, messages are stored; as many as the store holds, then they wait in the transport.
+        Until ``is_ready``, or ``patience_s`` after the first message of wheels or a LiDAR [s], messages are stored; as many as the store
+        holds, then they wait in the transport.
 
         Silent ones are reported once it is ready, when they change and every half minute. Raises `TransportError` for a topic that
         carries another type, `KeyboardInterrupt` when ``is_over``.
@@ -87,7 +90,7 @@ class TopicDiscovery:
         begin = reported = time.monotonic()
         last_report, first = "", None
         while not is_over():
-            if is_ready() or len(self._backlog) < _MAX_BACKLOG:
+            if is_ready() or len(self._backlog) < MAX_BACKLOG:
                 for received in self._transport.take(_POLL_S):
                     self._receive(received)
             else:
@@ -97,12 +100,13 @@ class TopicDiscovery:
             self._check_types(published)
             if first is None and any(self.candidates[topic] in (*_MOTION_TYPES, *TWIST_TYPES) for topic in self._counts):
                 first = now
-            is_late = first is not None and now - first >= wait_s
+            heard_s = -math.inf if first is None else now - first
+            is_late = heard_s >= wait_s
             waited_for = {*needed, *(() if is_late else published)} & set(self.candidates)
             silent = sorted(waited_for - set(self._counts))
-            is_settled = first is not None and now - first >= min(wait_s, _SETTLE_S)
+            is_settled = heard_s >= min(wait_s, _SETTLE_S)
             has_mounts = bool(self._transforms.mounts()) or self._tf_static not in published or is_late
-            if is_settled and not silent and has_mounts and is_ready():
+            if is_settled and not silent and has_mounts and (is_ready() or heard_s >= patience_s):
                 for topic in sorted(set(published) & set(self.candidates) - set(self._counts)):
                     report(f"started without {topic}: it is published, but no message comes.")
                 discovered = self._discovered()
@@ -138,7 +142,7 @@ class TopicDiscovery:
             self._first[received.topic].append(FirstMessage(wall_ns, stamp_ns(message), frame_name(message.header.frame_id)))
         self._counts[received.topic] += 1
         self._backlog.append(received)
-        if len(self._backlog) > _MAX_BACKLOG:
+        if len(self._backlog) > MAX_BACKLOG:
             del self._backlog[0]
 
     def _check_types(self, published: Mapping[str, set[str]]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gc
+import math
 import queue
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
@@ -24,6 +25,7 @@ from localization.logs.decode import MessageStats
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
+from localization.ros.dead_reckoning import DeadReckoning
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
 from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
@@ -43,6 +45,8 @@ from motion_models.prior import prior_notes
 from motion_models.robot import Mount
 
 _STATUS_PERIOD_S, _POLL_S = 1.0, 0.2
+_COMPILING_S = 3.0
+"""After the first message of wheels or LiDAR, odometry does not wait longer for the estimator to compile."""
 _AFTER_ESTIMATE = 1.5
 """A status waits for an estimate for up to this many periods: then the next scan is farthest."""
 _MAX_PREDICTED_AGE_NS = 200_000_000
@@ -76,6 +80,8 @@ class Node:
         self._commands = OperatorCommands(self, transport, names, report)
         self._gnss = _gnss(run, transport, self._stats)
         self._problems: set[str] = set()  # that were reported
+        self._is_compiled: Callable[[], bool] = lambda: True
+        self._compiling: DeadReckoning | None = None
         self._entrance: LidarEntrance | None = None
         self._wiring: LiveWiring | None = None
         self._wiring_notes: list[str] = []
@@ -97,7 +103,8 @@ class Node:
         is_over: Callable[[], bool] = lambda: False,
         view: View | None = None,
     ) -> Node:
-        """Compile and discover the topics side by side, then begin, or continue from the state on disk.
+        """Compile and discover the topics side by side, then begin, or continue from the state on disk. Where compiling takes longer,
+        odometry is by wheels alone until then; a state on disk is waited for.
 
         ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`). Raises `TransportError`, `TopicError`,
         `EstimatorError`, `CheckpointError` and `OutputError`.
@@ -108,12 +115,19 @@ class Node:
         discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
         # now: subscribers have found it by the first estimate
         publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
-        needed = read_head(state_file).get("topics", []) if state_file is not None and state_file.exists() else []
-        discovered = discovery.discover(config.wait_s, needed, report, is_over, lambda: warming.is_done(with_clouds=discovery.has_clouds))
+        is_resumed = state_file is not None and state_file.exists()
+        needed = read_head(state_file).get("topics", []) if state_file is not None and is_resumed else []
+
+        def is_compiled() -> bool:
+            return warming.is_done(with_clouds=discovery.has_clouds)
+
+        patience_s = math.inf if is_resumed or not config.predict else _COMPILING_S
+        discovered = discovery.discover(config.wait_s, needed, report, is_over, is_compiled, patience_s)
         trial = run.make_trial(discovered.parts.sources.lidar is not None)
         for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report)
+        node._is_compiled = is_compiled
         node._open_session(discovered, view)
         return node
 
@@ -146,13 +160,30 @@ class Node:
                 self._check_lidar()
             if not self.session.head and self._sources.wheels is not None and self._sources.wheels.kind == "joint_states":
                 self._check_wiring(is_clock_known=False)
-            for received in discovered.backlog:
-                self._receive(received)
-            self._caught_up_ns = self._transport.now_ns()
+            if not self._is_compiled():
+                self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
+                self._compiling = DeadReckoning(self._open_stream(MessageStats()), _predictor(self._trial, self._run))
+            self._take_up(discovered.backlog)
             failing.pop_all()
 
-    def _open_stream(self) -> LiveStream:
-        return LiveStream(self._discovered, self._run.robot, self._stats, self._transport.epoch_ns, is_ros1=self._transport.is_ros1)
+    def _take_up(self, backlog: Iterable[Received]) -> None:
+        """Messages that have waited: their latencies do not count."""
+        for received in backlog:
+            self._receive(received)
+        self._caught_up_ns = self._transport.now_ns()
+
+    def _reckon(self, compiling: DeadReckoning, received: Received) -> None:
+        """Odometry by wheels, until the estimator is compiled: then it takes up what has waited."""
+        if (found := compiling.add(received)) is not None:
+            self._publisher.publish_prediction(*found)
+        if self._is_compiled():
+            self._compiling = None
+            self._report("compiled: the estimator begins.")
+            self._take_up(compiling.messages)
+
+    def _open_stream(self, stats: MessageStats | None = None) -> LiveStream:
+        counts = self._stats if stats is None else stats
+        return LiveStream(self._discovered, self._run.robot, counts, self._transport.epoch_ns, is_ros1=self._transport.is_ros1)
 
     def _check_lidar(self) -> None:
         """Compare the LiDAR's mount with the wheels on the first metres, where there are both."""
@@ -287,6 +318,9 @@ class Node:
 
     def _receive(self, received: Received) -> bool:
         """Process a message; True if it made an estimate."""
+        if self._compiling is not None:
+            self._reckon(self._compiling, received)
+            return False
         if received.topic == self._tf:
             if (conflict := self._conflicts.check(received.data, self._publisher.recent_transforms)) is not None:
                 self._report(conflict)

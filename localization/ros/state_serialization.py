@@ -4,9 +4,9 @@ Understood are plain values, numpy arrays and numbers, the usual containers, and
 without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays keep their
 layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
 
-Long lists and deques of numbers, and of frozen dataclasses or named tuples of numbers and arrays, are written as columns: hours of them must not
-take longer than a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed, that makes
-no difference.
+Long lists and deques of numbers, and of frozen dataclasses or named tuples of numbers and arrays, are written as columns: hours of them
+must not take longer than a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed,
+that makes no difference.
 
 A pickle, read by an unpickler that allows these classes alone, was tried: 90 lines, and results the same to the last bit. It lost, for a
 crafted file of nine bytes takes 4 GB (an index of pickle's memo), others call constructors of the allowed classes, and 20,000 wheel samples

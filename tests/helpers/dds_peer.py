@@ -318,6 +318,7 @@ def main(path: str, domain: int) -> None:
                 "late_s": late_s,
                 "scans": [[stamp_ns, sent_s] for stamp_ns, (sent_s, _) in scans_sent.items()],
                 "arrivals_s": arrivals,
+                "first_predicted_s": next((o.sample_info.source_timestamp * 1e-9 for o in received["/skidloc/odometry_predicted"]), None),
                 "predicted_stamps": [stamp(o.header) for o in received["/skidloc/odometry_predicted"]],
                 "predicted_poses": [
                     [o.pose.pose.position.x, o.pose.pose.position.y, o.pose.pose.orientation.z]

@@ -1,0 +1,41 @@
+"""Odometry by wheels alone while the estimator compiles: a robot that is driven at once has its transforms after seconds, not a minute."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from localization.estimators import Estimate
+from localization.events import WheelSample
+from localization.ros.discovery import MAX_BACKLOG
+from localization.ros.live_stream import LiveStream
+from localization.ros.publisher import Predictor
+from localization.ros.transports.transport import Received
+
+
+class DeadReckoning:
+    """`add` each message. `messages` holds them all for the estimator, which begins with the first of them.
+
+    The pose starts at the origin of `odom`, as the estimator's does. A gap of the wheels ends it.
+    """
+
+    def __init__(self, stream: LiveStream, predictor: Predictor) -> None:
+        """``stream`` and ``predictor`` are its own: those of the node begin when the estimator does."""
+        self._stream, self._predictor = stream, predictor
+        self._has_begun = False
+        self.messages: deque[Received] = deque(maxlen=MAX_BACKLOG)
+
+    def add(self, received: Received) -> tuple[Estimate, int] | None:
+        """Keep a message. Returns the pose at the newest wheel sample and its stamp in the sender's clock [ns], where one is due."""
+        self.messages.append(received)
+        newest = None
+        for event in self._stream.events(received):
+            is_due = self._predictor.insert(event)
+            if isinstance(event, WheelSample) and not self._has_begun:
+                self._has_begun = True
+                self._predictor.reset(Estimate(event.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
+            elif is_due and (estimate := self._predictor.predict()) is not None:
+                self._predictor.reset(estimate, None, 0.0)
+                newest = estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False)
+        return newest
