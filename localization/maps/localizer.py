@@ -129,9 +129,10 @@ class Localizer:
     def add(self, points: Points2, delta: Pose2, cov: Cov3) -> None:
         """A keyframe with the scan ``points`` (N, 2) of the body frame [m]: moved by ``delta`` (3,) with covariance ``cov`` (3, 3) since
         the one before."""
+        delta, cov = self._recent.move(Motion(delta, cov), points)
         if not is_narrow(cov):  # carried, or driven blind: scans before and after do not belong together
             self._running, self.hypotheses = None, ()
-        delta, cov = self._recent.move(Motion(delta, cov), points)
+            self._failures = self._wait = 0
         A = se2.adjoint(se2.inverse(delta))
         self.pose, self._cov = se2.compose(self.pose, delta), A @ self._cov @ A.T + cov
         self._since_search = A @ self._since_search @ A.T + cov

@@ -29,6 +29,8 @@ _CELL_M = 0.08
 _WIDE_M, _WIDE_RAD = 0.02, 0.01
 """Sigma of the odometry from keyframe to keyframe, from which on it is aligned: scans give 0.003 m and 0.001 rad, wheels 0.03 m and
 0.08 rad in turns of 25 degrees (fr079)."""
+_BASIN_M, _BASIN_RAD = 0.4, 0.3
+"""Sigma of the odometry up to which it is: alignments converge from about there."""
 _LEAST_OVERLAP = 0.6
 """Share of a scan's points on those before, from which on it is aligned."""
 _NEW_VIEW_M = 2.0 / math.pi
@@ -81,9 +83,9 @@ class RecentScans:
     def move(self, motion: Motion, points: Points2) -> Motion:
         """Add ``motion``, at whose end ``points`` (N, 2) of the body frame are measured [m]. Returns the motion by scans and odometry where
         the odometry is wide."""
+        motion = self._aligned(motion, points)
         if not is_narrow(motion.cov):
             self.clear()  # carried, or driven blind
-        motion = self._aligned(motion, points)
         A = se2.adjoint(se2.inverse(motion.delta))
         moved = [replace(key, cov=A @ key.cov @ A.T + motion.cov) for key in self._keys]
         self._keys = deque((key for key in moved if is_narrow(key.cov)), _MOST)
@@ -106,7 +108,8 @@ class RecentScans:
     def _aligned(self, motion: Motion, points: Points2) -> Motion:
         delta, cov = motion
         is_wide = np.trace(cov[:2, :2]) > _WIDE_M**2 or cov[2, 2] > _WIDE_RAD**2
-        if not is_wide or not self._keys or len(points) < MIN_POINTS:
+        is_near = np.trace(cov[:2, :2]) < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2
+        if not (is_wide and is_near) or not self._keys or len(points) < MIN_POINTS:
             return motion
         grid = make_grid(self._seen_from(self._pose, _ALIGNED), _CELL_M, self._range_noise_m)
         fit = align_points(grid, points, delta, cov, delta)

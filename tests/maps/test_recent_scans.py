@@ -13,16 +13,17 @@ from tests.helpers import floor_plan
 from tests.helpers.floor_plan import OFFICE, path
 
 WHEELS = np.diag([0.02, 0.02, 0.08]) ** 2
+SLIPPING = np.diag([0.2, 0.2, 0.2]) ** 2
 WAY = path((1, 1), (4, 1), (4, 3.6), (7, 3.6), (7, 6.5))
 
 
-def driven(seed: int) -> tuple[list[Motion], list[np.ndarray], RecentScans]:
+def driven(seed: int, cov: np.ndarray = WHEELS) -> tuple[list[Motion], list[np.ndarray], RecentScans]:
     """Motions as the scans have them, the true ones, and the scans."""
     rng, recent, found, moves = np.random.default_rng(seed), RecentScans(0.02), [], floor_plan.moves(WAY)
     for k, delta in enumerate(moves):
         points = floor_plan.scan(OFFICE, WAY[k], noise=0.02, seed=1000 * seed + k)
-        measured = se2.compose(delta, rng.multivariate_normal(np.zeros(3), WHEELS)) if k else delta
-        found.append(recent.move(Motion(measured, WHEELS if k else np.zeros((3, 3))), points))
+        measured = se2.compose(delta, rng.multivariate_normal(np.zeros(3), cov)) if k else delta
+        found.append(recent.move(Motion(measured, cov if k else np.zeros((3, 3))), points))
         recent.add(points)
     return found, list(moves), recent
 
@@ -37,12 +38,13 @@ def test_recent_scans_by_slipping_wheels_stay_joined() -> None:
 
 
 @pytest.mark.extended
-def test_motions_by_scans_have_their_covariance() -> None:
+@pytest.mark.parametrize("cov", [WHEELS, SLIPPING], ids=["wheels", "slipping"])
+def test_motions_by_scans_have_their_covariance(cov: np.ndarray) -> None:
     """Monte Carlo of 20 drives with 18 motions each: squares of normalised errors are those of three normal numbers, but for one
     in a hundred beyond 16.3, at most."""
     squares = []
     for seed in range(20):
-        found, truth, _ = driven(seed)
+        found, truth, _ = driven(seed, cov)
         for motion, delta in zip(found[1:], truth[1:], strict=True):
             off = se2.local(delta, motion.delta)
             squares.append(off @ np.linalg.solve(motion.cov, off))
