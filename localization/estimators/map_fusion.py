@@ -62,6 +62,7 @@ class MapFusion(FilteredOdometry):
         self._is_keyframe_due, self._has_key, self._summed_cov = False, False, np.zeros((3, 3))
         self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
+        self._outside_s = 0.0
         self._first_s: float | None = None
         self._n_losses, self._waiting_s = 0, 0.0
         self._positions: list[PositionSample] = []
@@ -165,6 +166,12 @@ class MapFusion(FilteredOdometry):
         if self.localizer.state == "localized" and self._first_s is None:
             self._first_s = sum(self._seconds.values())
         self._seconds[self.localizer.state] += duration_s
+        self._outside_s += duration_s if self._is_outside else 0.0
+
+    @property
+    def _is_outside(self) -> bool:
+        """Whether the place is known, and is where the map has nothing."""
+        return self.localizer.state == "localized" and self.localizer.is_outside
 
     def finish(self, filtered: Any = None) -> None:
         """The trajectory stays as it was published: nothing is smoothed."""
@@ -200,6 +207,8 @@ class MapFusion(FilteredOdometry):
             "probability": self.localizer.probability,
             "pose": self.localizer.pose.tolist(),
             **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
+            "is_outside": self._is_outside,
+            "outside_s": self._outside_s,
             "first_localized_s": self._first_s,
             "losses": self._n_losses,
             "places": [{"pose": place.pose.tolist(), "probability": place.probability} for place in places],

@@ -55,6 +55,13 @@ _PRIOR_SQUARE = 9.0
 """A search agrees with an earlier place within 3 sigma of the odometry since, and of `_SAME_COV`."""
 _SAME_COV = np.diag([0.1, 0.1, 0.033]) ** 2
 """Covariance of a searched pose against another of the same place [m^2, m^2, rad^2]."""
+_TRACKED_SCANS = 4
+"""Scans that are searched near a tracked pose: 2 m of way, so that those of space that is not mapped are soon behind."""
+_JOINED_M = 0.8 * CELL_M
+"""Voxel of joined scans [m]."""
+_STAYED_M, _STAYED_RAD = 1.0, 0.8
+"""A place this near to where the odometry leads confirms it, however wide that is: in a building of 20 m it is there by chance once in
+a thousand times."""
 _INDEPENDENT_M = 1.0
 """Way between the first and the last of the scans that are searched, from which on they are more than the same view again [m]."""
 _INITIAL_KEYFRAMES = 10
@@ -86,6 +93,8 @@ class Localizer:
         """Places that a search found, the most probable first."""
         self._initial_left = 0
         self._is_doubtful = False  # the last scan does not fit, as the first one does after the robot was carried unnoticed
+        self.is_outside = False
+        """Whether most of the last scan is where the map has nothing: the tracked pose is by odometry meanwhile."""
         self._is_reckoned = False  # the pose is by odometry since it was tracked, and was not refuted
         self._searched_m, self._since_search = 0.0, np.zeros((3, 3))
         self._failures, self._wait = 0, 0
@@ -179,7 +188,9 @@ class Localizer:
     def _track(self, points: Points2) -> None:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
         place, cov = self._align(points), self._cov
-        if place is None or (place.on_walls + place.contradicting < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE):
+        if place is not None:
+            self.is_outside = place.on_walls + place.contradicting < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
+        if place is None or self.is_outside:
             return
         evidence = self._evidence(place, cov)
         if evidence < -_TRACK_GAIN:  # the odometry may be an outlier, as by slip in a turn
@@ -216,12 +227,13 @@ class Localizer:
         return mahalanobis(self.pose, measured, cov) > OUTLIER_SIGMAS**2
 
     def _align(self, points: Points2) -> Place | None:
-        """Near the pose; searched within 3 sigma where that is wider than the basin of an alignment, and None where that is not `LIKELY`:
-        of a scan that is mostly in unmapped space, another place than the right one may have more on walls."""
+        """Near the pose. Where that is wider than the basin of an alignment, the last scans are searched within 3 sigma, and None where
+        that is not `LIKELY`: where much is unmapped, another place than the right one may have more on walls."""
         if is_narrow(self._cov):
             return self.places.align(points, self.pose, self._cov)
-        found = self.places.search(points, self.pose, _three_sigma(self._cov))
-        return found[0] if found and weigh(found, len(points), self._weights, is_narrowed=True)[0].probability >= LIKELY else None
+        joined = self._recent.joined(_JOINED_M, _TRACKED_SCANS)
+        found = self.places.search(joined, self.pose, _three_sigma(self._cov))
+        return found[0] if found and weigh(found, len(joined), self._weights, is_narrowed=True)[0].probability >= LIKELY else None
 
     def _reckon(self) -> None:
         """The pose is too wide to align scans: search about it, or everywhere where it is wider than that."""
@@ -249,7 +261,7 @@ class Localizer:
         if self._initial_left:
             self._initial_left -= 1
             self._cov = self._cov if self._initial_left else np.zeros((3, 3))
-        points, self._searched_m = self._recent.joined(0.8 * CELL_M), self._recent.way_m
+        points, self._searched_m = self._recent.joined(_JOINED_M), self._recent.way_m
         if self._is_background:
             self._running = BackgroundSearch(self.places, points, near, is_by_fix)
         else:
@@ -283,13 +295,17 @@ class Localizer:
             self._begin_tracking(best.pose, A @ (best.cov + _BEND) @ A.T + moved_cov)
 
     def _is_reckoned_at(self, pose: Pose2) -> bool:
-        """Whether the odometry leads to ``pose`` (3,) from where the robot was tracked; not where it is as wide as after being carried."""
-        return self._is_reckoned and self.state == "searching" and _agree(self.pose, pose, self._cov)
+        """Whether the odometry leads to ``pose`` (3,) from where the robot was tracked: nearly, where it is wide as after being carried."""
+        if self.state == "searching":
+            return self._is_reckoned and _agree(self.pose, pose, self._cov)
+        off = se2.between(self.pose, pose)
+        return self._is_reckoned and math.hypot(off[0], off[1]) < _STAYED_M and abs(off[2]) < _STAYED_RAD
 
     def _begin_tracking(self, pose: Pose2, cov: Cov3) -> None:
         """The robot is at ``pose`` (3,) with covariance ``cov`` (3, 3)."""
         self.pose, self._cov, self._track_odds = pose, np.asarray(cov), self._search_odds
         self._is_tracking, self._is_reckoned, self._is_doubtful, self.state = True, False, False, "localized"
+        self.is_outside = False
         self._initial_left, self._failures, self._wait = 0, 0, 0
 
 

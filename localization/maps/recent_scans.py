@@ -98,9 +98,9 @@ class RecentScans:
         """The scan ``points`` (N, 2) [m] was taken where the robot is."""
         self._keys.append(_Keyframe(self._pose, points, np.zeros((3, 3)), self._way_m))
 
-    def joined(self, cell_m: float) -> Points2:
-        """(M, 2) all scans as seen from the last one, one point in each voxel of ``cell_m`` [m]."""
-        return voxel_means(self._seen_from(self._pose, _MOST), cell_m)
+    def joined(self, cell_m: float, n: int = _MOST) -> Points2:
+        """(M, 2) the last ``n`` scans as seen from the last one, one point in each voxel of ``cell_m`` [m]."""
+        return voxel_means(self._seen_from(self._pose, n), cell_m)
 
     def _seen_from(self, pose: Pose2, n: int) -> Points2:
         return np.vstack([se2.transform(se2.between(pose, key.pose), key.points) for key in list(self._keys)[-n:]])

@@ -220,7 +220,7 @@ def _of_place(found: Mapping[str, Any]) -> Status:
         x, y, yaw = place["pose"]
         values[f"place_{i + 1}"] = f"x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.0f} deg: {place['probability']:.2f}"
     if found["state"] == "localized":
-        return Status("map", values=values)
+        return Status("map", OK, "outside of the map: the pose is by odometry" if found["is_outside"] else "ok", values)
     text = "the place in the map is searched: drive some metres, or publish it on /initialpose"
     return Status("map", WARN, text if found["state"] == "searching" else f"lost: {text}", values)
 

@@ -17,6 +17,7 @@ from tests.helpers.floor_plan import HALL, OFFICE, path
 
 COV = np.diag([0.01, 0.01, 0.005]) ** 2
 CARRIED = np.diag([3.0, 3.0, 1.5]) ** 2
+CORRIDOR = np.array([*floor_plan.box(0, 0, 25, 2.4), *floor_plan.box(2.5, 0, 3, 0.6), *floor_plan.box(0.4, 1.8, 1.2, 2.4)], dtype=float)
 WAY = path((7, 4), (10.5, 4), (10.5, 6.5), (7, 6.5), (7, 4), (3.5, 3.6), (3.5, 1), (1, 1))
 
 
@@ -146,6 +147,36 @@ def test_localizer_by_one_view_again_and_again_is_not_certain(office: PlaceMap) 
         assert localizer.state == "searching"
         assert localizer.probability < LIKELY + 1e-9
     assert math.hypot(*(localizer.hypotheses[0].pose[:2] - WAY[0, :2])) < 0.05
+
+
+@pytest.fixture(scope="module")
+def corridor() -> PlaceMap:
+    """A corridor of 25 m, mapped from its end with poses that are off by 3 cm: of walls that slanting beams alone touch, many cells are
+    free."""
+    rng, n = np.random.default_rng(0), 40
+    poses = np.column_stack([rng.uniform(0.6, 2.0, n), rng.uniform(0.5, 1.6, n), rng.uniform(-math.pi, math.pi, n)])
+    mapped = floor_plan.make_map(CORRIDOR, poses)
+    return PlaceMap(replace(mapped, poses=poses + rng.normal(0.0, [0.03, 0.03, 0.01], (n, 3))), 0.02)
+
+
+def test_place_in_a_corridor_mapped_from_its_end_is_not_contradicted(corridor: PlaceMap) -> None:
+    """Half a metre beside it is."""
+    cov = np.diag([1e-4, 1e-4, 1e-4]) ** 2
+    for x, in_free, beside in ((7.0, 0.1, 0.05), (5.0, 0.02, 0.2)):
+        points = floor_plan.scan(CORRIDOR, np.array([x, 1.2, 0.0]))
+        right, wrong = (corridor.align(points, np.array([x, y, 0.0]), cov) for y in (1.2, 1.7))
+        assert right.in_free > in_free
+        assert right.contradicting < 0.02
+        assert wrong.contradicting > beside
+
+
+def test_localizer_that_leaves_the_map_is_outside_with_its_covariance(corridor: PlaceMap) -> None:
+    localizer, way = Localizer(corridor), path((0.8, 0.6), (2, 1.5), (0.9, 1.2), (16, 1.2))
+    found = drive(localizer, CORRIDOR, way)
+    first = [state for state, _ in found].index("localized")
+    assert {state for state, _ in found[first:]} == {"localized"}
+    assert localizer.is_outside
+    assert found[-1][1] < 3.0 * math.sqrt(np.trace(localizer.covariance[:2, :2]))
 
 
 def test_localizer_beyond_the_map_keeps_its_pose_and_is_found_near_it(office: PlaceMap) -> None:

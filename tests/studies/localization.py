@@ -4,7 +4,8 @@
 the other half, and it drives for ``--seconds``; keyframes and truth are those of the smoothed graph of the whole log. A start is
 mapped where, at its end, the scan at the true pose has a score of at least 0.5. Right is within 0.5 m and 0.2 rad. *Reliability*: of all
 keyframes by the probability that was said, and of all searches by weights that were fitted to the other buildings. *Drives*: the second
-half of each log, replayed in the map of the first, and the reverse. *Carried*: the same drives with cuts; times count from where the scan
+half of each log, replayed in the map of the first, and the reverse; errors while the state is localized, where the map has most of the
+walls and outside of it, where the pose is by odometry. *Carried*: the same drives with cuts; times count from where the scan
 at the true pose is mapped, and a place that the map does not have cannot be found.
 """
 
@@ -13,11 +14,12 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from localization.estimators import EstimatorConfig, MapFusion, PriorMap
 from localization.estimators.graph_fusion import GraphConfig
@@ -38,6 +40,8 @@ _MAP_STRIDE = 3
 _STEP_M, _STEP_RAD = 0.5, 0.3
 _COV = np.diag([0.01, 0.01, 0.005]) ** 2
 _MAPPED_SCORE = 0.5
+_ON_WALL_M, _MAPPED_SHARE = 0.3, 0.5
+"""A keyframe is outside of a map where less than this share of its points is this near to points of the map, at the true pose."""
 _CYCLE_S, _KEPT_S = 70.0, 40.0
 
 
@@ -185,14 +189,16 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
 
 def drive_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i: errors while localized, times, and the cost against the filter's alone."""
-    places = PlaceMap(keyframes.select(halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
+    mapped = keyframes.select(halves(keyframes)[i][::_MAP_STRIDE])
+    places = PlaceMap(mapped, 0.02)
     ids = halves(keyframes)[1 - i]
     begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
     model = make_model("diff_drive", drive.robot)
     trials = Trial(model, "map", prior=PriorMap(places)), Trial(model, "ekf")
     located, alone = (Pipeline(trial, drive.robot, drive.mounts, True) for trial in trials)
     assert isinstance(located.estimator, MapFusion)
-    localizer, errors, spent = located.estimator.localizer, [], np.zeros(3)  # searching; localized, and the filter alone meanwhile
+    localizer, rows, spent = located.estimator.localizer, [], np.zeros(3)  # searching; localized, and the filter alone meanwhile
+    is_outside, scans = outside_of(mapped, keyframes), keyframes.scans()
     for event in drive.events:
         if not begin <= event.stamp_ns <= end:
             continue
@@ -207,20 +213,51 @@ def drive_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
         spent += [0.0, *np.diff(clock)] if was_localized else [clock[1] - clock[0], 0.0, 0.0]
         for estimate in estimates:
             k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
-            if k < len(keyframes.stamps_ns) and keyframes.stamps_ns[k] == estimate.stamp_ns and is_localized:
-                errors.append(math.hypot(*(estimate.pose[:2] - keyframes.poses[k, :2])))
+            if k < len(keyframes.stamps_ns) and keyframes.stamps_ns[k] == estimate.stamp_ns and len(scans[k]):
+                error = math.hypot(*(estimate.pose[:2] - keyframes.poses[k, :2]))
+                rows.append((estimate.stamp_ns * 1e-9, error, is_localized, is_outside(k)))
     found = located.estimator.localization()
-    e = np.array(errors) if errors else np.array([math.nan])
+    t, error, localized, outside = (np.array(column) for column in zip(*rows, strict=True))
     cells = [
         f"{name}, map of half {i + 1}",
-        f"{np.median(e):.3f} / {np.quantile(e, 0.95):.3f} / {e.max():.2f}",
+        _errors(error[localized & ~outside]),
+        _errors(error[localized & outside]),
+        f"{100 * outside.mean():.0f}",
         " / ".join(f"{found[key]:.0f}" for key in ("localized_s", "searching_s", "lost_s")),
         "-" if found["first_localized_s"] is None else f"{found['first_localized_s']:.1f}",
-        str(found["losses"]),
+        f"{longest_unknown_s(t, localized, outside):.1f}",
         f"{spent[0]:.1f}",
         f"{spent[1] / max(spent[2], 1e-9):.2f}",
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def outside_of(mapped: KeyframeMap, keyframes: KeyframeMap) -> Callable[[int], bool]:
+    """Whether keyframe k of ``keyframes`` is outside of the map: most of its scan, at the true pose, is where ``mapped`` has no points."""
+    walls, scans = cKDTree(mapped.points_in_map()), keyframes.scans()
+
+    def is_outside(k: int) -> bool:
+        distances, _ = walls.query(se2.transform(keyframes.poses[k], scans[k]))
+        return bool((distances < _ON_WALL_M).mean() < _MAPPED_SHARE)
+
+    return is_outside
+
+
+def longest_unknown_s(t: np.ndarray, localized: np.ndarray, outside: np.ndarray) -> float:
+    """The longest time [s] without a place, of moments ``t`` (N,) [s] after the first place that are not outside of the map."""
+    longest, since = 0.0, None
+    for k in range(int(np.argmax(localized)), len(t)):
+        if localized[k] or outside[k]:
+            longest, since = max(longest, 0.0 if since is None else t[k] - since), None
+        elif since is None:
+            since = t[k]
+    return longest if since is None else max(longest, t[-1] - since)
+
+
+def _errors(errors: np.ndarray) -> str:
+    if not len(errors):
+        return "-"
+    return f"{np.median(errors):.3f} / {np.quantile(errors, 0.95):.3f} / {errors.max():.2f}"
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -249,9 +286,11 @@ def main(words: Sequence[str] | None = None) -> None:
     if options.figure:
         draw(moments, options.figure)
     if not options.no_drives:
-        columns = "error median / p95 / max [m] | localized / searching / lost [s] | first after [s] | losses"
-        print(f"\n| drive | {columns} | CPU of searches [s] | CPU localized / ekf |")
-        print("|---" * 7 + "|")
+        columns = (
+            "error inside: median / p95 / max [m] | outside of the map | outside [%] | localized / searching / lost [s] | first after [s]"
+        )
+        print(f"\n| drive | {columns} | longest unknown inside [s] | CPU of searches [s] | CPU localized / ekf |")
+        print("|---" * 9 + "|")
         for name, drive in drives.items():
             for i in (0, 1):
                 print(drive_row(name, drive, maps[name], i), flush=True)
