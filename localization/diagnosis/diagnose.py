@@ -79,6 +79,7 @@ _SYSTEMATIC_SHARE = 1.0 / 3.0  # systematic part of a size's sigma, over what is
 _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
 _DETECTABLE_SIGMAS = 3.0
+_PART_LOG_ODDS = 14.0  # twice the log-odds by which a cause in a part of a drive leads: odds of 1000, as hundreds of parts are tried
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -133,7 +134,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
     predictor, first, error = _linearize_with_model_error(make_predictor(drive, model, baseline), config)
     rng = np.random.default_rng(config.seed)
-    linearization, chosen = _choose_parts(predictor, first, error, *_choose_causes(predictor, first))
+    linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
     chosen = _drop_insignificant(linearization, chosen, rng, config)
     if chosen and _is_worse_with(predictor, linearization, chosen):
         linearization, chosen = first, ()
@@ -203,26 +204,35 @@ def _choose_causes(predictor: DrivePredictor, first: Linearization) -> tuple[Lin
 
 
 def _choose_parts(
-    predictor: DrivePredictor, first: Linearization, error: ModelError, linearization: Linearization, chosen: tuple[int, ...]
+    predictor: DrivePredictor, first: Linearization, linearization: Linearization, chosen: tuple[int, ...]
 ) -> tuple[Linearization, tuple[int, ...]]:
     """The drive and the causes ``chosen`` on it, or the best set with causes in a part of the drive, where these explain it better."""
-    log_odds = error.log_odds if error.is_shown else 0.0
-    spells = find_spells(predictor, linearization, chosen, log_odds)
+    spells = find_spells(predictor, linearization, chosen)
     if not spells:
         return linearization, chosen
     state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *spells), {}, TOLERANCE))
     if not any(state.causes[i].spell for i in best):
         return linearization, chosen
-    more = find_spells(predictor, state, best, log_odds)
+    more = find_spells(predictor, state, best)
     if more:
         kept = [state.causes[i] for i in best if state.causes[i].spell]
         state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *kept, *more), {}, TOLERANCE))
     located = with_intervals(predictor, state, best)
-    if not located:
+    if not located or _is_error_of_contacts(predictor, state, best):
         return linearization, chosen
     causes = tuple(located.get(i, cause) for i, cause in enumerate(state.causes))
     sizes = {causes[i]: float(size) for i, size in zip(best, state.problem.fit(best)[0], strict=True)}
     return linearize(predictor, causes, sizes, TOLERANCE), best
+
+
+def _is_error_of_contacts(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> bool:
+    """Whether those of ``chosen`` that hold in a part of the drive gain no more than errors of the contacts still do beside them: parts of
+    a drive have different motions, in which such errors differ."""
+    if not predictor.unmodelled.slip_share:
+        return False
+    error = find_model_error(predictor, state)
+    lasting = tuple(i for i in chosen if state.causes[i].spell is None)
+    return error.is_shown and state.problem.gain(chosen) - state.problem.gain(lasting) < error.log_odds + _PART_LOG_ODDS
 
 
 def _drop_insignificant(

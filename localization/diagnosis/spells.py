@@ -1,13 +1,15 @@
 """Change points: causes that hold in a part of a drive, as a payload that is taken up on the way.
 
 A cause of signature s_i with an onset at t_0 has the signature s_i w(t_0), w the share of each window's way after t_0. Its size is fitted
-beside the causes of a set B, and all others within tolerance; with score u and its variance v (sizes in units of their prior),
+beside the causes of a set B, and all others within tolerance; with the scores u of the causes of one event and their covariance V (sizes in
+units of their prior),
 
-    2 log evidence gained = u^2 / (v + 1) - log(1 + v).
+    2 log evidence gained = u^T (V + 1)^-1 u - log det (V + 1).
 
 Onsets are chosen by evidence, at the price of their number and of a change point (log n for each moment, as for a size; Zhang & Siegmund
 2007 have 3/2 log n for a moment and the size after it). The set with the onset takes the place of the one without where windows that were
-held out are more likely by it. The interval of an onset is that of its posterior, by a flat prior.
+held out are more likely by it. The interval of an onset is that of its posterior, by a flat prior;
+causes that begin and end together are one event, with one onset.
 """
 
 from __future__ import annotations
@@ -47,9 +49,8 @@ class _Option(NamedTuple):
     spell: Spell
 
 
-def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...], error_log_odds: float = 0.0) -> tuple[Cause, ...]:
-    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes does, by more than the ``error_log_odds`` that
-    errors of the contact model gain on it; none for tables and short drives.
+def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> tuple[Cause, ...]:
+    """Causes in a part of the drive that explain it better than the set ``chosen`` of causes does; none for tables and short drives.
 
     Where one of those ``chosen`` holds in a part of the drive, others are tried in this part alone: one event may change several things, as
     a tyre that loses air changes the mean of all radii and the difference of both sides.
@@ -62,11 +63,11 @@ def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[i
     options: dict[str, _Option] = {}
     bases = sorted({(), chosen, *(tuple(j for j in chosen if j != i) for i in chosen)})
     tried = [i for i, c in enumerate(state.causes) if c.id not in _OF_WHOLE_DRIVES and c.spell is None]
-    gains = spell_gains(predictor, state, bases, tried, spells)
+    gains = spell_gains(predictor, state, bases, [(i,) for i in tried], spells)
     prices = 2.0 * math.log(len(spells)) + math.log(max(state.problem.count, 2)) * np.array(moments)
     for option in itertools.chain.from_iterable(_options(state, b, tried, spells, prices - g) for b, g in zip(bases, gains, strict=True)):
         name = state.causes[option.cause].id
-        if option.cost < min(least - max(_MARGIN, error_log_odds), options[name].cost if name in options else math.inf):
+        if option.cost < min(least - _MARGIN, options[name].cost if name in options else math.inf):
             options[name] = option
     best = sorted(options.values())[:_MOST]
     if not best or heldout_lead(predictor, state, chosen, best[0]) <= 0.0:
@@ -76,10 +77,14 @@ def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[i
 
 def with_intervals(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> dict[int, Cause]:
     """Causes among those ``chosen`` that hold in a part of the drive, with their most likely moments."""
-    found = {}
+    events: dict[Spell, list[int]] = {}
     for i in chosen:
-        if state.causes[i].spell is not None:
-            found[i] = _located(predictor, state, tuple(j for j in chosen if j != i), i)
+        spell = state.causes[i].spell
+        if spell is not None:
+            events.setdefault(spell, []).append(i)
+    found: dict[int, Cause] = {}
+    for event in events.values():
+        found |= _located(predictor, state, tuple(j for j in chosen if j not in event), event)
     return found
 
 
@@ -113,10 +118,14 @@ def _options(
 
 
 def spell_gains(
-    predictor: DrivePredictor, state: Linearization, bases: Sequence[tuple[int, ...]], tried: Sequence[int], spells: Sequence[Spell]
+    predictor: DrivePredictor,
+    state: Linearization,
+    bases: Sequence[tuple[int, ...]],
+    tried: Sequence[tuple[int, ...]],
+    spells: Sequence[Spell],
 ) -> FloatArray:
-    """(bases, tried, spells) twice the log-evidence that each cause ``tried`` gains in each part of the drive, beside the causes of each of
-    ``bases``; sizes beyond its bounds gain nothing."""
+    """(bases, tried, spells) twice the log-evidence that the causes of each event ``tried`` gain in each part of the drive, beside the
+    causes of each of ``bases``; sizes beyond their bounds gain nothing."""
     problem, noise = state.problem, state.noise
     shares = np.array([predictor.shares(s) for s in spells])
     S = noise.whiten(state.signatures).reshape(-1, len(state.causes)) * problem.scale
@@ -130,16 +139,21 @@ def spell_gains(
         A = S.T @ S + np.diag(1.0 / variances)
         fits.append((A, y - S @ np.linalg.solve(A, S.T @ y)))
     gains = np.zeros((len(bases), len(tried), len(spells)))
-    for k, i in enumerate(tried):
-        columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, :]).reshape(measured, -1) * problem.scale[i]
-        columns = without(columns)
-        squares, shared = np.sum(columns**2, axis=0), S.T @ columns
-        low, high = state.causes[i].bounds
+    for k, event in enumerate(tried):
+        i, shape = list(event), (-1, len(event), len(spells))
+        columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, None, :]).reshape(measured, *shape[1:])
+        columns = without((columns * problem.scale[i][:, None]).reshape(measured, -1))
+        by_spell = columns.reshape(shape).transpose(2, 0, 1)
+        squares, shared = by_spell.transpose(0, 2, 1) @ by_spell, S.T @ columns
+        low, high = np.array([state.causes[j].bounds for j in i]).T
         for row, (A, left) in zip(gains[:, k], fits, strict=True):
-            u = columns.T @ left
-            v = np.maximum(squares - np.sum(shared * np.linalg.solve(A, shared), axis=0), 0.0)
-            sizes = u / (v + 1.0) * problem.scale[i]
-            row[:] = np.where((sizes >= low) & (sizes <= high), u**2 / (v + 1.0) - np.log1p(v), 0.0)
+            u = (columns.T @ left).reshape(shape[1:]).T
+            taken = np.linalg.solve(A, shared).reshape(shape).transpose(2, 0, 1)
+            V = squares - shared.reshape(shape).transpose(2, 1, 0) @ taken + np.eye(len(i))
+            x = np.linalg.solve(V, u[..., None])[..., 0]
+            sizes = x * problem.scale[i]
+            is_possible = np.all((sizes >= low) & (sizes <= high), axis=1)
+            row[:] = np.where(is_possible, np.sum(u * x, axis=1) - np.linalg.slogdet(V)[1], 0.0)
     return gains
 
 
@@ -165,12 +179,13 @@ def heldout_lead(predictor: DrivePredictor, state: Linearization, chosen: tuple[
     return sum(whole.gain(best) - r.gain(best) - whole.gain(chosen) + r.gain(chosen) for r in rest)
 
 
-def _located(predictor: DrivePredictor, state: Linearization, others: tuple[int, ...], i: int) -> Cause:
-    """Cause ``i``, which holds in a part of the drive, with the most likely moments, one after the other, and their 95 % intervals."""
-    cause = state.causes[i]
-    spell = cause.spell
+def _located(predictor: DrivePredictor, state: Linearization, others: tuple[int, ...], event: Sequence[int]) -> dict[int, Cause]:
+    """Causes of one ``event``, which hold in the same part of the drive, with the most likely moments of all of them, one after the other,
+    and their 95 % intervals."""
+    spell = state.causes[event[0]].spell
     assert spell is not None
-    whole = next(j for j, c in enumerate(state.causes) if c.spell is None and c.id == cause.id and c.axis == cause.axis)
+    lasting = {(c.id, c.axis): j for j, c in enumerate(state.causes) if c.spell is None}
+    whole = tuple(lasting[state.causes[i].id, state.causes[i].axis] for i in event)
     begins, ends = predictor.window_times_s
     grid = np.unique(np.concatenate([begins + (ends - begins) * k / _SUBSTEPS for k in range(_SUBSTEPS)]))
     intervals = {"start_s": (spell.start_s, spell.start_s), "end_s": (spell.end_s, spell.end_s)}
@@ -185,4 +200,5 @@ def _located(predictor: DrivePredictor, state: Linearization, others: tuple[int,
         cumulative = np.cumsum(weights) / weights.sum()
         low, high = (float(moments[int(np.searchsorted(cumulative, q))]) for q in (_TAIL, 1.0 - _TAIL))
         spell, intervals[name] = tried[int(np.argmax(gains))], (low, high)
-    return in_spell(state.causes[whole], spell, (intervals["start_s"], intervals["end_s"]))
+    located = intervals["start_s"], intervals["end_s"]
+    return {i: in_spell(state.causes[j], spell, located) for i, j in zip(event, whole, strict=True)}

@@ -47,6 +47,7 @@ def test_diagnose_puncture_is_two_causes_from_one_moment(nominal: Drive) -> None
     by = {f.cause: f for f in found.findings}
     assert found.verdict == "explained"
     assert set(by) == {"wheel_radius_difference", "wheel_radius_scale"}
+    assert len({f.definition.spell for f in found.findings}) == 1
     for cause, size in (("wheel_radius_difference", _PUNCTURE_SHARE), ("wheel_radius_scale", 0.5 * _PUNCTURE_SHARE)):
         assert by[cause].size == pytest.approx(size, abs=2.5 * by[cause].sigma)
         spell_95 = by[cause].definition.spell_95
