@@ -185,6 +185,7 @@ _TIE_LOG_ODDS = 1.0  # difference of twice the log-odds that decides nothing
 _ALIAS_LOG_ODDS = 7.0  # twice the log-likelihood by which a rival may be worse: odds of 1 to 33
 _ALIAS_SHARE = 0.02  # or this share of what the cause explains: accuracy of the model
 _BASELINE_SHARE = 0.05  # the same for a robot that does not follow the friction model when nothing is wrong
+_MOTION = 3  # channels of the motion itself
 _MAX_LARGER_SQUARES = 2.0
 """Squares of the discrepancies once causes are corrected, over those before. What is tolerated may hide a part of a cause: of one of 3.7
 times the sigma that it is known by, as it takes to be named, in 1.5 % of robots so much that correcting it makes squares twice as large."""
@@ -350,7 +351,7 @@ def _regression_of(linearization: Linearization, rows: FloatArray, signatures: F
 
 def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start: dict[Cause, float]) -> tuple[dict[Cause, float], float]:
     """Sizes by the predictor itself, and what they cost; inf for sizes that no robot can have, and for causes whose correction makes
-    discrepancies larger: they cancel each other or what is tolerated, which no correction has."""
+    all discrepancies larger: they cancel each other or what is tolerated, which no correction has."""
     try:
         sizes, rows = _refine_sizes(predictor, linearization, start)
         if any(size in cause.limits for cause, size in sizes.items()):  # the drive asks for more than is considered
@@ -363,11 +364,11 @@ def _refined_cost(predictor: DrivePredictor, linearization: Linearization, start
 
 
 def is_correction_worse(predictor: DrivePredictor, noise: Noise, rows: FloatArray) -> bool:
-    """Whether ``rows`` (M, 6), which corrected causes leave, are larger over the noise than the discrepancies by the robot file, beyond
-    what is tolerated; without outliers, and whatever the correlation of the noise."""
+    """Whether ``rows`` (M, 6), which corrected causes leave, are larger than the discrepancies by the robot file: none of the channels of
+    the motion shrinks, and all together grow beyond what is tolerated; over the noise, without outliers."""
     scale = noise.weights[:, None] / noise.sigmas
-    before, after = (float(np.nansum((r * scale) ** 2)) for r in (predictor.discrepancies(Hypothesis()), rows))
-    return after > _MAX_LARGER_SQUARES * before
+    before, after = (np.nansum(((r * scale) ** 2)[:, :_MOTION], axis=0) for r in (predictor.discrepancies(Hypothesis()), rows))
+    return bool(np.all(after >= before)) and float(after.sum()) > _MAX_LARGER_SQUARES * float(before.sum())
 
 
 def _refine_sizes(
