@@ -163,27 +163,6 @@ def path_nodes(positions: FloatArray, resolution_m: float) -> tuple[NDArray[np.i
     return np.array(nodes, dtype=np.intp), np.array(distances)
 
 
-def through_nodes(
-    odometry: FloatArray, covs_since: FloatArray, nodes: NDArray[np.intp], poses: FloatArray, covs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Poses (N, 3) and covariances (N, 3, 3) of ``odometry`` (N, 3), where the ``nodes`` (K,) of it are at ``poses`` (K, 3) with ``covs``.
-
-    What the motion between two nodes has changed by grows evenly along it, and not where the robot stands. Poses between nodes have the
-    noise of the motion since the last one as well, ``covs_since`` (N, 3, 3), the less of it the nearer the next one is.
-    """
-    steps = se2.between(odometry[:-1], odometry[1:])
-    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]) + np.abs(steps[:, 2]) + 1e-9)])
-    k = np.clip(np.searchsorted(nodes, np.arange(len(odometry)), side="right") - 1, 0, len(nodes) - 2)
-    part = np.clip((travelled - travelled[nodes[k]]) / (travelled[nodes[k + 1]] - travelled[nodes[k]]), 0.0, 1.0)
-    since, until = se2.between(odometry[nodes[k]], odometry), se2.between(odometry, odometry[nodes[k + 1]])
-    forward, backward = se2.compose(poses[k], since), se2.compose(poses[k + 1], se2.inverse(until))
-    A, B, w = se2.adjoint(se2.inverse(since)), se2.adjoint(until), part[:, None, None]
-    mixed = (1.0 - w) * (A @ covs[k] @ A.swapaxes(-1, -2)) + w * (B @ covs[k + 1] @ B.swapaxes(-1, -2))
-    noise = (1.0 - w) * covs_since
-    noise[nodes] = 0.0
-    return se2.retract(forward, part[:, None] * se2.local(forward, backward)), mixed + noise
-
-
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
     """Write a TUM file: same trajectory, same bytes.
 

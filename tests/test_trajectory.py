@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.errors import EvaluationError, OutputError
-from localization.trajectory import Trajectory, path_nodes, read_tum, through_nodes, write_tum
+from localization.trajectory import Trajectory, path_nodes, read_tum, write_tum
 from motion_models import se2
 from tests.helpers.disks import files_of_at_most
 
@@ -235,18 +235,3 @@ def test_tum_file_interrupted_write_leaves_no_file(tmp_path):
     write_tum(tmp_path / "a.tum", whole)
     assert len(read_tum(tmp_path / "a.tum")) == len(whole)
     assert [path.name for path in tmp_path.iterdir()] == ["a.tum"]
-
-
-def test_through_nodes_moves_poses_by_travelled_share():
-    odometry = np.column_stack([[0.0, 1.0, 1.0, 2.0], np.zeros(4), np.zeros(4)])  # it rests in between
-    poses, covs = np.array([[0.0, 0.0, 0.0], [2.2, 0.0, 0.0]]), np.array([0.01 * np.eye(3), 0.03 * np.eye(3)])
-    found, mixed = through_nodes(odometry, np.zeros((4, 3, 3)), np.array([0, 3]), poses, covs)
-    np.testing.assert_allclose(found[:, 0], [0.0, 1.1, 1.1, 2.2], atol=1e-6)
-    np.testing.assert_allclose(mixed[[0, 3]], covs, atol=1e-8)
-
-
-def test_through_nodes_adds_the_noise_of_the_motion_less_its_share():
-    odometry = np.column_stack([[0.0, 0.5, 1.0, 1.5, 2.0], np.zeros(5), np.zeros(5)])
-    noise, nothing = np.diag([1e-4, 2e-4, 3e-5]), np.zeros((2, 3, 3))
-    _, found = through_nodes(odometry, np.tile(noise, (5, 1, 1)), np.array([0, 4]), odometry[[0, 4]], nothing)
-    np.testing.assert_allclose(found, np.array([0.0, 0.75, 0.5, 0.25, 0.0])[:, None, None] * noise, atol=1e-12)

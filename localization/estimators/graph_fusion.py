@@ -19,14 +19,14 @@ from localization.core.state import SE2, Group
 from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
-from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
+from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, through_nodes
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
 from localization.maps.position_plane import PositionPlane
-from localization.trajectory import Trajectory, through_nodes
+from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.online_calibration import Corrections
 from motion_models.preintegration import MotionPreintegration, PreintegratedMotion
@@ -264,8 +264,8 @@ class GraphFusion(FilteredOdometry):
             return None
         by_filter = np.array(self._odometry_covs).reshape(-1, 3, 3)
         covs = self._smoothed_covs = np.array([self._bound(*pair) for pair in zip(covs, by_filter, strict=True)])
-        nodes, odom = np.array(self._nodes), np.array(self._steps).reshape(-1, 3)
-        return Trajectory(filtered.stamps_ns, *through_nodes(odom, np.array(self._covs_since).reshape(-1, 3, 3), nodes, poses, covs))
+        odom, since = np.array(self._steps).reshape(-1, 3), np.array(self._covs_since).reshape(-1, 3, 3)
+        return Trajectory(filtered.stamps_ns, *through_nodes(SE2, odom, since, np.array(self._nodes), poses, covs))
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what was estimated besides the pose, by name: by the filter, and radius and lever arm by the graph."""

@@ -10,7 +10,6 @@ Measurements are collected on the way and solved once, by Levenberg-Marquardt. P
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import gtsam
@@ -144,29 +143,3 @@ def gravity_factor(measured: GravityMeasurement) -> gtsam.CustomFactor:
         return np.asarray(GRAVITY * measured.turned.T @ up + values.atVector(_BIAS) - measured.force)
 
     return robust_factor([key, _BIAS], measured.variance * np.eye(3), error)
-
-
-def through_keyframes(
-    odometry: FloatArray, covs_since: FloatArray, nodes: Sequence[int], poses: FloatArray, covs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Poses (N, 4, 4) and covariances (N, 6, 6) of ``odometry`` (N, 4, 4), whose ``nodes`` (K,) are at ``poses`` with ``covs``.
-
-    What the motion between two nodes has changed by grows evenly along their steps, as in the plane (`trajectory.through_nodes`); after the
-    last node the odometry goes on.
-    """
-    out, spread, noise = np.array(odometry), np.array(covs_since), np.array(covs_since)
-    noise[list(nodes)] = 0.0
-    ends = [*nodes[1:], len(odometry)]
-    for k, (a, b) in enumerate(zip(nodes, ends, strict=True)):
-        to_next = np.zeros(6)
-        if k + 1 < len(nodes):
-            to_next = se3.local(poses[k] @ se3.inverse(odometry[a]) @ odometry[b], poses[k + 1])
-        for i in range(a, b):
-            part, since = (i - a) / (b - a), se3.inverse(odometry[a]) @ odometry[i]
-            out[i] = se3.retract(poses[k] @ since, part * to_next)
-            A = se3.adjoint(se3.inverse(since))
-            spread[i] = A @ covs[k] @ A.T + (1.0 - part) * noise[i]
-            if k + 1 < len(nodes):
-                B = se3.adjoint(se3.inverse(odometry[i]) @ odometry[b])
-                spread[i] = (1.0 - part) * spread[i] + part * (B @ covs[k + 1] @ B.T)
-    return out, spread

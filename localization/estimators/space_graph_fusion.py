@@ -16,8 +16,9 @@ from localization.core.state import clip_eigenvalues
 from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate, Estimator
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
+from localization.estimators.pose_graph import through_nodes
 from localization.estimators.space_fusion import SpaceFusion
-from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, through_keyframes
+from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph
 from localization.events import Step
 from localization.lidar import LostScans
 from localization.lifting import Pose3, SpaceTable, Trajectory3
@@ -126,7 +127,7 @@ class SpaceGraphFusion(Estimator):
             return None
         stamps = np.array(self._stamps_ns, dtype=np.int64)
         odometry, since = np.array(self._poses).reshape(-1, 4, 4), np.array(self._covs_since).reshape(-1, 6, 6)
-        smoothed, spread = through_keyframes(odometry, since, self._nodes, poses, covs)
+        smoothed, spread = through_nodes(SE3, odometry, since, np.array(self._nodes), poses, covs)
         smoothed = lift(self._map_T_odom) @ smoothed
         table, planar = SpaceTable(), filtered.poses.copy()
         planar_covs = None if filtered.covariances is None else filtered.covariances.copy()
