@@ -27,7 +27,7 @@ _MIN_YAW_STEP_RAD = 2e-3
 OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
 """-log of the odds that the prior is an outlier."""
 _SEARCH_FACTOR = 9.0
-SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
+_SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
 """The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2] + j j^T, j from the prior to where the motion of the last step would lead."""
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
 """Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
@@ -126,7 +126,7 @@ def search_limit(cov: Cov3) -> FloatArray:
 
 def prior_outlier_cov(cov: Cov3) -> Cov3:
     """(3, 3) to be added to the covariance ``cov`` (3, 3) of a prior that may be an outlier."""
-    return np.asarray((_SEARCH_FACTOR - 1.0) * cov + SEARCH_FLOOR)
+    return np.asarray((_SEARCH_FACTOR - 1.0) * cov + _SEARCH_FLOOR)
 
 
 def _count(half: FloatArray, yaws: int, step: float) -> float:

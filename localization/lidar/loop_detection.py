@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from localization.lidar.correlative_search import SEARCH_FLOOR, draw_image, find_place, prior_outlier_cov, search_limit
-from localization.lidar.registration import align_points, is_narrow, mahalanobis
+from localization.lidar.correlative_search import draw_image, find_place, prior_outlier_cov, search_limit
+from localization.lidar.registration import align_points, is_narrow
 from localization.lidar.scan_matcher import MIN_PLACE_OVERLAP, LidarConfig
 from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
@@ -25,8 +25,6 @@ _NEW_KEYFRAMES = 5
 for as many: loops that share scans share their errors, and would count twice."""
 _FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
-_AGREE_SQUARE = 9.0
-"""Two loops agree where they and the odometry between them close within 3 sigma."""
 _MAX_DISTANCE_RANGES = 1.5
 """How far from its place a scan still shows the same walls [median range]."""
 
@@ -57,14 +55,13 @@ class LoopClosure:
 
 
 class LoopDetector:
-    """`add` each keyframe, then `detect`: loops on which two trials agree."""
+    """`add` each keyframe, then `detect` the loop that ends there."""
 
     def __init__(self, config: LidarConfig) -> None:
         self._config = config
         self._least_travel_m = _MIN_TRAVEL_SUBMAPS * config.key_scans * config.key_distance_m
         self.keyframes: list[Keyframe] = []
         self._travelled_m: list[float] = []
-        self._pending: list[LoopClosure] = []
         self._next_trial = 0
 
     def add(self, keyframe: Keyframe) -> None:
@@ -77,7 +74,7 @@ class LoopDetector:
         self.keyframes.append(keyframe)
 
     def detect(self, cell: float, poses: Callable[[], FloatArray], marginal: Callable[[int], FloatArray]) -> LoopClosure | None:
-        """The loop that ends at the newest keyframe, if one of the last trials confirms it.
+        """The loop that ends at the newest keyframe, or None.
 
         ``cell``: edge of voxels [m]; ``poses()`` (K, 3) are the graph's, ``marginal(k)`` (3, 3) is the covariance of one."""
         k = len(self.keyframes) - 1
@@ -85,14 +82,8 @@ class LoopDetector:
         if not old or k < self._next_trial or not len(self.keyframes[k].points):
             return None
         found = self._match(k, old, cell, poses(), marginal(k))
-        self._pending = [loop for loop in self._pending if k - loop.b <= _OLD_KEYFRAMES]
-        if found is None:
-            return None
-        is_confirmed = any(self._agree(loop, found) for loop in self._pending)
-        self._pending.append(found)
-        if not is_confirmed:
-            return None
-        self._next_trial = k + _NEW_KEYFRAMES
+        if found is not None:
+            self._next_trial = k + _NEW_KEYFRAMES
         return found
 
     def _match(self, k: int, n_old: int, cell: float, poses: FloatArray, marginal: FloatArray) -> LoopClosure | None:
@@ -126,13 +117,6 @@ class LoopDetector:
         """(N, 2) the scans of keyframes ``ids`` in the frame of keyframe ``base``."""
         moved = [se2.transform(se2.between(poses[base], poses[i]), self.keyframes[i].points) for i in ids if len(self.keyframes[i].points)]
         return np.vstack(moved)
-
-    def _agree(self, one: LoopClosure, other: LoopClosure) -> bool:
-        """Whether both loops and the odometry between their ends close: a1^-1 a2 and b1^-1 b2 are given by the odometry."""
-        a = se2.between(self.keyframes[one.a].odometry, self.keyframes[other.a].odometry)
-        b = se2.between(self.keyframes[one.b].odometry, self.keyframes[other.b].odometry)
-        cov = one.cov + other.cov + SEARCH_FLOOR
-        return mahalanobis(se2.compose(one.delta, b), se2.compose(a, other.delta), cov) < _AGREE_SQUARE
 
 
 def _within_reach(place: Points2, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> FloatArray:

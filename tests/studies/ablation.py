@@ -172,7 +172,6 @@ PATCHES: Mapping[str, Patch] = {
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
     "loop closures": _attribute(LoopDetector, "detect", lambda self, cell, poses, marginal: None),
-    "agreement of a second loop": _attribute(LoopDetector, "_agree", lambda self, one, other: True),
     "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
     "ways that the scene leaves open as the wheels' alone": _attribute(graph_fusion, "_OPEN_SHARE", math.inf),
