@@ -1,4 +1,4 @@
-# Every target makes its own .venv from pyproject.toml and constraints.txt; nothing else is needed than python3 (3.11-3.13) and make.
+# Every target makes .venv from pyproject.toml and constraints.txt; nothing else is needed than python3 (3.11-3.13) and make.
 PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo-out
@@ -6,35 +6,41 @@ DATA := tests/data
 
 .PHONY: demo demo-buildings test test-extended test-all test-ros2 check docs benchmark clean
 
-.venv/ready: pyproject.toml constraints.txt
-	@echo "Making .venv with what pyproject.toml names (1.5 GB; minutes at the first time)."
+.venv/installed: pyproject.toml constraints.txt
+	@echo "Making .venv with skidloc and what it needs (700 MB; a minute at the first time)."
 	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	touch $@
+
+.venv/ready: .venv/installed
+	@echo "Adding the tools of tests and documents (800 MB)."
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
 KERNELS := $(shell grep -rlE '^@(threaded_kernel|kernel|subroutine)' --include='*.py' localization motion_models)
 
-.venv/kernels: .venv/ready $(KERNELS)
+.venv/kernels: .venv/installed $(KERNELS)
 	@echo "Compiling, once (a minute)."
 	$(BIN)/python -m tests.helpers.compile_kernels
 	touch $@
 
-# A minute: real rotations held out, then a drive whose arms move the centre of gravity, then the same with a hidden load.
+# A minute: real rotations held out, then a drive whose arms move the centre of gravity, and beside both one with a hidden load.
 demo: .venv/kernels
 	rm -rf $(DEMO) && mkdir $(DEMO)
-	@echo "1. Real robot: 68 rotations in place, each at another centre of gravity."
-	$(BIN)/python -m tests.studies.held_out_rotations
-	@echo "2. Simulated drive: the arms take another posture on each lap. Wheels alone, then fused with gyro and LiDAR."
-	@echo "3. Beside it two such laps with a load of 8 kg in the gripper that the robot file does not have: what is wrong with the model?"
 	@{ $(BIN)/skidloc simulate laps --config.experiment.laps 2 --seed 1 --effect payload=8 --out $(DEMO)/load.mcap && \
 		$(BIN)/skidloc diagnose $(DEMO)/load.mcap --robot vaultbot --out $(DEMO)/load; } > $(DEMO)/load.txt 2>&1 & load=$$!; \
+	echo "1. Real robot: 68 rotations in place, each at another centre of gravity."; \
+	$(BIN)/python -m tests.studies.held_out_rotations; studied=$$?; \
+	echo "2. Simulated drive: the arms take another posture on each lap. Wheels alone, then fused with gyro and LiDAR."; \
 	$(BIN)/skidloc simulate laps --out $(DEMO)/laps.mcap && \
 	$(BIN)/skidloc replay $(DEMO)/laps.mcap --robot vaultbot --model diff_drive,skid_steer --estimator odometry,ekf --out $(DEMO)/laps; \
-	replayed=$$?; wait $$load; diagnosed=$$?; cat $(DEMO)/load.txt; exit $$((replayed + diagnosed))
+	replayed=$$?; wait $$load; diagnosed=$$?; \
+	echo "3. Two such laps with a load of 8 kg in the gripper that the robot file does not have: what is wrong with the model?"; \
+	cat $(DEMO)/load.txt; exit $$((studied + replayed + diagnosed))
 	@echo "Open $(DEMO)/laps/report.html and $(DEMO)/load/diagnosis.html in a browser. Long real logs: make demo-buildings."
 
 # Minutes: the Husky outdoors and two real buildings.
-demo-buildings: .venv/ready
+demo-buildings: .venv/installed
 	rm -rf $(DEMO)/husky $(DEMO)/aces $(DEMO)/fr079 && mkdir -p $(DEMO)
 	$(BIN)/skidloc replay $(DATA)/husky-outdoor-gps/test1.bag --robot husky_a200 --model diff_drive,skid_steer --out $(DEMO)/husky
 	$(BIN)/skidloc replay $(DATA)/aces/aces.mcap --robot aces --model diff_drive,skid_steer --estimator odometry,lidar,ekf,graph \
@@ -43,11 +49,11 @@ demo-buildings: .venv/ready
 		--reference $(DATA)/fr079/fr079_reference.tum --reference-sigma 0.016 0.5 --out $(DEMO)/fr079
 	@echo "Open $(DEMO)/aces/report.html, $(DEMO)/fr079/report.html and $(DEMO)/husky/report.html in a browser."
 
-test: .venv/kernels
+test: .venv/ready .venv/kernels
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow and not extended"
 
 # What `make test` leaves out: more cases of each kind and long scenarios.
-test-extended: .venv/kernels
+test-extended: .venv/ready .venv/kernels
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "extended and not slow"
 
 test-all: test test-extended

@@ -146,11 +146,21 @@ def _run(name: str, options: Sequence[str]) -> None:
     if text is not None:
         print(text)
         return
+    parse(name, options).run(PlainConsole(highlight=False))
+
+
+def parse(name: str, options: Sequence[str]) -> Any:
+    """The command ``name`` with its ``options``, to be run. Raises `SystemExit` (2) for what it does not have."""
     import tyro
 
     command = getattr(importlib.import_module(f"localization.commands.{name}"), COMMANDS[name][0])
     options = _expand(options, set(_three_state_options(command)))
-    tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,)).run(PlainConsole(highlight=False))
+    try:
+        return tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,))
+    except SystemExit as end:
+        if end.code and any(option.startswith(("--topic.", "--config.")) for option in options):
+            print(f"`skidloc {name} --help-all` lists --topic.* and --config.*.", file=sys.stderr)
+        raise
 
 
 def _expand(options: Sequence[str], three_state: Collection[str]) -> list[str]:

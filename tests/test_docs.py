@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from localization.cli import main
+from localization.cli import main, parse
 from tests.helpers.checkout import ROOT, enter_checkout
 from tests.helpers.compare import logs
 
@@ -30,6 +30,18 @@ def commands_of(path: Path) -> list[str]:
     """Commands in the shell blocks of a document."""
     blocks = re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     return [line for block in blocks for line in block.splitlines() if line.startswith("skidloc ")]
+
+
+def examples_of(path: Path) -> list[str]:
+    """Commands in blocks that are no shell blocks: they need a log of the reader's, or ROS."""
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    lines = [re.split(r"\s{2,}#", line)[0] for kind, block in blocks if kind not in ("sh", "python") for line in block.splitlines()]
+    return [found[1] for line in lines if (found := re.search(r'(?:^|^\$ |")skidloc (\w[^"]*)', line))]
+
+
+def slug(heading: str) -> str:
+    """Name of a heading in a link, as of GitHub and MkDocs."""
+    return re.sub(r"[^\w\- ]", "", re.sub(r"[`*]|\]\(.*?\)", "", heading).lower()).strip().replace(" ", "-")
 
 
 README_COMMANDS = [command for path in DOCUMENTS if path.name == "README.md" for command in commands_of(path)]
@@ -60,6 +72,26 @@ def test_commands_of_a_page_run_one_after_another(page: Path, tmp_path: Path, mo
         Path("logs.csv").write_text("log,robot,floor,day\ndrives/monday.mcap,vaultbot,hall,\ndrives/tuesday.mcap,vaultbot,hall,\n")
     for command in commands_of(page):
         assert main(shlex.split(command, comments=True)[1:]) == 0, command
+
+
+@pytest.mark.extended
+def test_examples_have_options_that_exist() -> None:
+    examples = [example for path in DOCUMENTS for example in examples_of(path)]
+    assert len(examples) >= 8
+    for example in examples:
+        name, *options = shlex.split(re.sub(r"[{}]", "", example))
+        assert parse(name, options) is not None, example
+
+
+def test_links_to_a_heading_lead_to_one() -> None:
+    missing = []
+    for path in DOCUMENTS:
+        for file, anchor in re.findall(r"\]\(([^)#:]*)#([^)]+)\)", path.read_text(encoding="utf-8")):
+            target = path.parent / file if file else path
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), flags=re.MULTILINE) if target.suffix == ".md" else []
+            if target.suffix == ".md" and anchor not in map(slug, headings):
+                missing.append((str(path.relative_to(ROOT)), file, anchor))
+    assert missing == []
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -173,8 +173,10 @@ class TopicChooser:
         if have is not None:
             found = f"'{topic}' in {self._log} carries {short_type(have)}, not {short}"
         others = self.of_type(*types)
-        fitting = f"topics of type {short} in it: {', '.join(others)}" if others else f"it has no topic of type {short}"
-        raise TopicError(f"{found}; {fitting}. Pass {option}.")
+        fitting = f"topics of type {short} in it: {', '.join(others)}. Pass {option}."
+        if not others:
+            fitting = f"it has no topic of type {short}. `skidloc info` lists its topics; {option} names the one to take."
+        raise TopicError(f"{found}; {fitting}")
 
 
 def short_type(name: str) -> str:

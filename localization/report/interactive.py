@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.maps.grid import Grid
 from localization.report.page import Explorer
-from localization.report.runs import PlottedRun, map_view, run_with_map, thin_series, timeline
+from localization.report.runs import PlottedRun, ellipse, map_view, run_with_map, thin_series, timeline
 from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -26,9 +27,12 @@ _MOST_POINTS = 2_700
 """Points of all paths together, of all errors, and of all innovations: 80 bytes in all, so that a page stays below 2 MB."""
 _MOST_MAP_POINTS = 5_000
 _MOST_LOOPS = 400
+_MOST_SLIPS = 60
 _MOST_MEANS = 300
 _LOST_AFTER_S = 1.0
 """A time without a matched scan that is shown as lost [s]: ten scans of a usual LiDAR."""
+_SLIP_NIS = float(chi2.isf(1e-9, 3))
+"""Innovation of a scan that noise exceeds once in 1e9 scans: the wheels slipped, or the robot was pushed."""
 _MILLIMETRES, _TENTHS = 3, 1
 _FAULT = re.compile(r"^at t = ([.0-9]+) s: (.*)", re.MULTILINE)
 """Time and text of a warning of the sensor checks."""
@@ -79,7 +83,7 @@ def _borders(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations |
 
 
 def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None) -> dict[str, Any]:
-    """One run: path with sigma, errors, innovations, loops, times without a matched scan, and when sensor faults began."""
+    """One run: path with sigma, errors, innovations, loops, times of slip and without a matched scan, and when sensor faults began."""
     trajectory = run.result.run.trajectory
     t = np.asarray((trajectory.stamps_ns - start_ns) * 1e-9, dtype=np.float64)
     poses = run.placed(trajectory.poses)
@@ -97,10 +101,12 @@ def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None
         "heading": numbers(np.degrees(poses[keep, 2]), _TENTHS),
         "way": numbers(way[keep], 2),
         "sigma": None if sigma is None else numbers(sigma[keep], 4),
+        "ellipse": None if trajectory.covariances is None else _ellipses(poses[keep], trajectory.covariances[keep]),
         "errors": _errors(run, t, way, most, track),
         "nis": _innovations(run, t),
         "loops": _loops(run),
         "lost": _lost(run, t),
+        "slips": _slips(run, t),
         "faults": [[float(at), text] for at, text in _FAULT.findall("\n".join(run.result.run.warnings))],
         "parameters": {name: _history(rows, start_ns) for name, rows in run.result.run.parameter_history.items()},
     }
@@ -168,6 +174,23 @@ def _lost(run: PlottedRun, t: FloatArray) -> list[list[float | None]]:
     if t[-1] - matched[-1] > _LOST_AFTER_S:
         found.append([float(matched[-1]), float(t[-1])])
     return [numbers(np.array(pair), 2) for pair in found]
+
+
+def _slips(run: PlottedRun, t: FloatArray) -> list[list[float | None]]:
+    """Intervals in which scans contradict the wheels: [from, to] in seconds, and the largest innovation in sigmas; the largest of all."""
+    nis = run.result.run.nis
+    large = np.flatnonzero(nis > _SLIP_NIS)
+    if not len(large):
+        return []
+    parts = np.split(large, np.flatnonzero(np.diff(t[large]) > _LOST_AFTER_S) + 1)
+    found = [[t[part[0]], t[part[-1]], np.sqrt(nis[part].max())] for part in parts]
+    return [numbers(row, 2) for row in sorted(sorted(found, key=lambda row: -row[2])[:_MOST_SLIPS])]
+
+
+def _ellipses(poses: FloatArray, covariances: FloatArray) -> list[list[float | None]]:
+    """Half axes [m] and direction [rad] of the two-sigma ellipses of ``poses`` (N, 3) with covariances (N, 3, 3): three columns."""
+    found = [ellipse(pose, cov) for pose, cov in zip(poses, covariances, strict=True)]
+    return [numbers([e.semi_axes[0] for e in found], 3), numbers([e.semi_axes[1] for e in found], 3), numbers([e.angle for e in found], 2)]
 
 
 def _history(rows: FloatArray, start_ns: int) -> dict[str, list[float | None]]:

@@ -270,7 +270,7 @@ def _shown(result: Result) -> str:
     if result.nees_mean is None and result.position_nees is not None:
         dof, band = 1, result.position_nees.band
     factor = math.sqrt(band[1] / dof)
-    return f"; this drive shows sigmas that are {factor:.1f} times too small or more" if factor > _MIN_SHOWN_FACTOR else ""
+    return f"; so short a drive shows only sigmas that are {factor:.1f} times too small or more" if factor > _MIN_SHOWN_FACTOR else ""
 
 
 def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:

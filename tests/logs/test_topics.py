@@ -135,7 +135,7 @@ def test_topic_two_with_wheel_joints_are_refused(tmp_path: Path) -> None:
 
 def test_topic_option_of_wrong_type_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        TopicError, match=r"'/pose' in run\.mcap carries geometry_msgs/PoseStamped, not sensor_msgs/Imu.*no topic of type.*--topic\.imu"
+        TopicError, match=r"'/pose' in run\.mcap carries geometry_msgs/PoseStamped, not sensor_msgs/Imu.*no topic of type.*skidloc info"
     ):
         log_of(tmp_path, {"/joint_states": "joints", "/pose": "pose"}, TopicOverrides(imu="/pose"))
 

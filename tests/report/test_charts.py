@@ -109,3 +109,25 @@ def test_weigh_page_shows_the_ellipse_and_the_load():
     assert "<td>+1.66</td>" in text
     assert "diagonal_load" not in text
     assert len(made) < 2_000_000
+
+
+def printed(page: str) -> str:
+    """The page as it is printed: what holds for paper alone holds on the screen, and the other way round."""
+    return page.replace("@media screen", "@media (width < 0)").replace("@media print", "@media screen")
+
+
+def test_printed_page_has_still_figures_and_no_controls(tmp_path: Path):
+    script = """const shown = query => [...document.querySelectorAll(query)].map(e => getComputedStyle(e).display !== "none");
+    found.still = shown("section.static"); found.drawn = shown(".explorer"); found.filters = shown("input.filter");
+    found.paper = getComputedStyle(document.body).backgroundColor;
+    found.overflow = document.documentElement.scrollWidth - document.documentElement.clientWidth;"""
+    options = ("--window-size=720,900", "--blink-settings=preferredColorScheme=0")  # A4 between its margins, of a reader with a dark theme
+    seen = run_in_page(printed(render(PAGE)), script, tmp_path, *options)
+    assert seen == {
+        "errors": [],
+        "still": [True],
+        "drawn": [False],
+        "filters": [False, False],
+        "paper": "rgb(255, 255, 255)",
+        "overflow": 0,
+    }

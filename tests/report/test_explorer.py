@@ -32,10 +32,12 @@ const titles = () => (box("time").layout.annotations || []).map(a => a.text);
 const scan = () => {const d = box("map").data; return [d[d.length - 2].x, d[d.length - 2].y];};
 change("slider", 21, "input"); found.scan = scan();
 change("slider", 20, "input"); found.at20 = now(); found.text = box("now").textContent;
+const ellipse = box("map").data.filter(t => t.name === "two sigma now");
+found.ellipse = ellipse.map(t => [Math.max(...t.x) - 10, Math.max(...t.y)]);
 found.log = box("time").layout.yaxis.type; found.titles = titles();
 change("a", 0, "change"); change("b", 1, "change"); found.difference = titles().includes("A to B [m]");
 change("axis", "way", "change"); found.way = box("time").layout.xaxis.title.text;
-found.bands = box("time").layout.shapes.filter(s => s.type === "rect").length;
+found.bands = box("time").layout.shapes.filter(s => s.type === "rect").map(s => [s.x0, s.x1]);
 found.isStaticHidden = getComputedStyle(document.querySelector("section.static")).display === "none";
 change("aligned", "start", "change"); found.atStart = Math.max(...box("time").data[0].y);
 found.events = [...box("event").options].map(o => o.text).slice(1);
@@ -60,6 +62,7 @@ def one_loop():
 def results():
     nis = np.full(401, 3.0)
     nis[100:200] = np.nan
+    nis[251:255] = 100.0
     cov = np.tile(np.diag([0.01, 0.01, 0.001]), (401, 1, 1))
     zeros = np.zeros((401, 3)), np.zeros((401, 3, 3))
     plain = Run(
@@ -92,6 +95,7 @@ def test_explorer_data_has_times_without_a_matched_scan():
     found, reference = results()
     data = explorer_data(plotted_runs(found), reference)
     assert [run["lost"] for run in data["runs"]] == [[], [[9.9, 20.0]]]
+    assert [run["slips"] for run in data["runs"]] == [[], [[25.1, 25.4, 10.0]]]
     assert data["runs"][1]["way"][-1] == pytest.approx(20.0)
     assert data["reference"]["t"][-1] == pytest.approx(40.0)
 
@@ -126,11 +130,13 @@ def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     assert seen["scan"] == [[12.0, 12.0], [1.0, -1.0]]  # the last one before 21 s, from where the robot was at 20 s
     assert seen["difference"]
     assert seen["isStaticHidden"]
-    assert seen["bands"] == 1
+    assert np.array(seen["ellipse"]) == pytest.approx(np.full((2, 2), 0.2), abs=0.01)
+    assert seen["bands"] == [[4.95, 10.0], [12.55, 12.7]]
     assert seen["atStart"] == pytest.approx(2.0, abs=0.01)
     assert seen["events"] == [
         "9.9 s: no scan matched for 10.1 s, ekf · diff_drive",
         "12.3 s: fault: the gyro's rates stand still.",
+        "25.1 s: scan against wheels 10 sigma (slip or push), ekf · diff_drive",
         "40.0 s: loop closed, ekf · diff_drive",
     ]
     assert seen["jumped"] == "12.3 s"

@@ -193,8 +193,8 @@ def test_summary_large_innovations_with_honest_poses_are_no_overconfidence():
     text = verdict([dataclasses.replace(result, nees_mean=1.5, nees_band=None)], track())
     assert "overconfident" not in text
     assert (
-        "Its covariances are not too small by the reference (mean NEES 1.5, where 3 is expected; this drive shows sigmas that are 1.8"
-        in text
+        "Its covariances are not too small by the reference (mean NEES 1.5, where 3 is expected; so short a drive shows only "
+        "sigmas that are 1.8" in text
     )
     assert "differ more than their noise allows: mean NIS" in text
     assert "`skidloc diagnose`" in text

@@ -33,6 +33,8 @@
         mode: "lines", name: run.loops.length + " loops, " + run.label, hoverinfo: "skip", visible: "legendonly",
         line: {color: colour("accent"), width: 1}});
     });
+    runs.forEach((run, i) => run.ellipse && traces.push({x: [], y: [], mode: "lines", name: "two sigma now", legendgroup: run.label, showlegend: false,
+      hoverinfo: "skip", meta: i, line: {color: colour(run.colour), width: 1.5}}));
     if (data.scans.length) traces.push({x: [], y: [], mode: "markers", name: "scan now", hoverinfo: "skip", marker: {size: 3, color: colour("accent")}});
     traces.push({x: [], y: [], mode: "markers", name: "now", hoverinfo: "skip", showlegend: false,
                  marker: {size: 11, color: [], line: {color: colour("paper"), width: 2}}});
@@ -91,11 +93,22 @@
       return {type: "rect", xref: "x", yref: "paper", x0: at(from), x1: at(to), y0: 0, y1: 1, line: {width: 0},
               fillcolor: colour(run.colour), opacity: .18, layer: "below"};
     }));
+    const slips = runs.flatMap(run => run.slips.map(([from, to]) => {
+      const at = t => isWay() ? run.way[before(run.t, t)] : t;
+      return {type: "rect", xref: "x", yref: "paper", x0: at(from), x1: at(to), y0: 0, y1: 1, line: {color: colour("orange"), width: 1},
+              fillcolor: colour("orange"), opacity: .3, layer: "below"};
+    }));
     const faults = runs.flatMap(run => run.faults.map(([t]) => isWay() ? run.way[before(run.t, t)] : t)).map(t => ({type: "line", xref: "x",
       yref: "paper", x0: t, x1: t, y0: 0, y1: 1, line: {color: colour("red"), width: 1, dash: "dot"}, layer: "below"}));
-    return [...bands, ...faults, {type: "line", xref: "x", yref: "paper", x0: line, x1: line, y0: 0, y1: 1, line: {color: colour("accent"), width: 1.5}}];
+    return [...bands, ...slips, ...faults, {type: "line", xref: "x", yref: "paper", x0: line, x1: line, y0: 0, y1: 1, line: {color: colour("accent"), width: 1.5}}];
   };
 
+  // Two sigma of the position of `run` at its pose k, as a closed line.
+  const ellipseNow = (run, k) => {
+    const [a, b, angle] = run.ellipse.map(column => column[k]), turns = [...Array(49).keys()].map(i => 2 * Math.PI * i / 48);
+    const [c, s] = [Math.cos(angle), Math.sin(angle)];
+    return [turns.map(u => run.x[k] + a * c * Math.cos(u) - b * s * Math.sin(u)), turns.map(u => run.y[k] + a * s * Math.cos(u) + b * c * Math.sin(u))];
+  };
   const show = t => {
     now = Math.min(Math.max(t, 0), end);
     box("slider").value = now;
@@ -104,10 +117,9 @@
     const points = {x: runs.map((run, i) => run.x[at[i]]), y: runs.map((run, i) => run.y[at[i]]), c: runs.map(run => colour(run.colour))};
     if (data.reference) points.x.push(data.reference.x[track]), points.y.push(data.reference.y[track]), points.c.push(colour("ink"));
     Plotly.restyle(box("map"), {x: [points.x], y: [points.y], "marker.color": [points.c]}, [box("map").data.length - 1]);
-    if (data.scans.length) {
-      const [, x, y] = data.scans[before(scanTimes, now)];
-      Plotly.restyle(box("map"), {x: [x], y: [y]}, [box("map").data.length - 2]);
-    }
+    const layers = box("map").data.map((trace, k) => [k, trace.meta]).filter(([, i]) => i !== undefined).map(([k, i]) => [k, ...ellipseNow(runs[i], at[i])]);
+    if (data.scans.length) layers.push([box("map").data.length - 2, ...data.scans[before(scanTimes, now)].slice(1)]);
+    if (layers.length) Plotly.restyle(box("map"), {x: layers.map(l => l[1]), y: layers.map(l => l[2])}, layers.map(l => l[0]));
     Plotly.relayout(box("time"), {shapes: shapes()});
     box("now").textContent = now.toFixed(1) + " s";
   };
@@ -122,7 +134,8 @@
   };
   const drawTime = () => {
     const [curves, more] = timeFigure();
-    Plotly.react(box("time"), curves, {...more, showlegend: !isNarrow()}, {...config, scrollZoom: false});
+    const margin = {...more.margin, t: isNarrow() ? 26 : more.margin.t};  // without a legend, the first title needs it
+    Plotly.react(box("time"), curves, {...more, margin, showlegend: !isNarrow()}, {...config, scrollZoom: false});
     show(now);
   };
   const draw = () => { drawMap(); drawTime(); };
@@ -133,6 +146,7 @@
   }
   const faults = new Map(runs.flatMap(run => run.faults.map(([t, text]) => [text, [t, "fault: " + text]])));  // of several runs once
   const events = [...faults.values(), ...runs.flatMap(run => run.lost.map(l => [l[0], "no scan matched for " + (l[1] - l[0]).toFixed(1) + " s, " + run.label])),
+                  ...runs.flatMap(run => run.slips.map(l => [l[0], "scan against wheels " + l[2].toFixed(0) + " sigma (slip or push), " + run.label])),
                   ...runs.flatMap(run => run.loops.map(l => [l[4], "loop closed, " + run.label]))].sort((p, q) => p[0] - q[0]);
   events.forEach(([t, text]) => box("event").add(new Option(t.toFixed(1) + " s: " + text, t)));
   const names = [...new Set(runs.flatMap(run => Object.keys(run.parameters)))];
