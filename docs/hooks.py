@@ -7,6 +7,7 @@ In a page `{code: PATH :: TEXT}` becomes the number and the text of the line of 
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from html import escape, unescape
@@ -46,6 +47,7 @@ def find_line(path: str, text: str) -> Line:
     return found[0]
 
 
+@functools.cache
 def messages(path: str) -> list[str]:
     """Texts of the warnings of a module, in the order of its lines; expressions in them are an ellipsis."""
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))

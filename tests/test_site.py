@@ -11,6 +11,7 @@ import pytest
 
 from localization import sensor_checks
 from localization.sensor_checks.faults import Fault
+from tests.helpers.checkout import enter_checkout
 from tests.helpers.extended import cases
 
 ROOT = Path(__file__).parents[1]
@@ -89,8 +90,8 @@ def test_equation_becomes_mathml():
 
 
 @pytest.mark.parametrize("name", cases(SNIPPETS, usual=["api 1"]))
-def test_python_of_a_page_runs(name: str, monkeypatch: pytest.MonkeyPatch):
+def test_python_of_a_page_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     if "to_pandas" in SNIPPETS[name]:
         pytest.importorskip("pandas")
-    monkeypatch.chdir(ROOT)
+    enter_checkout(tmp_path, monkeypatch)
     exec(compile(SNIPPETS[name], name, "exec"), {})

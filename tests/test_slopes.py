@@ -69,7 +69,10 @@ def final_error(log, run):
     return float(np.hypot(*(true - found)[:2])), abs(math.remainder(true[2] - found[2], 2.0 * math.pi))
 
 
-@pytest.mark.parametrize(("model", "estimator", "gain"), [("friction", "odometry", 5.0), ("skid_steer", "ekf", 3.0), ("icr", "ekf", 3.0)])
+@pytest.mark.parametrize(
+    ("model", "estimator", "gain"),
+    [("friction", "odometry", 5.0), ("skid_steer", "ekf", 3.0), pytest.param("icr", "ekf", 3.0, marks=pytest.mark.extended)],
+)
 def test_slope_drive_with_the_tilt_is_nearer_than_by_a_flat_model(on_slope, model, estimator, gain):
     """In the simulator, whose forces are the dynamic model's; the flat model's error is what the robot slides downhill."""
     flat, _ = final_error(on_slope, run_of(on_slope, model, estimator, FLAT))

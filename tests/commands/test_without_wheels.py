@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from localization.cli import main
+from localization.comparison.jobs import run_job
 from tests.helpers import bags
 from tests.helpers.bags import S
 
@@ -35,7 +36,11 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_command_without_wheels_ends_with_exit_code_2(command: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_without_wheels_ends_with_exit_code_2(
+    command: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # in this process: another one takes seconds to start
+    monkeypatch.setattr("localization.commands.compare.run_local", lambda jobs, processes: ((job, run_job(job)) for job in jobs))
     options = COMMANDS[command]
     out = [str(tmp_path / ("robot.toml" if command == "calibrate" else "out"))] if "--out" in options else []
     assert main([command.split()[0], str(log), "--robot", "husky_a200", *options, *out]) == 2

@@ -26,7 +26,7 @@ def test_every_case_can_be_simulated() -> None:
         assert moved.payload_kg == case.effects.get("payload", 0.0), case.number
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_encoder_that_loses_few_counts_is_named() -> None:
     """Two spells in a minute, 0.9 % of the counts: 20 mrad in a window, where the noise is 0.3 mrad."""
     row = run(case_of(1005), has_rivals=False)

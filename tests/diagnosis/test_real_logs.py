@@ -156,7 +156,7 @@ def test_diagnose_clockwise_rotations_separate_treads() -> None:
         assert {f.cause for f in table.diagnosis.findings} == {"lidar_offset_x", "diagonal_load", "track_width"}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_drive_husky_clock_agrees_with_gyro() -> None:
     """A clock between them is named; the gyro, which was no input, shows that both are late, the wheels more so."""
     robot = drive_husky.robot()

@@ -57,7 +57,7 @@ def test_diagnose_puncture_is_two_causes_from_one_moment(nominal: Drive) -> None
     assert found.sentence.startswith("Correct wheel_radius_difference from t = 30 s")
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_rates_that_saturate_are_unexplained(nominal: Drive) -> None:
     """Further effects outside of the catalogue are in `tests.studies.unknown_effects`."""
     assert_unexplained(diagnose(UNKNOWN["rates saturate"](nominal), make_model("friction", nominal.robot)))

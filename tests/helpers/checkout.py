@@ -1,4 +1,4 @@
-"""A folder with the data of this repository whose longest log is short, for commands and code of documents."""
+"""A folder with the data of this repository whose long logs are short, for commands and code of documents."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-HUSKY = Path("tests/data/husky-outdoor-gps/test1.bag")
+HUSKY, ACES = Path("tests/data/husky-outdoor-gps/test1.bag"), Path("tests/data/aces/aces.mcap")
 
 
 def beginning_of(log: Path, part: int, path: Path) -> Path:
@@ -16,12 +16,17 @@ def beginning_of(log: Path, part: int, path: Path) -> Path:
     return path
 
 
-def enter_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Go to a folder with the data of this repository, its longest log cut to the first fifth."""
-    (tmp_path / HUSKY.parent).mkdir(parents=True)
-    beginning_of(ROOT / HUSKY, 5, tmp_path / HUSKY)
+def enter_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int = 5) -> None:
+    """Go to a folder with the data of this repository, of the Husky's and of ACES's log the first ``part``-th."""
     data = Path("tests/data")
+    (tmp_path / data).mkdir(parents=True)
     for folder in (ROOT / data).iterdir():
-        if folder.name != HUSKY.parent.name:
-            (tmp_path / data / folder.name).symlink_to(folder)
+        (tmp_path / data / folder.name).symlink_to(folder)
+    for log in (HUSKY, ACES):
+        (tmp_path / log.parent).unlink()
+        (tmp_path / log.parent).mkdir()
+        for file in (ROOT / log.parent).iterdir():
+            (tmp_path / log.parent / file.name).symlink_to(file)
+        (tmp_path / log).unlink()
+        beginning_of(ROOT / log, part, tmp_path / log)
     monkeypatch.chdir(tmp_path)

@@ -28,6 +28,7 @@ from localization.ros.session import Files, View
 from localization.ros.settings import LiveRun, Names, NodeConfig
 from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler
 from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, Rest, constant
+from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
@@ -52,9 +53,9 @@ DRIVE = Experiment("short", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
 
 @functools.cache
 def drive_log(lidar: str = "2d", seed: int = 0) -> Path:
-    """An .mcap of about 20 s."""
+    """An .mcap of about 20 s, in 2D with half of the usual scans."""
     path = Path(_FOLDER.name) / f"drive_{lidar}_{seed}.mcap"
-    config = SimulationConfig(sensors=SensorConfig(lidar=lidar, encoders=EncoderConfig()))
+    config = SimulationConfig(sensors=SensorConfig(lidar=lidar, scanner=ScannerConfig(rate_hz=6.25), encoders=EncoderConfig()))
     write_simulation(path, Simulation(DRIVE, ROBOT, seed, {}, config))
     return path
 

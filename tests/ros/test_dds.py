@@ -186,6 +186,7 @@ def test_node_stopped_for_5_s_and_killed_stays_within_5_sigma(followed):
     assert (sigmas[5:] > 0.0).all()
 
 
+@pytest.mark.extended
 def test_node_publishes_lateral_velocity_corrections_and_diagnostics(followed):
     report = followed.report
     turning = [twist for twist in report["twists"] if abs(twist[2]) > 0.3]

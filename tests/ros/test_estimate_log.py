@@ -274,20 +274,17 @@ def test_online_of_a_log_on_a_full_disk_ends_with_the_reason(tmp_path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_transport_without_its_library_names_it(tmp_path):
-    """In a process in which nothing of the extras can be imported."""
-    code = (
-        "import sys, importlib.util\n"
-        "for name in ('cyclonedds', 'cyclonedds.core', 'rclpy', 'rospy', 'rosgraph', 'distributed'): sys.modules[name] = None\n"
-        "from localization.cli import main\n"
-        "print([main(['online', '--robot', 'vaultbot', '--door', door]) for door in ('dds', 'rclpy', 'rospy')])\n"
-    )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[2, 2, 2]"
-    assert "pip install 'skidloc[ros2]'" in found.stderr
-    assert "source a ROS 2 installation" in found.stderr
-    assert "apt install python3-rospy" in found.stderr
-    assert "Traceback" not in found.stderr
+@pytest.mark.parametrize(
+    ("door", "remedy"),
+    [("dds", "pip install 'skidloc[ros2]'"), ("rclpy", "source a ROS 2 installation"), ("rospy", "apt install python3-rospy")],
+)
+def test_transport_without_its_library_names_it(door, remedy, monkeypatch, capsys):
+    """As where nothing of the extras can be imported, and the transport was not yet."""
+    for name in ("cyclonedds", "cyclonedds.core", "rclpy", "rospy", "rosgraph"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, f"localization.ros.transports.{door}", raising=False)
+    assert main(["online", "--robot", "vaultbot", "--door", door]) == 2
+    assert remedy in " ".join(capsys.readouterr().err.split())
 
 
 def test_hidden_files_of_a_killed_run_do_not_stop_the_next(tmp_path):

@@ -111,7 +111,7 @@ def test_live_node_old_first_message_is_as_a_lost_one(topic):
 def test_node_publishes_odometry_transforms_and_diagnostics(calm):
     transport, node, _ = calm
     odometry, tf = published(transport, ODOMETRY), published(transport, TF)
-    assert len(odometry) == len(tf) > 250
+    assert len(odometry) == len(tf) > 125
     turning = [m for m in odometry if abs(m.twist.twist.angular.z) > 0.3]
     lateral = np.array([m.twist.twist.linear.y / m.twist.twist.angular.z for m in turning])
     assert np.median(np.abs(lateral)) > 0.005  # a skid-steer turns about a point that is not its centre: vy is not 0
@@ -250,7 +250,7 @@ def test_sensor_that_vanishes_and_returns_is_used_again(topic, calm):
         assert b[gap[-1]][1][0] > a[gap[-1]][1][0]  # and it is less sure meanwhile
     truth, found = a[common[-1]], b[common[-1]]
     assert np.all(np.abs(_wrapped(found[0] - truth[0])) < 3.0 * np.maximum(found[1], truth[1]) + 0.01)
-    assert node.session.pipeline.estimator.counts()["matched"] > 150
+    assert node.session.pipeline.estimator.counts()["matched"] > 75
 
 
 def test_batch_s_ends_shortly_before_the_next_scan(calm):
@@ -258,7 +258,7 @@ def test_batch_s_ends_shortly_before_the_next_scan(calm):
     stream = calm[1]._stream
     scans = stream._rates["/scan"]
     period, last = scans._period_s, scans._last_ns
-    assert period == pytest.approx(0.08, rel=0.1)
+    assert period == pytest.approx(0.16, rel=0.1)
 
     def rests():
         return [stream.batch_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.93, 0.97, 1.05, 1.15, 50.0)]
@@ -427,7 +427,7 @@ def test_undecodable_messages_are_dropped_and_counted():
     transport = LogTransport(drive_log(), garbled, {"/tf": "tf2_msgs/msg/TFMessage"})
     node, _ = run_node(transport)
     assert any("not of the type" in note for note in node.warnings())
-    assert node.session.pipeline.estimator.counts()["matched"] > 200
+    assert node.session.pipeline.estimator.counts()["matched"] > 100
     assert node.payloads.loads == {}
 
 
@@ -665,7 +665,7 @@ def test_playback_clock_keeps_the_logs_time_and_cuts_pauses():
 def test_drive_log_has_the_scans_that_tests_need():
     events, _ = drive_events()
     scans = [e for e in events if isinstance(e, Scan)]
-    assert len(scans) > 250
+    assert len(scans) > 125
     assert 8.0 * S < scans[-1].stamp_ns - scans[0].stamp_ns < 30.0 * S
 
 

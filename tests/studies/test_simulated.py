@@ -21,7 +21,7 @@ def drives():
     return {row.trajectory: row for row in simulated_controllers.rows(simulated_controllers.scores())}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.xdist_group("simulated_grid")
 def test_rotations_by_scan_matching_reproduce_the_regressions(measured):
     """4.21, 4.22 and 4.25 through bag, scan matching and arcs: each coefficient within three of its stated sigmas."""
