@@ -22,6 +22,8 @@ from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import between
 
+pytestmark = pytest.mark.xdist_group("slopes")
+
 ROBOT = load_robot("husky_a200")
 FLAT = ReplayConfig(step=StepConfig(slopes=False))
 

@@ -23,6 +23,8 @@ from tests.helpers.bags import START
 from tests.helpers.disks import files_of_at_most
 from tests.helpers.rooms import drive
 
+pytestmark = pytest.mark.xdist_group("arguments")
+
 VAULTBOT = robot_toml(load_robot("vaultbot"))
 
 

@@ -22,6 +22,8 @@ from tests.helpers.disks import files_of_at_most
 from tests.helpers.extended import cases
 from tests.helpers.rooms import drive
 
+pytestmark = pytest.mark.xdist_group("border")
+
 COMMON = ("--robot", "{robot}")
 WRITERS: dict[str, tuple[str, ...]] = {
     "info": ("info", "{log}", *COMMON, "--json", "{out}.json"),

@@ -30,6 +30,8 @@ from tests.helpers.bags import START, WHEELS, Record, S
 from tests.helpers.checkout import beginning_of
 from tests.studies import drive_husky, friction_grid, thesis_regressions
 
+pytestmark = pytest.mark.xdist_group("calibrate")
+
 DATA = Path(__file__).parents[1] / "data"
 HUSKY = DATA / "husky-outdoor-gps" / "test1.bag"
 GRID = DATA / "vaultbot" / "rotation_grid.csv"

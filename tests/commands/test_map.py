@@ -19,6 +19,8 @@ from localization.maps import SavedMap, load_map, save_map
 from localization.trajectory import read_tum
 from tests.helpers import bags, floor_plan, rooms
 
+pytestmark = pytest.mark.xdist_group("map")
+
 
 def replay(log: Path, out: Path, *more: object) -> int:
     return main(["replay", str(log), "--robot", "vaultbot", "--model", "diff_drive", "--out", str(out), *map(str, more)])

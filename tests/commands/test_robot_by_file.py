@@ -22,6 +22,8 @@ from tests.helpers.extended import cases
 from tests.helpers.online import LogTransport, drive_events, drive_log, run_node
 from tests.helpers.rooms import drive
 
+pytestmark = pytest.mark.xdist_group("robot_by_file")
+
 ARGUMENTS: dict[str, tuple[str, ...]] = {
     "info": ("{log}",),
     "replay": ("{log}", "--out", "{out}", "--model", "skid_steer", "--estimator", "odometry,ekf", "--json", "{out}.json"),

@@ -21,6 +21,8 @@ from tests.helpers.diagnosis_effects import ChangedLog, Effect, hide
 from tests.helpers.diagnosis_windows import drive_of_windows, windows
 from tests.helpers.extended import cases
 
+pytestmark = pytest.mark.xdist_group("bound_effects")
+
 MODEL = "diff_drive"
 _TILT_RAD = 0.06
 FOREIGN: dict[str, tuple[Effect, str, float]] = {

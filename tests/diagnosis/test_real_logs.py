@@ -22,6 +22,8 @@ from tests.helpers.diagnosis_rotations import known
 from tests.helpers.diagnosis_rotations import rotations as rotations_driven
 from tests.studies import drive_husky
 
+pytestmark = pytest.mark.xdist_group("real_logs")
+
 DATA = Path(__file__).parents[1] / "data"
 
 

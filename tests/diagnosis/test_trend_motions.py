@@ -16,6 +16,8 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
+pytestmark = pytest.mark.xdist_group("trend_motions")
+
 _DT = np.full(100, 0.02)
 _STEP = 1e-6
 

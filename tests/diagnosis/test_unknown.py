@@ -15,6 +15,8 @@ from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.diagnosis_unknown import UNKNOWN
 
+pytestmark = pytest.mark.xdist_group("unknown")
+
 
 @pytest.fixture(scope="module")
 def nominal(tmp_path_factory: pytest.TempPathFactory) -> Drive:

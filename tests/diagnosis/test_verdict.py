@@ -41,6 +41,8 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
+pytestmark = pytest.mark.xdist_group("verdict")
+
 GRID = Path(__file__).parents[1] / "data" / "vaultbot" / "rotation_grid.csv"
 
 GAIN = Gain(2.0, 1.0, 0.5, 0.4, 0.6)

@@ -17,6 +17,8 @@ from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
 from tests.helpers.extended import cases
 
+pytestmark = pytest.mark.xdist_group("gaps")
+
 CSAIL = Path(__file__).parents[1] / "data" / "mit-csail"
 ROBOT = load_robot(CSAIL / "csail.toml")
 S = 1_000_000_000

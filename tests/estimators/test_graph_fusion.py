@@ -36,6 +36,8 @@ from motion_models.robot import WheelNoise
 from tests.helpers import rooms
 from tests.studies.buildings import BUILDINGS
 
+pytestmark = pytest.mark.xdist_group("graph_fusion")
+
 QUIET = WheelNoise(*[1e-8] * 8)
 SCANNER = rooms.Beams(beams=240, rate_hz=6.25, noise=0.03, longest=8.0)
 RADIUS_ERROR, TURN_ERROR = 1.03, 1.1
@@ -151,9 +153,8 @@ def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
 
 def test_graph_with_loop_moves_map_and_not_odometry() -> None:
     """The pose in the map jumps where the loop closes; odom -> base_link moves as the robot does (REP-105)."""
-    jumps = [np.hypot(*np.diff([e.map_T_odom for e in estimated(seed)[0]], axis=0)[:, :2].T).max() for seed in range(4)]
-    assert max(jumps) > 0.03
-    estimates, _ = estimated(int(np.argmax(jumps)))
+    estimates, _ = estimated()
+    assert np.hypot(*np.diff([e.map_T_odom for e in estimates], axis=0)[:, :2].T).max() > 0.03
     odometry = np.array([e.odometry[0] for e in estimates])
     moved = se2.between(odometry[:-1], odometry[1:])
     assert np.hypot(moved[:, 0], moved[:, 1]).max() < 0.8 / SCANNER.rate_hz + 0.03  # 0.8 m/s

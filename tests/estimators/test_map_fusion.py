@@ -21,6 +21,8 @@ from motion_models import se2
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, drive_log
 
+pytestmark = pytest.mark.xdist_group("map_fusion")
+
 MODEL = make_model("diff_drive", ROBOT)
 
 

@@ -15,6 +15,8 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+pytestmark = pytest.mark.xdist_group("aces_log")
+
 DATA = Path(__file__).parents[1] / "data"
 BAG = DATA / "aces" / "aces.mcap"
 EXCERPT = DATA / "aces" / "excerpt.clf"

@@ -24,6 +24,8 @@ from tests.helpers.hostile_logs import (
     write_case,
 )
 
+pytestmark = pytest.mark.xdist_group("hostile_campaign")
+
 
 @pytest.fixture(scope="module")
 def truths(tmp_path_factory: pytest.TempPathFactory) -> Path:

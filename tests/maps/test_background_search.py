@@ -15,6 +15,8 @@ from motion_models import se2
 from tests.helpers import floor_plan
 from tests.helpers.floor_plan import OFFICE, path
 
+pytestmark = pytest.mark.xdist_group("background_search")
+
 COV = np.diag([0.01, 0.01, 0.005]) ** 2
 WAY = path((7, 4), (10.5, 4), (10.5, 6.5), (7, 6.5))
 

@@ -15,6 +15,8 @@ from motion_models import se2
 from tests.helpers import floor_plan
 from tests.helpers.floor_plan import HALL, OFFICE, path
 
+pytestmark = pytest.mark.xdist_group("localizer")
+
 COV = np.diag([0.01, 0.01, 0.005]) ** 2
 CARRIED = np.diag([3.0, 3.0, 1.5]) ** 2
 CORRIDOR = np.array([*floor_plan.box(0, 0, 25, 2.4), *floor_plan.box(2.5, 0, 3, 0.6), *floor_plan.box(0.4, 1.8, 1.2, 2.4)], dtype=float)

@@ -22,6 +22,8 @@ from motion_models import se2
 from tests.helpers import floor_plan, office_floor, square_room
 from tests.helpers.floor_plan import OFFICE, path
 
+pytestmark = pytest.mark.xdist_group("map_positions")
+
 COV = np.diag([0.01, 0.01, 0.005]) ** 2
 PLANE = PositionPlane(
     np.array([40.0, -25.0, 2.0]), np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.002], [0.0, 0.002, 0.001]]), np.array([0.3, 0.1])

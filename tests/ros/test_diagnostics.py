@@ -30,6 +30,8 @@ from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
 from tests.helpers.online import ROBOT, LogTransport, drive_events, drive_log, new_core, published, run_node
 
+pytestmark = pytest.mark.xdist_group("diagnostics")
+
 
 @functools.cache
 def pipeline():

@@ -21,6 +21,8 @@ from localization.simulation.simulator import Simulation, SimulationConfig, writ
 from motion_models import se2
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node
 
+pytestmark = pytest.mark.xdist_group("robots_topics")
+
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 SECONDS = 6
 CLEARPATH = {

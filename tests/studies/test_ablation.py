@@ -8,6 +8,8 @@ import pytest
 from tests.studies.ablation import BEGIN, END, GRAPH_PATCHES, JOURNAL, PATCHES, SETTINGS, write_into
 from tests.studies.buildings import BUILDINGS, Drive
 
+pytestmark = pytest.mark.xdist_group("ablation")
+
 _SECONDS = 25.0
 
 

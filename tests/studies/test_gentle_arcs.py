@@ -19,6 +19,8 @@ from tests.studies.gentle_arcs import (
     vision_error,
 )
 
+pytestmark = pytest.mark.xdist_group("gentle_arcs")
+
 MODEL, THESIS = friction(), friction("thesis")
 FITTED, FITTED_THESIS = (fitted(model=model)[0].params for model in (MODEL, THESIS))
 KINDS = pytest.mark.parametrize("kind", ["four fitted", "nothing fitted"])

@@ -11,6 +11,8 @@ from motion_models.calibration.maneuvers import Maneuver
 from tests.studies import drive_husky
 from tests.studies.real_husky import BEST, SYMMETRIC, THREE, Row, score
 
+pytestmark = pytest.mark.xdist_group("real_husky")
+
 GEOMETRY = Row("geometry", "diff_drive")
 K_SCALE_X = Row("k, scale, x_CR", "full_linear", THREE, SYMMETRIC)
 V_TIMES_W = Row("and v|wz|", "full_linear", (*THREE, "longitudinal_slip_turning"), SYMMETRIC)
