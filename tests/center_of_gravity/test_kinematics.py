@@ -58,7 +58,7 @@ def trees(draw):
     return '<robot name="r">' + "".join(draw(st.permutations(parts))) + "</robot>", positions
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(trees())
 def test_forward_of_any_tree_is_a_plain_recursion(tree):
     text, positions = tree
@@ -69,7 +69,7 @@ def test_forward_of_any_tree_is_a_plain_recursion(tree):
     np.testing.assert_allclose(chain.center_of_mass(q), expected, atol=1e-11)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(trees())
 def test_subtree_jacobian_is_a_difference(tree):
     text, positions = tree

@@ -19,6 +19,7 @@ from motion_models.center_of_gravity.urdf import parse_urdf
 from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, wheel_contacts
 from motion_models.errors import CgError, RobotError
 from tests.helpers import urdf_reference
+from tests.helpers.extended import cases
 
 TEXT = (resources.files("motion_models") / "robots" / "vaultbot.urdf").read_text()
 URDF = parse_urdf(TEXT, "vaultbot.urdf")
@@ -100,7 +101,7 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("source", cases(SOURCES, usual=("contacts", "centres", "all")))
 def test_cg_covariance_of_a_weighed_robot_is_that_of_samples(source):
     """The whole way: scales err, wheels stand elsewhere, the arms' masses are wrong in what is taken away and in what is added."""
     tolerances, scales = SOURCES[source]

@@ -229,6 +229,7 @@ def test_compare_killed_process_loses_no_other_log(table):
     assert all(row["ate_rmse_m"] == expected[row["log"], row["model"]] for row in (*first, *third))
 
 
+@pytest.mark.extended
 def test_compare_interrupted_leaves_no_process():
     running = run_local(jobs(2), 1, quick)
     next(running)
@@ -319,7 +320,6 @@ def test_compare_parquet_without_its_extra_names_it(tmp_path, capsys, monkeypatc
     assert "Or name a .csv." in printed
 
 
-@pytest.mark.rendered
 def test_compare_folder_gets_table_and_report(table, tmp_path, capsys):
     out = tmp_path / "results"
     assert compare(out) == 0

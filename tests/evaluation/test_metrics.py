@@ -84,8 +84,7 @@ def test_ate_is_that_of_evo(seed):
     np.testing.assert_allclose(se2.compose(found.reference_T_world, estimate), found.errors.estimate, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("length", [1.0, 2.0, 5.0, 50.0])
+@pytest.mark.parametrize(("seed", "length"), [(0, 1.0), (1, 2.0), (2, 5.0), (0, 50.0)])
 def test_rpe_is_that_of_evo(seed, length):
     truth = planar_path(seed)
     estimate = disturbed(truth, seed)

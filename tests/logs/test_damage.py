@@ -107,8 +107,7 @@ def test_mcap_folder_truncated_is_read_to_the_cut(tmp_path: Path) -> None:
     assert "run.mcap was read record by record" in warnings_of(log)
 
 
-@pytest.mark.parametrize("compression", [None, "message"])
-@pytest.mark.parametrize("bare", [True, False])
+@pytest.mark.parametrize(("compression", "bare"), [(None, True), ("message", False)])
 @pytest.mark.parametrize("fraction", cases([0.3, 0.9], ("0.9",)))
 def test_sqlite_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | None, bare: bool, fraction: float) -> None:
     """Wherever it was cut off: at 0.3, SQLite itself finds no row, for the page that leads to the first ones comes later."""

@@ -44,6 +44,7 @@ def test_husky_documented_results_are_reproduced(stored: list[Maneuver]) -> None
     assert rmse(K_SCALE_X, stored) == pytest.approx(0.264, abs=0.005)
 
 
+@pytest.mark.extended
 def test_husky_named_terms_reduce_the_error_below_23_cm(stored: list[Maneuver]) -> None:
     before, turning, best = (score(row, stored) for row in (K_SCALE_X, V_TIMES_W, BEST))
     assert np.sqrt(turning.squared_distance.mean()) <= 0.23
@@ -93,6 +94,7 @@ def test_husky_fitted_numbers_are_those_of_straights_and_whole_turns(mended: lis
     assert -value["wz_left"] == pytest.approx(k, abs=0.005)
 
 
+@pytest.mark.extended
 def test_husky_one_minute_calibrates_nearly_as_well_as_twenty(mended: list[Maneuver]) -> None:
     curve = learning_curve(BEST.train, mended, (2, 10, 150), 10, np.random.default_rng(0))
     two, ten, many = (np.median(curve[n]) for n in (2, 10, 150))

@@ -54,6 +54,7 @@ def test_closed_model_differs_from_vehicle_by_less_than_a_percent(measured):
     assert np.abs(off[:, 1:]).max() < 0.006
 
 
+@pytest.mark.extended
 @pytest.mark.xdist_group("simulated_controllers")
 def test_skid_steer_on_hard_turns_wins_as_in_the_thesis(drives):
     """Clearly on rotations and hard turns, in vision error."""

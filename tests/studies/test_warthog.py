@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.studies.warthog import study
 
 
+@pytest.mark.extended
 def test_warthog_study_holds_its_bounds_over_robots() -> None:
     """Medians over sixteen robots; `python -m tests.studies.warthog` has the distribution over 40."""
     found = np.median([study(seed) for seed in range(16)], axis=0)
