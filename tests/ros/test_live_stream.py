@@ -185,7 +185,7 @@ def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "
     return message._replace(data=encode(content))
 
 
-@pytest.mark.parametrize("jump_s", [500.0, -0.9, 3.0])
+@pytest.mark.parametrize("jump_s", [500.0, -0.9, pytest.param(3.0, marks=pytest.mark.extended)])
 def test_clock_jump_of_all_sensors_moves_the_pose_within_sigma(jump_s, calm):
     """Set forward and back: the pose hardly notices, and what is published bears the sender's new stamps.
 
