@@ -425,7 +425,7 @@ def test_calibrate_without_a_motion_reference_is_refused(tmp_path: Path, capsys:
     assert "neither a LiDAR nor an IMU" in refused(capsys, bag, "--robot", "vaultbot")
     scans = [("/scan", bags.laser_scan(START + i * S), START + i * S) for i in range(3)]
     assert "has no wheels" in refused(capsys, bags.write_mcap(tmp_path / "scans.mcap", scans), "--robot", "vaultbot")
-    husky = beginning_of(HUSKY, 10, tmp_path / "husky.bag")
+    husky = beginning_of(HUSKY, 5, tmp_path / "husky.bag")
     assert "has no LiDAR" in refused(capsys, husky, "--witness", "lidar")
     assert "too coarse: they err by 0.8 m" in refused(capsys, husky, "--reference", "/fix")
     assert "no topic '/mocap'" in refused(capsys, husky, "--reference", "/mocap")

@@ -263,7 +263,7 @@ def test_batch_s_ends_shortly_before_the_next_scan(calm):
     def rests():
         return [stream.batch_s(last + int(part * period * S)) / period for part in (0.0, 0.3, 0.93, 0.97, 1.05, 1.15, 50.0)]
 
-    assert rests() == pytest.approx([0.95, 0.65, 0.02, 0.13, 0.05, 0.0, 0.0], abs=1e-6)
+    assert rests() == pytest.approx([0.12 / period, 0.65, 0.02, 0.13, 0.05, 0.0, 0.0], abs=1e-6)  # never longer than 0.12 s
     alone = LogTransport(drive_log(), silenced("/scan", 0.0, 99.0))
     alone.types.pop("/scan")
     node, _ = run_node(alone)
@@ -483,7 +483,7 @@ def test_files_of_a_killed_run_do_not_stop_a_live_node(tmp_path, left):
         node, reports = run_node(rest, files=files)
         assert any("resumed from" in text for text in reports)
         assert any("its output begins here" in text for text in reports) == (left != "hidden files")
-        assert node.finish() == len(read_tum(tmp_path / "run.tum")) > 100
+        assert node.finish() == len(read_tum(tmp_path / "run.tum")) > 50
     assert (tmp_path / "state").is_file()
 
 
