@@ -455,7 +455,7 @@ def test_dask_killed_worker_gives_the_same_table(table, tmp_path, cluster):
     assert out.read_bytes() == table.read_bytes()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_path, asked, cluster):
     out = tmp_path / "table.csv"
     address, scheduler, workers = cluster
