@@ -52,10 +52,10 @@ DRIVE = Experiment("short", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
 
 
 @functools.cache
-def drive_log(lidar: str = "2d", seed: int = 0) -> Path:
-    """An .mcap of about 20 s, in 2D with half of the usual scans."""
-    path = Path(_FOLDER.name) / f"drive_{lidar}_{seed}.mcap"
-    config = SimulationConfig(sensors=SensorConfig(lidar=lidar, scanner=ScannerConfig(rate_hz=6.25), encoders=EncoderConfig()))
+def drive_log(lidar: str = "2d", seed: int = 0, scans_hz: float = 6.25) -> Path:
+    """An .mcap of about 20 s; ``scans_hz`` is that of the planar scanner."""
+    path = Path(_FOLDER.name) / f"drive_{lidar}_{seed}_{scans_hz}.mcap"
+    config = SimulationConfig(sensors=SensorConfig(lidar=lidar, scanner=ScannerConfig(rate_hz=scans_hz), encoders=EncoderConfig()))
     write_simulation(path, Simulation(DRIVE, ROBOT, seed, {}, config))
     return path
 
