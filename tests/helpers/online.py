@@ -52,7 +52,7 @@ DRIVE = Experiment("short", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
 
 
 @functools.cache
-def drive_log(lidar: str = "2d", seed: int = 0, scans_hz: float = 6.25) -> Path:
+def drive_log(lidar: str = "2d", seed: int = 0, scans_hz: float = 12.5) -> Path:
     """An .mcap of about 20 s; ``scans_hz`` is that of the planar scanner."""
     path = Path(_FOLDER.name) / f"drive_{lidar}_{seed}_{scans_hz}.mcap"
     config = SimulationConfig(sensors=SensorConfig(lidar=lidar, scanner=ScannerConfig(rate_hz=scans_hz), encoders=EncoderConfig()))

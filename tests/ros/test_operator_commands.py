@@ -37,13 +37,13 @@ def commanded(estimator, topic, *data, at_s=8.0):
         sent = [Received(topic, at + i * S, content) for i, content in enumerate(data)]
         return sorted([*messages, *sent], key=lambda m: m.received_ns)
 
-    transport = LogTransport(drive_log(scans_hz=12.5), spoil)
+    transport = LogTransport(drive_log(), spoil)
     return transport, *run_node(transport, estimator, config=NodeConfig(wait_s=0.0))
 
 
 @pytest.fixture(scope="module")
 def calm():
-    transport = LogTransport(drive_log(scans_hz=12.5))
+    transport = LogTransport(drive_log())
     run_node(transport, config=NodeConfig(wait_s=0.0))
     return track(transport)
 
@@ -87,7 +87,7 @@ def test_set_pose_with_wrong_content_is_ignored_with_a_reason(calm):
 
 def serviced(name, *requests):
     """A node that drives for 8 s, is asked, and drives on; the replies."""
-    transport = LogTransport(drive_log(scans_hz=12.5))
+    transport = LogTransport(drive_log())
     calls = {8.0 + 4.0 * i: request for i, request in enumerate(requests)}
     replies = []
     take = transport.take
@@ -160,7 +160,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
         load = Received("/skidloc/payload", at, payload_message("left_gripper", 20.0))
         return sorted([*messages[: len(messages) // 2], load], key=lambda m: m.received_ns)
 
-    transport = LogTransport(drive_log(scans_hz=12.5), spoil)
+    transport = LogTransport(drive_log(), spoil)
     node, reports = run_node(transport, files=files, config=NodeConfig(wait_s=0.0))
     assert "/skidloc/payload: 20 kg at 'left_gripper'" in reports
     alone, loaded = node.payloads._unloaded.position, node.payloads.sample(0).position
@@ -177,7 +177,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
         later = [messages[0], *messages[len(messages) // 2 :]]
         return [*later, tare._replace(received_ns=later[-1].received_ns)]
 
-    node, reports = run_node(LogTransport(drive_log(scans_hz=12.5), rest), files=files, config=NodeConfig(wait_s=0.0))
+    node, reports = run_node(LogTransport(drive_log(), rest), files=files, config=NodeConfig(wait_s=0.0))
     assert any("resumed from" in text for text in reports)
     assert any("no payload is set" in text for text in reports)
     assert node.payloads.loads == {}
@@ -212,7 +212,7 @@ def test_commands_by_topics_do_what_the_services_do():
 
 @pytest.mark.extended
 def test_path_and_map_are_published_in_the_frame_of_the_estimates():
-    transport = LogTransport(drive_log(scans_hz=12.5))
+    transport = LogTransport(drive_log())
     node, _ = run_node(transport, "graph", config=NodeConfig(wait_s=0.0, map_period_s=0.001))
     path, grid = published(transport, PATH)[-1], published(transport, MAP)[-1]
     assert path.header.frame_id == grid.header.frame_id == "map"

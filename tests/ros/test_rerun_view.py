@@ -73,7 +73,7 @@ def test_recording_holds_all_poses_scans_and_corrections(chunk, recorded):
     (mean, low, high) = column(rows["corrections/k_0"], "scalars")[-1]
     assert low < mean < high
     assert mean - low == pytest.approx(high - mean)
-    assert len(column(rows["estimate/nis"], "scalars")) > 100
+    assert len(column(rows["estimate/nis"], "scalars")) > 200
 
 
 def test_recording_changes_no_estimate(recorded, tmp_path):
@@ -89,7 +89,7 @@ def test_live_node_records_all_estimates(chunk, tmp_path):
     run_node(transport, view=view)
     view.close()
     places = column(rows_of(chunk, tmp_path / "live.rrd")["world/robot"], "translation")
-    assert len(places) == len(published(transport, ODOMETRY)) > 125
+    assert len(places) == len(published(transport, ODOMETRY)) > 250
 
 
 def test_viewer_listens_to_this_machine_and_may_be_closed(chunk, monkeypatch, tmp_path):
