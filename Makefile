@@ -9,7 +9,7 @@ DATA := tests/data
 .venv/installed: pyproject.toml constraints.txt
 	@echo "Making .venv with skidloc and what it needs (700 MB; a minute at the first time)."
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable .
 	touch $@
 
 .venv/ready: .venv/installed
