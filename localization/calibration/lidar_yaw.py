@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from localization.events import Event, Scan, WheelSample
-from localization.lidar import LidarConfig, Sweep
+from localization.lidar import LidarConfig
 from localization.logs import Log
-from localization.sensor_checks.scan_motion import ScanOdometry
+from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models import se2
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray, Pose2
@@ -191,8 +191,7 @@ def _has_moved(first: WheelSample, now: WheelSample) -> bool:
 
 def _register(travel: _Travel, scan: Scan, mount: Mount, config: LidarConfig) -> None:
     """Add the motion since the scan before; an interval ends at the first scan after `_INTERVAL_S`."""
-    sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
-    motion = travel.odometry.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
+    motion = travel.odometry.register(profile_of(scan, mount, config))
     now = scan.middle_ns
     if motion is None or not motion.has_translation or travel.delta is None:
         travel.begin_ns, travel.delta = now, np.zeros(3)

@@ -16,14 +16,14 @@ import numpy as np
 
 from localization.events import ImuSample, Scan
 from localization.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
-from localization.lidar import LidarConfig, Sweep
+from localization.lidar import LidarConfig
 from localization.logs import Log
 from localization.logs.decode import JointReading, OdometryReading, decode_imu, decode_odometry
 from localization.logs.event_decoder import TopicDecoder, arc, late_ns
 from localization.logs.topic_names import is_other_estimate
 from localization.logs.topic_roles import TYPES
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
-from localization.sensor_checks.scan_motion import ScanOdometry
+from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -309,9 +309,7 @@ def _scan_steps(source: ScanSource, first_ns: int, start_s: float) -> Iterator[F
             continue
         if at > start_s + _MAX_LIDAR_S:
             return
-        mount = source.mounts.get(scan.frame_id, Mount())
-        sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
-        motion = odometry.register(sweep.project(sweep.points), np.array([mount.x, mount.y]))
+        motion = odometry.register(profile_of(scan, source.mounts.get(scan.frame_id, Mount()), config))
         if motion is not None and last is not None and motion.has_translation:
             yield np.array([last, at, motion.delta[0], motion.delta[2], motion.delta[1]])
         last = at

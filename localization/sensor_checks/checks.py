@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -67,7 +68,7 @@ class SensorChecks:
 
     def apply(self, step: Step) -> Step:
         """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain."""
-        if not np.isfinite(step.predicted.delta).all():
+        if not math.isfinite(step.predicted.delta.sum()):
             return step  # the estimator refuses it
         self._faults.start_step(step)
         for check in self._preparing:
@@ -111,7 +112,7 @@ class SensorChecks:
 
     def _compare_places(self, scan: Scan, pose: Pose2) -> None:
         """A place from before the faults may show ``pose`` (3,): then differences of sensors count from here on."""
-        if self._places.update(lambda: self._window.project(scan), pose):
+        if self._places.update(lambda: self._window.profile(scan), pose):
             self._disagreement.restart()
             self._consistency.restart()
 

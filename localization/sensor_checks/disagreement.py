@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import operator
 from collections import deque
 from typing import NamedTuple
 
@@ -105,7 +104,8 @@ class MotionDistance:
     """Distance of the estimate's motion from the wheels', over the last seconds."""
 
     def __init__(self) -> None:
-        self._rows: deque[tuple[float, float, FloatArray, FloatArray]] = deque()  # time [s], square, motion by wheels and estimate
+        self._rows: deque[tuple[float, FloatArray, FloatArray]] = deque()  # time [s], motion by wheels and estimate
+        self._squares: deque[float] = deque()
         self._motions: tuple[FloatArray, FloatArray] | None = None
         self.mean_square = 0.0
         self.began_s = 0.0
@@ -130,14 +130,17 @@ class MotionDistance:
             return
         off = se2.local(wheels, delta)
         square = max(float(off @ np.linalg.solve(step.cov + _SCAN_NOISE, off)), nis or 0.0)
-        self._rows.append((step.end_ns * _NS, min(square, _MAX_SQUARE), wheels, delta))
-        while self._rows[0][0] < self._rows[-1][0] - _DISAGREEMENT_S:
+        now_s = step.end_ns * _NS
+        self._rows.append((now_s, wheels, delta))
+        self._squares.append(min(square, _MAX_SQUARE))
+        while self._rows[0][0] < now_s - _DISAGREEMENT_S:
             self._rows.popleft()
-        self.mean_square = sum(map(operator.itemgetter(1), self._rows)) / len(self._rows)
-        is_short = self._rows[-1][0] - self._rows[0][0] < 0.9 * _DISAGREEMENT_S or len(self._rows) < _MIN_DISAGREEING_SCANS
+            self._squares.popleft()
+        self.mean_square = sum(self._squares) / len(self._squares)
+        is_short = now_s - self._rows[0][0] < 0.9 * _DISAGREEMENT_S or len(self._rows) < _MIN_DISAGREEING_SCANS
         if is_short or self.mean_square <= _MAX_MEAN_SQUARE:
             self._motions = None
         elif self._motions is None:
-            wheels, estimated = (functools.reduce(se2.compose, (row[i] for row in self._rows), np.zeros(3)) for i in (2, 3))
+            wheels, estimated = (functools.reduce(se2.compose, (row[i] for row in self._rows), np.zeros(3)) for i in (1, 2))
             self._motions = wheels, estimated
-            self.began_s = next(row[0] for row in self._rows if row[1] > _MAX_MEAN_SQUARE)
+            self.began_s = next(row[0] for row, square in zip(self._rows, self._squares, strict=True) if square > _MAX_MEAN_SQUARE)

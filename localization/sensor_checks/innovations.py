@@ -26,6 +26,10 @@ SECONDS, TURN, WAY, TURN_CHANGE = range(4)
 [rad/s]."""
 
 
+Regressors = tuple[float, float, float, float]
+_NONE: Regressors = (0.0, 0.0, 0.0, 0.0)
+
+
 class Pair(NamedTuple):
     """Two sensors that measure one quantity."""
 
@@ -47,8 +51,8 @@ class Bin(NamedTuple):
     innovation: float
     variance: float
     seconds: float
-    regressors: FloatArray
-    """(4,) of this bin alone."""
+    regressors: Regressors
+    """Of this bin alone."""
     poses: FloatArray
     """(k, 3) by the estimate and by dead reckonings, before its last step."""
 
@@ -96,20 +100,21 @@ class InnovationWindows:
         self.pair = pair
         self.bins: deque[Bin] = deque()
         self._innovation = self._variance = self._seconds = 0.0
-        self._regressors = np.zeros(4)
+        self._regressors = _NONE
 
-    def add(self, innovation: float, variance: float, regressors: FloatArray, now_s: float, poses: FloatArray) -> bool:
-        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``regressors`` (4,) since the last one; ``poses``
-        (k, 3) before it."""
+    def add(self, innovation: float, variance: float, regressors: Regressors, now_s: float, poses: FloatArray) -> bool:
+        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``regressors`` since the last one; ``poses`` (k, 3)
+        before it."""
         if not self.bins:
-            self.bins.append(Bin(now_s - float(regressors[SECONDS]), 0.0, 0.0, 0.0, np.zeros(4), poses))
+            self.bins.append(Bin(now_s - regressors[SECONDS], 0.0, 0.0, 0.0, _NONE, poses))
         self._innovation, self._variance = self._innovation + innovation, self._variance + variance
-        self._regressors = self._regressors + regressors
-        self._seconds += float(regressors[SECONDS])
+        (a, b, c, d), (e, f, g, h) = self._regressors, regressors
+        self._regressors = a + e, b + f, c + g, d + h
+        self._seconds += regressors[SECONDS]
         if self._regressors[SECONDS] < BIN_S:
             return False
         self.bins.append(Bin(now_s, self._innovation, self._variance, self._seconds, self._regressors, poses))
-        self._regressors = np.zeros(4)
+        self._regressors = _NONE
         while self.bins[1].end_s < now_s - WINDOWS_S[-1]:
             self.bins.popleft()
         return True

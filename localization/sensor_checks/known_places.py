@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.sensor_checks.faults import FaultLog
-from localization.sensor_checks.scan_motion import Profile, align_from, make_profile
+from localization.sensor_checks.scan_motion import Profile, align_from
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, Pose2
 
 _DISTANCE_M, _TURN_RAD = 1.0, 0.5
 """Motion from one place to the next."""
@@ -45,8 +45,8 @@ class KnownPlaces:
         self._compared_s = -math.inf
         self._was_lasting, self._count = False, 0
 
-    def update(self, scan: Callable[[], tuple[Points2, FloatArray]], pose: Pose2) -> bool:
-        """Keep a scan, or compare it: its points (M, 2) of the body frame and the LiDAR's position (2,) from the estimated ``pose`` (3,).
+    def update(self, profile_of: Callable[[], Profile | None], pose: Pose2) -> bool:
+        """Keep a scan from the estimated ``pose`` (3,), or compare it; ``profile_of`` gives its profile.
 
         Returns whether a place has shown the pose: differences of sensors count from here on."""
         inflation, now_s = self._inflation, self._faults.now_s
@@ -56,27 +56,27 @@ class KnownPlaces:
             self._places = [p for i, p in enumerate(self._places) if not i or p.at_s < begin_s - _MARGIN_S]
         self._was_lasting, self._count = is_lasting, inflation.count
         if not is_lasting:
-            self._keep(scan, pose, now_s)
+            self._keep(profile_of, pose, now_s)
         if not inflation.is_inflating or now_s - self._compared_s < _EVERY_S:
             return False
         self._compared_s = now_s
-        spread = self._find(scan, pose)
+        spread = self._find(profile_of, pose)
         if spread is None or np.trace(spread[:2, :2]) >= np.trace(inflation.total[:2, :2]):
             return False
         inflation.set_known(spread)
         return True
 
-    def _keep(self, scan: Callable[[], tuple[Points2, FloatArray]], pose: Pose2, now_s: float) -> None:
+    def _keep(self, profile_of: Callable[[], Profile | None], pose: Pose2, now_s: float) -> None:
         if self._places:
             moved = se2.between(self._places[-1].pose, pose)
             if math.hypot(moved[0], moved[1]) < _DISTANCE_M and abs(moved[2]) < _TURN_RAD:
                 return
-        profile = _profile(scan)
+        profile = profile_of()
         if profile is not None:
             self._places.append(_Place(now_s, pose, profile, self._inflation.spread))
             del self._places[1 : 1 + len(self._places) - _MAX_PLACES]
 
-    def _find(self, scan: Callable[[], tuple[Points2, FloatArray]], pose: Pose2) -> Cov3 | None:
+    def _find(self, profile_of: Callable[[], Profile | None], pose: Pose2) -> Cov3 | None:
         """Covariance (3, 3) that faults have left of ``pose`` (3,): that of a place within reach that the scan fits onto, and the distance
         of the estimate from the pose that it shows; None where there is none."""
         if not self._places:
@@ -86,14 +86,9 @@ class KnownPlaces:
         if not is_near.any():
             return None
         best = min(np.flatnonzero(is_near).tolist(), key=lambda k: float(np.trace(self._places[k].spread[:2, :2])))
-        profile = _profile(scan)
+        profile = profile_of()
         motion = None if profile is None else align_from(self._places[best].profile, profile, motions[best], _MIN_INLIERS)
         if motion is None or not motion.has_translation:
             return None
         off, A = se2.local(motions[best], motion.delta), se2.adjoint(se2.inverse(motion.delta))
         return np.asarray(A @ self._places[best].spread @ A.T + np.outer(off, off))
-
-
-def _profile(scan: Callable[[], tuple[Points2, FloatArray]]) -> Profile | None:
-    points, center = scan()
-    return make_profile(points - center, center)

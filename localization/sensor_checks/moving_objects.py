@@ -13,7 +13,7 @@ from localization.events import Step
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
 from localization.sensor_checks.scan_motion import Profile
-from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, label, refine
+from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, explain
 from localization.sensor_checks.sensor_check import Check, without_scan
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
@@ -230,10 +230,10 @@ class MovingObjects(Check):
 
     def _label(self, view: _View, profile: Profile, points: Points2) -> _Comparison:
         """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``."""
-        a, b = np.append(view.profile.center, 0.0), np.append(profile.center, 0.0)
-        by_wheels, by_estimate = se2.compose(se2.compose(se2.inverse(a), se2.between(view.poses, self._poses)), b)  # of the LiDAR
-        scene = label(view.profile, profile, points, refine(view.profile, points, by_wheels))
-        return _Comparison(view, profile, points, scene, by_estimate)
+        x, y = profile.center.tolist()
+        motions = se2.compose(se2.between(view.poses, self._poses), (x, y, 0.0))
+        motions[:, :2] -= view.profile.center  # of the LiDAR
+        return _Comparison(view, profile, points, explain(view.profile, profile, points, motions[0]), motions[1])
 
     def _update(self, step: Step, lidar: _Lidar, found: _Comparison) -> None:
         """Whether objects move now."""
@@ -316,11 +316,10 @@ class _Comparison:
         """
         least = math.inf
         for start in (self.by_estimate, align_rest(self.view.profile, self.points, self.scene)):
-            rival = None if start is None else refine(self.view.profile, self.points, start)
-            other = None if rival is None else label(self.view.profile, self.profile, self.points, rival)
-            if rival is None or other is None or other.moved_share >= _RIVAL_MOVED * self.scene.moved_share:
+            other = None if start is None else explain(self.view.profile, self.profile, self.points, start)
+            if other is None or other.moved_share >= _RIVAL_MOVED * self.scene.moved_share:
                 continue
-            if not has_turn and abs(float(se2.scalar_wrap(rival[2] - self.scene.motion[2]))) > _MAX_WHEEL_TURN_RAD:
+            if not has_turn and abs(float(se2.scalar_wrap(other.motion[2] - self.scene.motion[2]))) > _MAX_WHEEL_TURN_RAD:
                 return 0.0
             unique = float(np.sum((self.scene.labels == STILL) & (other.labels != STILL)))
             least = min(least, unique / max(float(np.sum(other.labels != STILL)), _MIN_UNEXPLAINED * len(self.points)))

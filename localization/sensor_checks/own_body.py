@@ -12,7 +12,7 @@ from localization.sensor_checks.faults import Fault, FaultLog
 from localization.sensor_checks.sensor_check import Check
 from localization.trajectory import BoolArray
 from motion_models.compiled import kernel
-from motion_models.se2 import FloatArray, Points2
+from motion_models.se2 import FloatArray
 
 LIDAR_OWN_BODY = Fault(
     "{percent:.0f} % of the LiDAR's points are the robot itself (same ranges while it drives and turns). They are left out"
@@ -75,9 +75,8 @@ class OwnBodyFilter:
         if not scan.is_planar or not len(points):
             return scan
         is_own = np.zeros(len(points), dtype=bool)
-        _find_own(np.array(points[:, :2]), self._travelled, self._heading, self._bearings, is_own)
+        share = _find_own(points, self._travelled, self._heading, self._bearings, is_own) / len(points)
         self._travelled = 0.0
-        share = float(is_own.mean())
         if share < _MIN_BODY_SHARE:
             return scan
         self.share = max(self.share, share)
@@ -85,8 +84,9 @@ class OwnBodyFilter:
 
 
 @kernel
-def _find_own(points: Points2, travelled: float, heading: float, bearings: FloatArray, is_own: BoolArray) -> None:
-    """Set ``is_own`` (N,) of the ``points`` (N, 2) that are the robot itself; ``bearings`` (360, 5) are updated, ``travelled`` [m] later.
+def _find_own(points: FloatArray, travelled: float, heading: float, bearings: FloatArray, is_own: BoolArray) -> int:
+    """Set ``is_own`` (N,) of the ``points`` (N, 3) that are the robot itself, and count them; ``bearings`` (360, 5) are updated,
+    ``travelled`` [m] later.
 
     Of each bearing: range to the nearest point [m], for how long a way it is the same [m], least and greatest ``heading`` meanwhile [rad],
     and whether it is the robot itself, 0 or 1.
@@ -107,6 +107,9 @@ def _find_own(points: Points2, travelled: float, heading: float, bearings: Float
         b[1], b[2], b[3] = b[1] + travelled, min(b[2], heading), max(b[3], heading)
         if b[1] >= _MIN_BODY_TRAVEL_M and b[3] - b[2] >= _MIN_BODY_TURN_RAD:
             b[4] = 1.0
+    count = 0
     for i in range(n):
         k = bins[i]
         is_own[i] = k >= 0 and bearings[k, 4] == 1.0 and abs(ranges[i] - bearings[k, 0]) <= _SAME_RANGE_M
+        count += is_own[i]
+    return count

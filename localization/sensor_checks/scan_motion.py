@@ -8,14 +8,16 @@ Sensor checks compare it with the other sensors; it is never fused.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from localization.events import Scan
+from localization.lidar import LidarConfig, Sweep
 from motion_models import se2
 from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import solve
+from motion_models.robot import Mount
 from motion_models.se2 import FloatArray, Points2, Pose2, Triple, triple
 
 BEARINGS = 180
@@ -47,8 +49,7 @@ class ScanMotion(NamedTuple):
     """The scene has structure along both axes."""
 
 
-@dataclass(frozen=True, eq=False)
-class Profile:
+class Profile(NamedTuple):
     """A planar scan by bearing about the sensor."""
 
     center: FloatArray
@@ -68,34 +69,39 @@ class ScanOdometry:
         self.last: Profile | None = None
         """Of the last scan."""
 
-    def register(self, points: FloatArray, center: FloatArray) -> ScanMotion | None:
-        """Motion since the last call; ``points`` (M, 2) and sensor position ``center`` (2,) in the body frame [m]; of any of its LiDARs.
+    def register(self, now: Profile | None) -> ScanMotion | None:
+        """Motion since the last call; ``now`` is of any of the body's LiDARs, None of one with too few points.
 
         None for the first scan, for scans with too few points and where the scans do not fit onto each other.
         """
-        last, now = self.last, make_profile(points - center, center)
-        self.last = now
+        last, self.last = self.last, now
         if last is None or now is None:
             return None
         turn = _correlate(np.log(last.ranges), np.log(now.ranges))
         if math.isnan(turn):
             return None
-        sensor_turn = np.array([*(now.center - last.center), turn])
-        return _refine(last, now, sensor_turn, _MIN_INLIERS)
+        x, y = (now.center - last.center).tolist()
+        return _refine(last, now, (x, y, turn), _MIN_INLIERS)
 
 
 def align_from(a: Profile, b: Profile, a_T_b: Pose2, min_inliers: float) -> ScanMotion | None:
     """Motion of the body from profile ``a`` to ``b``, refined from ``a_T_b`` (3,); None where fewer than the share ``min_inliers`` of the
     bearings of ``b`` fit."""
     body_T_a, body_T_b = (np.array([*profile.center, 0.0]) for profile in (a, b))
-    return _refine(a, b, se2.compose(se2.between(body_T_a, a_T_b), body_T_b), min_inliers)
+    return _refine(a, b, triple(se2.compose(se2.between(body_T_a, a_T_b), body_T_b)), min_inliers)
+
+
+def profile_of(scan: Scan, mount: Mount, config: LidarConfig) -> Profile | None:
+    """Profile of the surfaces of ``scan`` that are within the LiDAR's range; None for too few points."""
+    sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
+    center = np.array([mount.x, mount.y])
+    return make_profile(sweep.project(sweep.points) - center, center)
 
 
 def make_profile(points: Points2, center: FloatArray) -> Profile | None:
     """Profile of ``points`` (M, 2) about the sensor, which is at ``center`` (2,) in the body frame [m]; None for too few points."""
-    surface, ranges, normals = np.full((BEARINGS, 2), np.nan), np.full(BEARINGS, np.nan), np.full((BEARINGS, 2), np.nan)
-    _fill_profile(points, surface, ranges, normals)
-    return None if np.isfinite(ranges).sum() < _MIN_BEARINGS else Profile(center, surface, ranges, normals)
+    profile = Profile(center, np.empty((BEARINGS, 2)), np.empty(BEARINGS), np.empty((BEARINGS, 2)))
+    return profile if _fill_profile(points, profile) >= _MIN_BEARINGS else None
 
 
 @subroutine
@@ -105,8 +111,10 @@ def bearing_bin(x: float, y: float) -> int:
 
 
 @kernel
-def _fill_profile(points: Points2, surface: FloatArray, ranges: FloatArray, normals: FloatArray) -> None:
-    """Nearest points (180, 2), their ranges (180,) and normals (180, 2) by bearing; they stay NaN where there is none."""
+def _fill_profile(points: Points2, profile: Profile) -> int:
+    """Fill ``profile`` with the nearest of ``points`` (M, 2), their ranges and normals, NaN where there is none; number of its ranges."""
+    surface, ranges, normals = profile.points, profile.ranges, profile.normals
+    surface[:], ranges[:], normals[:] = np.nan, np.nan, np.nan
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         r = math.hypot(x, y)
@@ -120,6 +128,16 @@ def _fill_profile(points: Points2, surface: FloatArray, ranges: FloatArray, norm
         length = math.hypot(dx, dy)
         if length < 0.1 + 0.5 * ranges[k]:  # else from one surface to another, or unknown
             normals[k, 0], normals[k, 1] = -dy / max(length, 1e-6), dx / max(length, 1e-6)
+    return _count(ranges)
+
+
+@subroutine
+def _count(ranges: FloatArray) -> int:
+    """Number of ``ranges`` (180,) that are known."""
+    n = 0
+    for k in range(BEARINGS):
+        n += not math.isnan(ranges[k])
+    return n
 
 
 @kernel
@@ -162,28 +180,34 @@ def _correlate(a: FloatArray, b: FloatArray) -> float:
     return turn
 
 
-def _refine(a: Profile, b: Profile, guess: Pose2, min_inliers: float) -> ScanMotion | None:
-    """a_T_b of the body by point-to-line Gauss-Newton from the sensor's ``guess`` (3,); None where the scans do not fit."""
-    structure = np.empty((2, 2))
-    found, inliers = align_profiles(a.points, a.normals, b.points, triple(guess), structure)
-    if inliers < max(min_inliers * np.isfinite(b.ranges).sum(), 1) or not np.isfinite(found).all():
-        return None
-    a_T_b = np.array(found)
-    body_T_a, body_T_b = (np.array([*profile.center, 0.0]) for profile in (a, b))
-    moved = se2.compose(se2.compose(body_T_a, a_T_b), se2.inverse(body_T_b))
-    return ScanMotion(moved, float(np.linalg.eigvalsh(structure / inliers)[0]) >= _MIN_STRUCTURE)
+def _refine(a: Profile, b: Profile, guess: Triple, min_inliers: float) -> ScanMotion | None:
+    """a_T_b of the body by point-to-line Gauss-Newton from the sensor's ``guess``; None where the scans do not fit."""
+    found, inlier_share, least_structure = _align_bodies(a, b, guess)
+    return ScanMotion(np.array(found), least_structure >= _MIN_STRUCTURE) if inlier_share >= min_inliers else None
 
 
 @kernel
-def align_profiles(
-    surface: FloatArray, normals: FloatArray, points: FloatArray, guess: Triple, structure: FloatArray
-) -> tuple[Triple, int]:
-    """Motion of the sensor from ``guess`` on, and the number of inliers: 0 where too few points are associated. ``structure`` (2, 2)
-    becomes the sum of n n^T over the inliers."""
+def _align_bodies(a: Profile, b: Profile, guess: Triple) -> tuple[Triple, float, float]:
+    """Motion of the body from ``a`` to ``b``, where that of the sensor is near ``guess``; share of the bearings of ``b`` that fit, negative
+    where there is none, and smaller eigenvalue of the mean of n n^T over these."""
+    S = np.empty((2, 2))
+    found, inliers = align_profiles(a, b.points, guess, S)
+    if inliers == 0 or not math.isfinite(found[0] + found[1] + found[2]):
+        return found, -1.0, 0.0
+    body_T_a, b_T_body = (a.center[0], a.center[1], 0.0), (-b.center[0], -b.center[1], 0.0)
+    moved = se2.scalar_compose(se2.scalar_compose(body_T_a, found), b_T_body)
+    least = 0.5 * (S[0, 0] + S[1, 1] - math.hypot(S[0, 0] - S[1, 1], 2.0 * S[0, 1])) / inliers
+    return moved, inliers / max(_count(b.ranges), 1), least
+
+
+@kernel
+def align_profiles(a: Profile, points: FloatArray, guess: Triple, structure: FloatArray) -> tuple[Triple, int]:
+    """Motion of the sensor from profile ``a`` to ``points`` (M, 2), from ``guess`` on, and the number of inliers: 0 where too few points
+    are associated. ``structure`` (2, 2) becomes the sum of n n^T over the inliers."""
     A, gradient, a_T_b, inliers = np.empty((3, 3)), np.empty(3), guess, 0
     for k in range(_ITERATIONS):
         scale = _FIRST_SCALE_M * (_LAST_SCALE_M / _FIRST_SCALE_M) ** (k / (_ITERATIONS - 1))
-        inliers = _fill_normal_equations(surface, normals, points, a_T_b, scale, A, gradient, structure)
+        inliers = _fill_normal_equations(a.points, a.normals, points, a_T_b, scale, A, gradient, structure)
         if inliers < _MIN_BEARINGS // 2:
             return a_T_b, 0
         for p in range(3):

@@ -8,7 +8,7 @@ has left (free-space violations; Pomerleau et al. 2014, "Long-term 3D map mainte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,55 +34,51 @@ HIDDEN, STILL, MOVED = 0, 1, -1
 Labels = NDArray[np.int8]
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMotion:
+class SceneMotion(NamedTuple):
     """Points of a scan under one motion of the LiDAR since the reference."""
 
     motion: Pose2
     """(3,) of the LiDAR."""
     labels: Labels
     """(N,) of the points."""
-    vanished: int
-    """Bearings of the reference whose surface is seen through."""
-    bearings: int
-    """Bearings of the reference that are compared: in view, and not hidden."""
-
-    @property
-    def moved_share(self) -> float:
-        """The larger one of the shares of points that appeared, and of surfaces that vanished."""
-        return max(float(np.mean(self.labels == MOVED)), self.vanished / max(self.bearings, 1))
+    moved_share: float
+    """The larger one of the shares of points that appeared, and of the reference's surfaces in view that are seen through."""
 
 
-def refine(reference: Profile, points: Points2, motion: Pose2) -> Pose2:
-    """``motion`` (3,) of the LiDAR since ``reference`` by those of ``points`` (N, 2), about the LiDAR, that it nearly explains.
+def explain(reference: Profile, now: Profile, points: Points2, start: Pose2) -> SceneMotion:
+    """Label ``points`` (N, 2) about the LiDAR, of which ``now`` is the profile, for a motion (3,) of the LiDAR since ``reference``.
 
-    Gauss-Newton for the sum of the squared distances from their lines, and those from ``motion`` as a prior. What ends farther from
-    ``motion`` than that may be off was led away by points that move: ``motion`` itself is returned.
+    The motion is ``start`` (3,), refined by those points that it nearly explains: Gauss-Newton for the sum of the squared distances from
+    their lines, and those from ``start`` as a prior. What ends farther from ``start`` than that may be off was led away by points that
+    move: it is ``start`` itself then.
     """
-    found = np.array(_refine(reference.points, reference.normals, points, triple(motion)))
-    off = se2.local(motion, found)
-    return found if math.hypot(off[0], off[1]) < _PRIOR_M and abs(off[2]) < _PRIOR_RAD else motion
-
-
-def label(reference: Profile, now: Profile, points: Points2, motion: Pose2) -> SceneMotion:
-    """Label ``points`` (N, 2), of which ``now`` is the profile, for the ``motion`` (3,) of the LiDAR since ``reference``."""
-    labels = np.zeros(len(points), dtype=np.int8)
-    _label(reference.points, reference.normals, reference.ranges, points, motion, labels)
-    back = np.zeros(BEARINGS, dtype=np.int8)
-    _label(now.points, now.normals, now.ranges, reference.points, se2.inverse(motion), back)
-    return SceneMotion(motion, labels, int(np.sum(back == MOVED)), int(np.sum(back != HIDDEN)))
+    labels = np.empty(len(points), dtype=np.int8)
+    motion, moved_share = _explain(reference, now, points, triple(start), labels)
+    return SceneMotion(np.array(motion), labels, moved_share)
 
 
 def align_rest(reference: Profile, points: Points2, still: SceneMotion) -> Pose2 | None:
     """Motion (3,) of the LiDAR that explains those ``points`` (N, 2) which are not of the still world; None for too few."""
     rest = points[still.labels != STILL]
-    motion, inliers = align_profiles(reference.points, reference.normals, rest, triple(still.motion), np.empty((2, 2)))
+    motion, inliers = align_profiles(reference, rest, triple(still.motion), np.empty((2, 2)))
     return np.array(motion) if inliers >= _MIN_ALIGNED and np.isfinite(motion).all() else None
 
 
 @kernel
-def _refine(surface: FloatArray, normals: FloatArray, points: Points2, prior: Triple) -> Triple:
-    """See `refine`; the first step takes points from twice as far."""
+def _explain(reference: Profile, now: Profile, points: Points2, start: Triple, labels: Labels) -> tuple[Triple, float]:
+    """See `explain`: fill ``labels`` (N,); the motion, and `SceneMotion.moved_share`."""
+    motion = _refine(reference, points, start)
+    off = se2.scalar_log(se2.scalar_between(start, motion))
+    if not (math.hypot(off[0], off[1]) < _PRIOR_M and abs(off[2]) < _PRIOR_RAD):
+        motion = start
+    moved, _ = _label(reference, points, motion, labels)
+    vanished, in_view = _label(now, reference.points, se2.scalar_inverse(motion), np.empty(BEARINGS, dtype=np.int8))
+    return motion, max(moved / max(len(points), 1), vanished / max(in_view, 1))
+
+
+@subroutine
+def _refine(reference: Profile, points: Points2, prior: Triple) -> Triple:
+    """Motion near ``prior`` by ``points`` (N, 2); the first step takes points from twice as far."""
     A, g, x = np.empty((3, 3)), np.empty(3), prior
     for k in range(_ITERATIONS):
         off = se2.scalar_log(se2.scalar_between(prior, x))
@@ -90,7 +86,7 @@ def _refine(surface: FloatArray, normals: FloatArray, points: Points2, prior: Tr
         for a in range(3):
             w = (_RESIDUAL_M / (_PRIOR_RAD if a == 2 else _PRIOR_M)) ** 2
             A[a, a], g[a] = w, w * off[a]
-        _add_near(surface, normals, points, x, 2.0 if k == 0 else 1.0, A, g)
+        _add_near(reference.points, reference.normals, points, x, 2.0 if k == 0 else 1.0, A, g)
         u, v, turn = solve(A, g)
         x = se2.scalar_compose(x, se2.scalar_exp((-u, -v, -turn)))
     return x
@@ -118,10 +114,14 @@ def _add_near(surface: FloatArray, normals: FloatArray, points: Points2, x: Trip
                 A[a, b] += J[a] * J[b]
 
 
-@kernel
-def _label(surface: FloatArray, normals: FloatArray, ranges: FloatArray, points: Points2, x: Pose2, labels: Labels) -> None:
-    """Fill the ``labels`` (N,) of ``points`` (N, 2), moved by ``x`` (3,) into the frame of a profile."""
+@subroutine
+def _label(reference: Profile, points: Points2, x: Triple, labels: Labels) -> tuple[int, int]:
+    """Fill the ``labels`` (N,) of ``points`` (N, 2), moved by ``x`` into the frame of ``reference``; number of those that moved, and of
+    those that are not hidden."""
+    surface, normals, ranges = reference.points, reference.normals, reference.ranges
     c, s = math.cos(x[2]), math.sin(x[2])
+    labels[:] = HIDDEN
+    moved, in_view = 0, 0
     for i in range(points.shape[0]):
         wx, wy = x[0] + c * points[i, 0] - s * points[i, 1], x[1] + s * points[i, 0] + c * points[i, 1]
         if math.isnan(wx):
@@ -140,3 +140,6 @@ def _label(surface: FloatArray, normals: FloatArray, ranges: FloatArray, points:
                 labels[i] = STILL
         if labels[i] != STILL and distance < nearest - _FREE_M - _FREE_SHARE * nearest:
             labels[i] = MOVED
+            moved += 1
+        in_view += labels[i] != HIDDEN
+    return moved, in_view

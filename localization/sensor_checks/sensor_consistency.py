@@ -16,7 +16,7 @@ from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
 from localization.sensor_checks.disagreement import DISAGREEMENT
 from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
-from localization.sensor_checks.innovations import BIN_S, SECONDS, TURN, TURN_CHANGE, WAY, InnovationWindows, Pair
+from localization.sensor_checks.innovations import BIN_S, TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2
@@ -93,8 +93,8 @@ class Consistency:
         self._faults, self._clipping = faults, _Clipping()
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._poses, self._file_delta = np.zeros((3, 3)), np.zeros(3)
-        self._totals = np.zeros(4)  # what causes are proportional to, since the first step
-        self._totals_at = {pair: np.zeros(4) for pair in NAMED}  # at the last measurement of each pair
+        self._totals: Regressors = (0.0, 0.0, 0.0, 0.0)  # what causes are proportional to, since the first step
+        self._totals_at = dict.fromkeys(NAMED, self._totals)  # at the last measurement of each pair
         self._gyro_turn = math.nan  # in the last step [rad]
         self._has_moved = False
         self._matched_s = -math.inf
@@ -115,7 +115,8 @@ class Consistency:
         for pair, innovation in _innovations(step, residuals):
             if innovation is None:
                 continue
-            regressors, self._totals_at[pair] = self._totals - self._totals_at[pair], self._totals.copy()
+            (a, b, c, d), (e, f, g, h), self._totals_at[pair] = self._totals, self._totals_at[pair], self._totals
+            regressors = a - e, b - f, c - g, d - h
             if self._windows[pair].add(*innovation, regressors, self._faults.now_s, self._poses):
                 self._compare(pair)
                 has_ended = True
@@ -125,9 +126,10 @@ class Consistency:
     def _add_totals(self, step: Step) -> None:
         if step.duration == 0.0:
             return
-        way, _, turn = (step.predicted.delta if step.has_wheels else np.zeros(3)).tolist()
-        self._totals[[SECONDS, TURN, WAY]] += [step.duration, turn, way]
-        self._totals[TURN_CHANGE] = (turn if step.turn is None else step.turn.angle) / step.duration
+        seconds, turns, ways, _ = self._totals
+        way, _, turn = step.predicted.delta.tolist() if step.has_wheels else (0.0, 0.0, 0.0)
+        rate = (turn if step.turn is None else step.turn.angle) / step.duration
+        self._totals = seconds + step.duration, turns + turn, ways + way, rate
 
     def compare_estimate(self, delta: Pose2, nis: float | None) -> None:
         """The last step moved the estimate by ``delta`` (3,); ``nis`` of its scan, if one was matched."""

@@ -99,16 +99,16 @@ class Standstill(Check):
 
     def _moving(self) -> str:
         """What shows that the robot drives; "" where nothing does."""
-        bins = [b for b in list(self._window.bins)[-_RECENT_BINS:] if b.is_standing and np.isfinite(b.lidar[0])]
-        travelled, lasted = sum(math.hypot(b.lidar[0], b.lidar[1]) for b in bins), sum(b.duration_s for b in bins)
+        bins = self._window.bins.standing(_RECENT_BINS)
+        travelled, lasted = float(np.hypot(*bins.lidar[:, :2].T).sum()), float(bins.durations_s.sum())
         shaken_s = max((detector.lasted_s for detector in self._shaking.values()), default=0.0)
         is_shaking = min(shaken_s, self._stood_s) >= _SHAKE_S
         if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
-            rates = np.array([b.gyro / b.duration_s for b in bins])
+            rates = bins.gyro / bins.durations_s
             self._is_confirmed |= is_shaking or _has_turned(rates)
             has_second = _is_working(rates) or any(detector.has_noise for detector in self._shaking.values())
             return _LIDAR_MOVED if self._is_confirmed or not has_second else ""
-        return "the IMU shakes as if it moved" if is_shaking and not bins else ""
+        return "the IMU shakes as if it moved" if is_shaking and not len(bins) else ""
 
 
 def _is_turning(step: Step) -> bool:

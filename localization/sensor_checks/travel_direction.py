@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,8 @@ from scipy.special import stdtrit
 from localization.events import Step
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
 from localization.sensor_checks.sensor_check import Check, without_scan
-from localization.sensor_checks.window import Bin, Window
+from localization.sensor_checks.window import Window
+from motion_models.se2 import FloatArray
 
 LIDAR_DIRECTION = Fault(
     "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used while that lasts."
@@ -49,7 +50,7 @@ class TravelDirection(Check):
 
     def compare(self, window: Window) -> bool:
         """Declare a fault that lasts; whether the directions agree, or no scans have come."""
-        direction = travel_direction(window.bins)
+        direction = travel_direction(window.bins.wheels, window.bins.lidar)
         for evidence, most in ((self._off, _MAX_DIRECTION_RAD), (self._far_off, _MAX_SLIDE_RAD)):
             evidence.add(None if direction is None else direction.exceeds(most), window.end_s, window.begin_s)
         if direction is None:
@@ -83,24 +84,24 @@ class Direction(NamedTuple):
         return True if size - self.bound > most else False if size <= most else None
 
 
-def travel_direction(bins: Collection[Bin]) -> Direction | None:
-    """Direction of the LiDAR's travel against the wheels', where both agree among themselves; None where it is not known.
+def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
+    """Direction of the LiDAR's travel against the wheels', where both motions (n, 3) agree among themselves; None where it is not known.
 
     With products z_k = lidar_k conj(wheels_k) it is the angle of their sum. Its error is sum Im(z_k exp(-i angle)) / sum |z_k|, with
     Student's t for a variance that is measured by n - 1 of these.
     """
-    rows = np.hstack([[b.wheels for b in bins], [b.lidar for b in bins]])
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    wheels, turned, lidar = rows[:, 0] + 1j * rows[:, 1], np.abs(rows[:, 2]), rows[:, 3] + 1j * rows[:, 4]
-    shorter, longer = np.minimum(np.abs(wheels), np.abs(lidar)), np.maximum(np.abs(wheels), np.abs(lidar))
-    is_long = (shorter >= _MIN_TRAVEL_M) & (longer <= _MAX_LENGTH_RATIO * shorter) & (turned <= _MAX_CURVATURE_RAD_M * shorter)
+    by_wheels, by_lidar = wheels[:, 0] + 1j * wheels[:, 1], lidar[:, 0] + 1j * lidar[:, 1]
+    ways = np.abs([by_wheels, by_lidar])
+    shorter, longer = ways.min(axis=0), ways.max(axis=0)
+    is_straight = np.abs(wheels[:, 2]) <= _MAX_CURVATURE_RAD_M * shorter
+    is_long = (shorter >= _MIN_TRAVEL_M) & (longer <= _MAX_LENGTH_RATIO * shorter) & is_straight  # NaN is not
     if is_long.sum() < _MIN_TRAVEL_BINS:
         return None
-    offset = lidar[is_long] * np.conj(wheels[is_long])
-    unit = offset / np.abs(offset)
-    if abs(unit.mean()) < _MIN_COHERENCE:
+    offset = by_lidar[is_long] * by_wheels[is_long].conj()
+    sizes, n = np.abs(offset), len(offset)
+    if abs((offset / sizes).sum()) < _MIN_COHERENCE * n:
         return None
-    angle, n = float(np.angle(offset.sum())), len(offset)
-    across = (offset * np.exp(-1j * angle)).imag
-    sigma = math.sqrt(n / (n - 1) * float(across @ across)) / float(np.abs(offset).sum())
+    angle = cmath.phase(offset.sum())
+    across = (offset * cmath.exp(-1j * angle)).imag
+    sigma = math.sqrt(n / (n - 1) * float(across @ across)) / float(sizes.sum())
     return Direction(angle, float(stdtrit(n - 1, _CONFIDENCE)) * sigma)

@@ -18,7 +18,8 @@ from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.sensor_check import Check, without_scan, without_wheels
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
-from motion_models.se2 import FloatArray
+from motion_models.compiled import kernel, subroutine
+from motion_models.se2 import FloatArray, Triple
 
 GYRO_OPPOSITE = Fault(
     "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign{or_wheels}.",
@@ -59,7 +60,7 @@ _MIN_T = 4.0
 """Student's t of a correlation that is no chance."""
 _OPPOSITE_CORRELATION, _EQUAL_CORRELATION = -0.6, 0.6
 _MAX_EQUAL_RATIO = 2.5
-_DEG_PER_RAD_RANGE = (12.0, 130.0)
+_MIN_DEG_PER_RAD, _MAX_DEG_PER_RAD = 12.0, 130.0
 """Ratio of the gyro's turn rates to others that only a wrong unit explains, and of the wheels' to the gyro's that only wheels that spin do:
 57.3, with the factor of 0.45 to 2.3 by which wheels may be off on loose floor, and half of it while half of the window is of before the
 fault."""
@@ -85,8 +86,8 @@ class TurnRates(Check):
 
     def compare(self, window: Window) -> bool:
         """Declare faults that last; whether some turn rates are equal and none contradicts another."""
-        wheels, gyro, lidar = window.turn_rates
-        relations = _relate(wheels, gyro), _relate(wheels, lidar), _relate(lidar, gyro)
+        wheels, gyro, lidar = window.bins.turn_rates
+        relations = _Relation(*_relate(wheels, gyro)), _Relation(*_relate(wheels, lidar)), _Relation(*_relate(lidar, gyro))
         found, excluded = _find_faults(*relations), _excluded_faults(*relations)
         self._is_gyro_stuck, self._is_spinning = _is_constant(gyro, wheels), WHEELS_SPIN in found
         if self._is_gyro_stuck:
@@ -129,42 +130,53 @@ class _Relation(NamedTuple):
     """Ratio of the second to the first that only a wrong unit explains; 0 where there is none."""
 
 
-_NO_RELATION = _Relation(False, False, 0.0)
+@kernel
+def _relate(a: FloatArray, b: FloatArray) -> tuple[bool, bool, float]:
+    """Whether two turn rates (n,) [rad/s] are equal up to a bias of the second, whether opposite, and the ratio that only a wrong unit
+    explains (see `_Relation`)."""
+    n, sum_a, sum_b, aa, ab, bb = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(len(a)):
+        if not math.isnan(a[i] + b[i]):
+            n, sum_a, sum_b = n + 1, sum_a + a[i], sum_b + b[i]
+            aa, ab, bb = aa + a[i] * a[i], ab + a[i] * b[i], bb + b[i] * b[i]
+    if n < MIN_BINS:
+        return False, False, 0.0
+    bias = (sum_b - sum_a) / n
+    c = min(max(bias, -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
+    free = (aa, ab - c * sum_a, bb - 2.0 * c * sum_b + n * c * c)
+    if min(free[0], free[2]) < n * _MIN_RATE_RAD_S**2:
+        return False, False, 0.0
+    centred = (aa - sum_a * sum_a / n, ab - sum_a * sum_b / n, bb - sum_b * sum_b / n)
+    is_opposite = _is_opposite(n, free if abs(bias) > _MAX_BIAS_RAD_S else centred)
+    unit_ratio = _unit_ratio(n, free)
+    if unit_ratio == 0.0:
+        unit_ratio = _unit_ratio(n, centred)
+    ratio = math.sqrt(free[2] / free[0])
+    is_excited = min(free[0], free[2]) >= n * _MIN_EXCITED_RAD_S**2
+    is_equal = is_excited and _correlation(free) >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= ratio <= _MAX_EQUAL_RATIO
+    return is_equal, is_opposite, unit_ratio
 
 
-def _relate(a: FloatArray, b: FloatArray) -> _Relation:
-    """Relation of two turn rates (n,), up to a bias of the second [rad/s]."""
-    both = np.isfinite(a) & np.isfinite(b)
-    if both.sum() < MIN_BINS:
-        return _NO_RELATION
-    a, b = a[both], b[both]
-    bias = float((b - a).mean())
-    b = b - min(max(bias, -_MAX_BIAS_RAD_S), _MAX_BIAS_RAD_S)
-    size_a, size_b = math.sqrt(float(a @ a) / len(a)), math.sqrt(float(b @ b) / len(b))
-    if min(size_a, size_b) < _MIN_RATE_RAD_S:
-        return _NO_RELATION
-    r = float(a @ b) / len(a) / (size_a * size_b)
-    is_opposite = _is_opposite(a, b) if abs(bias) > _MAX_BIAS_RAD_S else _is_opposite(a - a.mean(), b - b.mean())
-    unit_ratio = _unit_ratio(a, b) or _unit_ratio(a - a.mean(), b - b.mean())
-    is_excited, ratio = min(size_a, size_b) >= _MIN_EXCITED_RAD_S, size_b / size_a
-    is_equal = is_excited and r >= _EQUAL_CORRELATION and 1.0 / _MAX_EQUAL_RATIO <= ratio <= _MAX_EQUAL_RATIO
-    return _Relation(is_equal, is_opposite, unit_ratio)
+@subroutine
+def _correlation(products: Triple) -> float:
+    """-1 to 1, by the sums of a^2, a b and b^2; 0 where one of them is 0."""
+    return min(max(products[1] / math.sqrt(max(products[0] * products[2], 1e-24)), -1.0), 1.0)
 
 
-def _unit_ratio(a: FloatArray, b: FloatArray) -> float:
-    """Ratio of turn rate ``b`` to ``a`` (n,) where they agree but for a factor as between degrees and radians; else 0."""
-    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
-    if min(size_a, size_b) < _MIN_RATE_RAD_S * math.sqrt(len(a)) or float(a @ b) < _EQUAL_CORRELATION * size_a * size_b:
+@subroutine
+def _unit_ratio(n: int, products: Triple) -> float:
+    """Ratio of b to a where they agree but for a factor as between degrees and radians; else 0."""
+    if min(products[0], products[2]) < n * _MIN_RATE_RAD_S**2 or _correlation(products) < _EQUAL_CORRELATION:
         return 0.0
-    low, high = _DEG_PER_RAD_RANGE
-    return size_b / size_a if low <= max(size_b / size_a, size_a / size_b) <= high else 0.0
+    ratio = math.sqrt(products[2] / products[0])
+    return ratio if _MIN_DEG_PER_RAD <= max(ratio, 1.0 / ratio) <= _MAX_DEG_PER_RAD else 0.0
 
 
-def _is_opposite(a: FloatArray, b: FloatArray) -> bool:
-    """Whether two turn rates (n,) have opposite signs, and not by chance. Means that a bias explains must be taken out before."""
-    r = min(max(float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12), -1.0), 1.0)
-    t = r * math.sqrt((len(a) - 2) / max(1.0 - r * r, 1e-9))
-    return r <= _OPPOSITE_CORRELATION and t <= -_MIN_T
+@subroutine
+def _is_opposite(n: int, products: Triple) -> bool:
+    """Whether a and b have opposite signs, and not by chance. Means that a bias explains must be taken out before."""
+    r = _correlation(products)
+    return r <= _OPPOSITE_CORRELATION and r * math.sqrt((n - 2) / max(1.0 - r * r, 1e-9)) <= -_MIN_T
 
 
 def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> dict[Fault, Numbers]:

@@ -3,38 +3,75 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from localization.events import Scan, Step
-from localization.lidar import LidarConfig, Sweep
-from localization.sensor_checks.scan_motion import Profile, ScanOdometry, make_profile
+from localization.lidar import LidarConfig
+from localization.sensor_checks.scan_motion import Profile, ScanOdometry, profile_of
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray, Points2
+from motion_models.se2 import FloatArray, Points2, Pose2
 
 BIN_S = 0.25
 WINDOW_BINS, MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
 _MAX_BIN_S = 1.0
 """How long a bin waits for a scan: LiDARs give 2 to 40 scans a second."""
+_UNKNOWN = np.full(3, np.nan)
 
 
-@dataclass(frozen=True, eq=False)
-class Bin:
-    """Motion over a quarter of a second or more."""
+_DURATION, _WHEELS, _GYRO, _LIDAR, _STANDING = 0, slice(1, 4), 4, slice(5, 8), 8
+_TURNS = [3, _GYRO, 7]
+"""Columns of a bin."""
 
-    duration_s: float
-    wheels: FloatArray
-    """(3,) by the wheels; NaN where they were missing."""
-    gyro: float
-    """Turn [rad]; NaN where it was missing."""
-    lidar: FloatArray
-    """(3,) by the scans; NaN where unknown, translation where the scene does not show it."""
-    is_standing: bool
+
+class Bins:
+    """Motion over the last quarters of a second or more, the oldest first. NaN is what was not measured."""
+
+    def __init__(self, rows: FloatArray | None = None) -> None:
+        """``rows`` (n, 9): see `then`."""
+        self._rows = np.empty((0, 9)) if rows is None else rows
+
+    def then(self, duration_s: float, wheels: Pose2, gyro: float, lidar: Pose2, is_standing: bool) -> Bins:
+        """These with one more, and without the oldest of more than `WINDOW_BINS`: motions (3,) by the wheels and by the scans, whose way is
+        NaN where the scene does not show it, and the turn by the gyro [rad]."""
+        return Bins(np.vstack([self._rows[1 - WINDOW_BINS :], (duration_s, *wheels, gyro, *lidar, is_standing)]))
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def durations_s(self) -> FloatArray:
+        """(n,) [s]"""
+        return self._rows[:, _DURATION]
+
+    @property
+    def wheels(self) -> FloatArray:
+        """(n, 3) motion by the wheels [m, m, rad]."""
+        return self._rows[:, _WHEELS]
+
+    @property
+    def gyro(self) -> FloatArray:
+        """(n,) turn by the gyro [rad]."""
+        return self._rows[:, _GYRO]
+
+    @property
+    def lidar(self) -> FloatArray:
+        """(n, 3) motion by the scans [m, m, rad]."""
+        return self._rows[:, _LIDAR]
+
+    @property
+    def turn_rates(self) -> FloatArray:
+        """(3, n) by wheels, gyro and LiDAR [rad/s]."""
+        return self._rows[:, _TURNS].T / self._rows[:, _DURATION]
+
+    def standing(self, count: int) -> Bins:
+        """Those of the last ``count`` in which the wheels stand, and the scans show a way."""
+        rows = self._rows[-count:]
+        return Bins(rows[(rows[:, _STANDING] > 0.0) & np.isfinite(rows[:, 5])])
 
 
 class Window:
@@ -44,8 +81,7 @@ class Window:
         self._mounts, self._config = mounts, config
         self._scans = ScanOdometry()
         self._open = _Accumulator()
-        self._durations_s = np.zeros(0)
-        self.bins: deque[Bin] = deque(maxlen=WINDOW_BINS)
+        self.bins = Bins()
         self.has_scans = False
         """Whether any scan has come."""
         self.begin_s = self.end_s = 0.0
@@ -62,44 +98,31 @@ class Window:
         waits_for_scan = self.has_scans and step.scan is None
         if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else BIN_S):
             return False
-        lidar = np.full(3, np.nan) if step.scan is None else self._register(step.scan)
-        self.bins.append(self._open.close(lidar))
-        self._open = _Accumulator(has_scan_at_start=step.scan is not None)
-        self._durations_s = np.array([b.duration_s for b in self.bins])
-        self.begin_s, self.end_s = max(now_s - float(self._durations_s.sum()), 0.0), now_s
+        lidar = _UNKNOWN if step.scan is None else self._register(step.scan)
+        closed, self._open = self._open, _Accumulator(has_scan_at_start=step.scan is not None)
+        self.bins = self.bins.then(closed.duration_s, closed.wheels, closed.gyro, lidar, closed.is_standing)
+        self.begin_s, self.end_s = max(now_s - float(self.bins.durations_s.sum()), 0.0), now_s
         return len(self.bins) >= MIN_BINS
 
     def _register(self, scan: Scan) -> FloatArray:
         """Motion (3,) in the open bin, which ``scan`` ends."""
+        motion = self._scans.register(self.profile(scan))
         self.registered = scan
-        motion = self._scans.register(*self.project(scan))
         if motion is None or not self._open.has_scan_at_start:
-            return np.full(3, np.nan)
+            return _UNKNOWN
         is_known = motion.has_translation and not self.is_scene_moving
         return motion.delta if is_known else np.array([np.nan, np.nan, motion.delta[2]])
-
-    def project(self, scan: Scan) -> tuple[Points2, FloatArray]:
-        """Points (M, 2) of ``scan`` in the plane of the body, and where its LiDAR is (2,) [m]."""
-        mount = self._mounts.get(scan.frame_id, Mount())
-        sweep = Sweep.from_scan(scan, mount).within(self._config.min_range_m, self._config.max_range_m)
-        return sweep.project(sweep.points), np.array([mount.x, mount.y])
 
     def profile(self, scan: Scan) -> Profile | None:
         """Profile of ``scan``; None for too few points."""
         if scan is self.registered:
             return self._scans.last
-        points, center = self.project(scan)
-        return make_profile(points - center, center)
+        return profile_of(scan, self._mounts.get(scan.frame_id, Mount()), self._config)
 
     def points_about_lidar(self, scan: Scan) -> Points2:
         """(N, 2) all points of a planar ``scan`` about its LiDAR, in the body's axes."""
         R = self._mounts.get(scan.frame_id, Mount()).rotation()
         return np.ascontiguousarray(scan.points[:, :2] @ R[:2, :2].T)
-
-    @property
-    def turn_rates(self) -> FloatArray:
-        """(3, n) by wheels, gyro and LiDAR [rad/s]; NaN where unknown."""
-        return np.array([[b.wheels[2], b.gyro, b.lidar[2]] for b in self.bins]).T / self._durations_s
 
 
 @dataclass
@@ -108,9 +131,9 @@ class _Accumulator:
 
     has_scan_at_start: bool = False
     duration_s: float = 0.0
+    gyro: float = 0.0
+    is_standing: bool = True
     _wheels: FloatArray | None = None
-    _gyro: float = 0.0
-    _is_standing: bool = True
     _has_wheels: bool = True
 
     def add(self, step: Step) -> None:
@@ -120,9 +143,10 @@ class _Accumulator:
         self._has_wheels &= step.has_wheels
         if self._has_wheels:
             self._wheels = step.predicted.delta if self._wheels is None else se2.compose(self._wheels, step.predicted.delta)
-        self._gyro += math.nan if step.turn is None else step.turn.angle
-        self._is_standing &= step.is_standing
+        self.gyro += math.nan if step.turn is None else step.turn.angle
+        self.is_standing &= step.is_standing
 
-    def close(self, lidar: FloatArray) -> Bin:
-        wheels = self._wheels if self._wheels is not None and self._has_wheels else np.full(3, np.nan)
-        return Bin(self.duration_s, wheels, self._gyro, lidar, self._is_standing)
+    @property
+    def wheels(self) -> FloatArray:
+        """(3,) motion by the wheels; NaN where they were missing."""
+        return self._wheels if self._wheels is not None and self._has_wheels else _UNKNOWN

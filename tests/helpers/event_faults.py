@@ -1,4 +1,4 @@
-"""Faults of a gyro and of encoders, put into the events of a drive."""
+"""Faults of gyro, encoders and LiDAR, put into the events of a drive."""
 
 from __future__ import annotations
 
@@ -47,18 +47,7 @@ def lose_ticks(left: float, right: float, seed: int = 0) -> EventFault:
 
 def multiply_wheels(factor: float, begin: float, end: float) -> EventFault:
     """Angles of the wheels grow ``factor`` times as fast, from the part ``begin`` of the drive to ``end``."""
-
-    def apply(events: list[Event]) -> Iterator[Event]:
-        first_ns, last_ns, last, counted = events[0].stamp_ns, events[-1].stamp_ns, None, np.zeros(2)
-        for event in events:
-            if isinstance(event, WheelSample):
-                step = event.position - (event.position if last is None else last)
-                is_wrong = begin <= (event.stamp_ns - first_ns) / (last_ns - first_ns) < end
-                last, counted = event.position, counted + step * (factor if is_wrong else 1.0)
-                event = replace(event, position=counted.copy(), velocity=np.full(2, np.nan))
-            yield event
-
-    return apply
+    return change_wheels(lambda step, part: step * (factor if begin <= part < end else 1.0))
 
 
 def faults_of_turns(axis: int = 2) -> dict[str, EventFault]:
@@ -93,3 +82,62 @@ def faults_of_stamps() -> dict[str, EventFault]:
         "LiDAR's clock 1 % fast": change_scans(lambda s, t: replace(s, stamp_ns=t + round(1.01 * (s.stamp_ns - t)))),
         "LiDAR's stamps .2 s late": change_scans(lambda s, t: replace(s, stamp_ns=s.stamp_ns + 200_000_000)),
     }
+
+
+def change_wheels(change: Callable[[np.ndarray, float], np.ndarray]) -> EventFault:
+    """``change`` of each increment (2,) of the wheels' angles [rad], left and right, by the part of the drive (0 to 1)."""
+
+    def apply(events: list[Event]) -> Iterator[Event]:
+        first_ns, last_ns, last, counted = events[0].stamp_ns, events[-1].stamp_ns, None, np.zeros(2)
+        for event in events:
+            if isinstance(event, WheelSample):
+                step = event.position - (event.position if last is None else last)
+                last, counted = event.position, counted + change(step, (event.stamp_ns - first_ns) / (last_ns - first_ns))
+                event = replace(event, position=counted.copy(), velocity=np.full(2, np.nan))
+            yield event
+
+    return apply
+
+
+def hold_gyro(part: float, rate: float, axis: int = 2) -> EventFault:
+    """The gyro repeats ``rate`` [rad/s] from the ``part`` of the drive on."""
+    return change_gyro(lambda w, now: rate if now > part else w, axis)
+
+
+def turn_scans(degrees: float) -> EventFault:
+    """Scans of a LiDAR that is mounted with another yaw."""
+    a = math.radians(degrees)
+    R = np.array([[math.cos(a), -math.sin(a), 0.0], [math.sin(a), math.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    return change_scans(lambda scan, begin_ns: replace(scan, points=scan.points @ R.T))
+
+
+def _cover(scan: Scan, half_angle: float = 0.5, range_m: float = 0.4) -> Scan:
+    """A part of the robot is ahead of its LiDAR."""
+    bearings = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    covered = np.column_stack([range_m * np.cos(bearings), range_m * np.sin(bearings), np.zeros(len(bearings))])
+    return replace(scan, points=np.where((np.abs(bearings) < half_angle)[:, None], covered, scan.points))
+
+
+def named_faults(axis: int = 2) -> dict[str, EventFault]:
+    """Faults with a check of their own; the gyro's ``axis`` is upright."""
+    return {
+        "gyro opposite": change_gyro(lambda w, part: -w, axis),
+        "gyro in deg/s": change_gyro(lambda w, part: math.degrees(w), axis),
+        "gyro in deg/s from half": change_gyro(lambda w, part: math.degrees(w) if part > 0.5 else w, axis),
+        "gyro glitches": change_gyro(lambda w, part: w + 40.0 * (round(1e6 * part) % 50_000 < 500), axis),
+        "gyro stuck at 0": hold_gyro(0.4, 0.0, axis),
+        "gyro stuck at 0.3 rad/s": hold_gyro(0.4, 0.3, axis),
+        "sides swapped": change_wheels(lambda step, part: step[::-1]),
+        "right side spins 20 times": change_wheels(lambda step, part: step * (1.0, 20.0 if 0.4 < part < 0.6 else 1.0)),
+        "encoders read zero": change_wheels(lambda step, part: step * (not 0.4 < part < 0.6)),
+        "right encoder reads zero": change_wheels(lambda step, part: step * (1.0, not 0.4 < part < 0.6)),
+        "LiDAR upside down": change_scans(lambda scan, begin_ns: replace(scan, points=scan.points * (1.0, -1.0, 1.0))),
+        "LiDAR yaw 25 deg": turn_scans(25.0),
+        "LiDAR yaw 90 deg": turn_scans(90.0),
+        "LiDAR sees the robot": change_scans(lambda scan, begin_ns: _cover(scan)),
+    }
+
+
+def without_gyro(fault: EventFault | None = None) -> EventFault:
+    """``fault`` of a robot without an IMU."""
+    return lambda events: [e for e in (events if fault is None else fault(events)) if not isinstance(e, ImuSample)]

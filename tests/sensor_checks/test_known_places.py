@@ -8,6 +8,7 @@ import pytest
 from localization.sensor_checks.faults import Fault, FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
+from localization.sensor_checks.scan_motion import make_profile
 from motion_models import se2
 from tests.helpers.event_faults import multiply_wheels
 from tests.helpers.fault_drives import in_room, run
@@ -16,7 +17,7 @@ from tests.helpers.rooms import ANGLES, ranges
 
 def _scan(pose: np.ndarray):
     r = ranges(tuple(pose))
-    return lambda: (np.column_stack([r * np.cos(ANGLES), r * np.sin(ANGLES)]), np.zeros(2))
+    return lambda: make_profile(np.column_stack([r * np.cos(ANGLES), r * np.sin(ANGLES)]), np.zeros(2))
 
 
 def _add_fault(faults: FaultLog, begin_s: float, now_s: float) -> None:

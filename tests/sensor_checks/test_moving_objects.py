@@ -10,7 +10,7 @@ import pytest
 from localization.ros.state_serialization import deserialize, serialize
 from localization.sensor_checks.moving_objects import MOVING_OBJECTS
 from localization.sensor_checks.scan_motion import make_profile
-from localization.sensor_checks.scene_motion import MOVED, STILL, align_rest, label, refine
+from localization.sensor_checks.scene_motion import MOVED, STILL, align_rest, explain
 from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms
@@ -38,9 +38,8 @@ def test_still_scene_has_one_motion() -> None:
     reference, profile = make_profile(before, np.zeros(2)), make_profile(now, np.zeros(2))
     assert reference is not None
     assert profile is not None
-    motion = refine(reference, now, MOTION + np.array([0.06, -0.05, 0.02]))
-    assert motion == pytest.approx(MOTION, abs=0.02)
-    scene = label(reference, profile, now, motion)
+    scene = explain(reference, profile, now, MOTION + np.array([0.06, -0.05, 0.02]))
+    assert scene.motion == pytest.approx(MOTION, abs=0.02)
     assert np.mean(scene.labels == STILL) > 0.9
     assert scene.moved_share < 0.03
 
@@ -51,7 +50,7 @@ def test_people_who_walk_along_have_another_motion_than_the_room() -> None:
     reference, profile = make_profile(before, np.zeros(2)), make_profile(now, np.zeros(2))
     assert reference is not None
     assert profile is not None
-    scene = label(reference, profile, now, refine(reference, now, MOTION))
+    scene = explain(reference, profile, now, MOTION)
     is_person = np.hypot(now[:, 0], now[:, 1]) < 1.9
     assert (scene.labels[~is_person] == STILL).mean() > 0.6  # some walls were hidden by people before
     assert (scene.labels[~is_person] == MOVED).mean() < 0.03

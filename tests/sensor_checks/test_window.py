@@ -25,7 +25,7 @@ def test_window_without_scans_has_bins_of_a_quarter_of_a_second() -> None:
     window = Window({}, LidarConfig())
     ends = [k for k in range(40) if window.add(step(k), (k + 1) * STEP_S)]
     assert ends == list(range(3 * MIN_BINS - 1, 40, 3))
-    np.testing.assert_allclose(window.turn_rates, np.tile([[0.2], [0.3], [np.nan]], 13))
+    np.testing.assert_allclose(window.bins.turn_rates, np.tile([[0.2], [0.3], [np.nan]], 13))
     assert window.end_s - window.begin_s == pytest.approx(39 * STEP_S)
     for k in range(40, 400):
         window.add(step(k), (k + 1) * STEP_S)
@@ -36,14 +36,14 @@ def test_window_with_scans_has_bins_that_end_at_scans() -> None:
     window = Window({}, LidarConfig())
     for k in range(35):
         window.add(step(k, has_scan=k % 5 == 0), (k + 1) * STEP_S)
-    np.testing.assert_allclose([b.duration_s for b in window.bins], [0.6, *[0.5] * 5])
+    np.testing.assert_allclose(window.bins.durations_s, [0.6, *[0.5] * 5])
     for k in range(35, 47):  # no more come
         window.add(step(k), (k + 1) * STEP_S)
-    assert window.bins[-1].duration_s == pytest.approx(1.1)  # ten steps of 0.1 s are a little less than 1 s
+    assert window.bins.durations_s[-1] == pytest.approx(1.1)  # ten steps of 0.1 s are a little less than 1 s
 
 
 def test_window_bin_without_gyro_or_wheels_has_unknown_rates() -> None:
     window = Window({}, LidarConfig())
     for k in range(6):
         window.add(step(k, has_gyro=k != 1, has_wheels=k != 4), (k + 1) * STEP_S)
-    np.testing.assert_allclose(window.turn_rates[:2], [[0.2, np.nan], [np.nan, 0.3]])
+    np.testing.assert_allclose(window.bins.turn_rates[:2], [[0.2, np.nan], [np.nan, 0.3]])
