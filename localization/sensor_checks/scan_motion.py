@@ -93,9 +93,15 @@ def align_from(a: Profile, b: Profile, a_T_b: Pose2, min_inliers: float) -> Scan
 
 def profile_of(scan: Scan, mount: Mount, config: LidarConfig) -> Profile | None:
     """Profile of the surfaces of ``scan`` that are within the LiDAR's range; None for too few points."""
-    sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
     center = np.array([mount.x, mount.y])
-    return make_profile(sweep.project(sweep.points) - center, center)
+    if not scan.is_planar:
+        sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
+        return make_profile(sweep.project(sweep.points) - center, center)
+    points = scan.points @ mount.rotation().T
+    at_body = points + np.array([mount.x, mount.y, mount.z])
+    r2 = np.einsum("ni,ni->n", at_body, at_body)
+    is_within = (r2 >= config.min_range_m**2) & (r2 <= config.max_range_m**2)  # NaN is not
+    return make_profile(points[is_within, :2], center)
 
 
 def make_profile(points: Points2, center: FloatArray) -> Profile | None:

@@ -11,7 +11,7 @@ import numpy as np
 from localization.events import ImuSample, Step
 from localization.sensor_checks.faults import Fault, FaultLog
 from localization.sensor_checks.sensor_check import Check, without_wheels
-from localization.sensor_checks.window import Window
+from localization.sensor_checks.window import Bins, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray
 
@@ -99,7 +99,9 @@ class Standstill(Check):
 
     def _moving(self) -> str:
         """What shows that the robot drives; "" where nothing does."""
-        bins = self._window.bins.standing(_RECENT_BINS)
+        recent = self._window.bins
+        is_compared = (recent.is_standing > 0.0) & np.isfinite(recent.lidar[:, 0])
+        bins = Bins.of(recent.rows[-_RECENT_BINS:][is_compared[-_RECENT_BINS:]])
         travelled, lasted = float(np.hypot(*bins.lidar[:, :2].T).sum()), float(bins.durations_s.sum())
         shaken_s = max((detector.lasted_s for detector in self._shaking.values()), default=0.0)
         is_shaking = min(shaken_s, self._stood_s) >= _SHAKE_S
@@ -108,7 +110,7 @@ class Standstill(Check):
             self._is_confirmed |= is_shaking or _has_turned(rates)
             has_second = _is_working(rates) or any(detector.has_noise for detector in self._shaking.values())
             return _LIDAR_MOVED if self._is_confirmed or not has_second else ""
-        return "the IMU shakes as if it moved" if is_shaking and not len(bins) else ""
+        return "the IMU shakes as if it moved" if is_shaking and not len(bins.rows) else ""
 
 
 def _is_turning(step: Step) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
 import math
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ from localization.events import Step
 from localization.sensor_checks.faults import Evidence, Fault, FaultLog
 from localization.sensor_checks.sensor_check import Check, without_scan
 from localization.sensor_checks.window import Window
+from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray
 
 LIDAR_DIRECTION = Fault(
@@ -90,18 +90,27 @@ def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
     With products z_k = lidar_k conj(wheels_k) it is the angle of their sum. Its error is sum Im(z_k exp(-i angle)) / sum |z_k|, with
     Student's t for a variance that is measured by n - 1 of these.
     """
-    by_wheels, by_lidar = wheels[:, 0] + 1j * wheels[:, 1], lidar[:, 0] + 1j * lidar[:, 1]
-    ways = np.abs([by_wheels, by_lidar])
-    shorter, longer = ways.min(axis=0), ways.max(axis=0)
-    is_straight = np.abs(wheels[:, 2]) <= _MAX_CURVATURE_RAD_M * shorter
-    is_long = (shorter >= _MIN_TRAVEL_M) & (longer <= _MAX_LENGTH_RATIO * shorter) & is_straight  # NaN is not
-    if is_long.sum() < _MIN_TRAVEL_BINS:
-        return None
-    offset = by_lidar[is_long] * by_wheels[is_long].conj()
-    sizes, n = np.abs(offset), len(offset)
-    if abs((offset / sizes).sum()) < _MIN_COHERENCE * n:
-        return None
-    angle = cmath.phase(offset.sum())
-    across = (offset * cmath.exp(-1j * angle)).imag
-    sigma = math.sqrt(n / (n - 1) * float(across @ across)) / float(sizes.sum())
-    return Direction(angle, float(stdtrit(n - 1, _CONFIDENCE)) * sigma)
+    n, angle, sigma = _mean_direction(wheels, lidar)
+    return Direction(angle, float(stdtrit(n - 1, _CONFIDENCE)) * sigma) if n else None
+
+
+@kernel
+def _mean_direction(wheels: FloatArray, lidar: FloatArray) -> tuple[int, float, float]:
+    """Number of bins whose direction counts, 0 where these do not agree; angle of the sum of their z_k, and its standard error [rad]."""
+    n, total, unit, size = 0, 0j, 0j, 0.0
+    z = np.empty(len(wheels), dtype=np.complex128)
+    for i in range(len(wheels)):
+        if math.isnan(wheels[i, 0] + lidar[i, 0]):
+            continue
+        by_wheels, by_lidar = complex(wheels[i, 0], wheels[i, 1]), complex(lidar[i, 0], lidar[i, 1])
+        shorter, longer = min(abs(by_wheels), abs(by_lidar)), max(abs(by_wheels), abs(by_lidar))
+        is_long = shorter >= _MIN_TRAVEL_M and longer <= _MAX_LENGTH_RATIO * shorter
+        if is_long and abs(wheels[i, 2]) <= _MAX_CURVATURE_RAD_M * shorter:
+            z[n] = by_lidar * by_wheels.conjugate()
+            total, unit, size, n = total + z[n], unit + z[n] / abs(z[n]), size + abs(z[n]), n + 1
+    if n < _MIN_TRAVEL_BINS or abs(unit) < _MIN_COHERENCE * n:
+        return 0, 0.0, 0.0
+    angle, across = math.atan2(total.imag, total.real), 0.0
+    for k in range(n):
+        across += (z[k].imag * math.cos(angle) - z[k].real * math.sin(angle)) ** 2
+    return n, angle, math.sqrt(n / (n - 1) * across) / size

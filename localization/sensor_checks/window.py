@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from localization.lidar import LidarConfig
 from localization.sensor_checks.scan_motion import Profile, ScanOdometry, profile_of
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray, Points2, Pose2
+from motion_models.se2 import FloatArray, Points2
 
 BIN_S = 0.25
 WINDOW_BINS, MIN_BINS = 24, 10
@@ -23,55 +24,31 @@ _MAX_BIN_S = 1.0
 _UNKNOWN = np.full(3, np.nan)
 
 
-_DURATION, _WHEELS, _GYRO, _LIDAR, _STANDING = 0, slice(1, 4), 4, slice(5, 8), 8
-_TURNS = [3, _GYRO, 7]
-"""Columns of a bin."""
-
-
-class Bins:
+class Bins(NamedTuple):
     """Motion over the last quarters of a second or more, the oldest first. NaN is what was not measured."""
 
-    def __init__(self, rows: FloatArray | None = None) -> None:
-        """``rows`` (n, 9): see `then`."""
-        self._rows = np.empty((0, 9)) if rows is None else rows
+    rows: FloatArray
+    """(n, 9) all of what follows."""
+    durations_s: FloatArray
+    """(n,) [s]"""
+    wheels: FloatArray
+    """(n, 3) by the wheels [m, m, rad]."""
+    gyro: FloatArray
+    """(n,) turn [rad]."""
+    lidar: FloatArray
+    """(n, 3) by the scans [m, m, rad]; NaN is the way where the scene does not show it."""
+    is_standing: FloatArray
+    """(n,) 1 where the wheels stand, else 0."""
 
-    def then(self, duration_s: float, wheels: Pose2, gyro: float, lidar: Pose2, is_standing: bool) -> Bins:
-        """These with one more, and without the oldest of more than `WINDOW_BINS`: motions (3,) by the wheels and by the scans, whose way is
-        NaN where the scene does not show it, and the turn by the gyro [rad]."""
-        return Bins(np.vstack([self._rows[1 - WINDOW_BINS :], (duration_s, *wheels, gyro, *lidar, is_standing)]))
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @property
-    def durations_s(self) -> FloatArray:
-        """(n,) [s]"""
-        return self._rows[:, _DURATION]
-
-    @property
-    def wheels(self) -> FloatArray:
-        """(n, 3) motion by the wheels [m, m, rad]."""
-        return self._rows[:, _WHEELS]
-
-    @property
-    def gyro(self) -> FloatArray:
-        """(n,) turn by the gyro [rad]."""
-        return self._rows[:, _GYRO]
-
-    @property
-    def lidar(self) -> FloatArray:
-        """(n, 3) motion by the scans [m, m, rad]."""
-        return self._rows[:, _LIDAR]
+    @classmethod
+    def of(cls, rows: FloatArray) -> Bins:
+        """Columns of ``rows`` (n, 9)."""
+        return cls(rows, rows[:, 0], rows[:, 1:4], rows[:, 4], rows[:, 5:8], rows[:, 8])
 
     @property
     def turn_rates(self) -> FloatArray:
         """(3, n) by wheels, gyro and LiDAR [rad/s]."""
-        return self._rows[:, _TURNS].T / self._rows[:, _DURATION]
-
-    def standing(self, count: int) -> Bins:
-        """Those of the last ``count`` in which the wheels stand, and the scans show a way."""
-        rows = self._rows[-count:]
-        return Bins(rows[(rows[:, _STANDING] > 0.0) & np.isfinite(rows[:, 5])])
+        return self.rows[:, [3, 4, 7]].T / self.durations_s
 
 
 class Window:
@@ -81,7 +58,7 @@ class Window:
         self._mounts, self._config = mounts, config
         self._scans = ScanOdometry()
         self._open = _Accumulator()
-        self.bins = Bins()
+        self.bins = Bins.of(np.empty((0, 9)))
         self.has_scans = False
         """Whether any scan has come."""
         self.begin_s = self.end_s = 0.0
@@ -100,9 +77,10 @@ class Window:
             return False
         lidar = _UNKNOWN if step.scan is None else self._register(step.scan)
         closed, self._open = self._open, _Accumulator(has_scan_at_start=step.scan is not None)
-        self.bins = self.bins.then(closed.duration_s, closed.wheels, closed.gyro, lidar, closed.is_standing)
+        row = closed.duration_s, *closed.wheels, closed.gyro, *lidar, closed.is_standing
+        self.bins = Bins.of(np.vstack([self.bins.rows[1 - WINDOW_BINS :], row]))
         self.begin_s, self.end_s = max(now_s - float(self.bins.durations_s.sum()), 0.0), now_s
-        return len(self.bins) >= MIN_BINS
+        return len(self.bins.rows) >= MIN_BINS
 
     def _register(self, scan: Scan) -> FloatArray:
         """Motion (3,) in the open bin, which ``scan`` ends."""

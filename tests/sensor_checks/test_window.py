@@ -29,7 +29,7 @@ def test_window_without_scans_has_bins_of_a_quarter_of_a_second() -> None:
     assert window.end_s - window.begin_s == pytest.approx(39 * STEP_S)
     for k in range(40, 400):
         window.add(step(k), (k + 1) * STEP_S)
-    assert len(window.bins) == WINDOW_BINS
+    assert len(window.bins.rows) == WINDOW_BINS
 
 
 def test_window_with_scans_has_bins_that_end_at_scans() -> None:
