@@ -1,9 +1,12 @@
 """A campaign of mutated logs: faults of sensors and of files, all drives, formats and models, by seed. Prints what was survived.
 
-python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs] [--scenes] [--seeds 1]
+python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs] [--checks] [--scenes] [--seeds 1]
 
 `--pairs` prints faults that no check knows by name instead, without the test of pairs of sensors and with it: the largest error of the
 position at its sigma [m], what wheels and scans alone make of the drive, and what is reported.
+
+`--checks` prints faults that a check knows by name, without the check and with it, in a room with a gyro, in another one without, and
+without a LiDAR.
 
 `--scenes` prints drives among people, vehicles, dust, glass and mirrors, and along a bare corridor (`tests.helpers.moving_scenes`): the
 error of the position that is most sigmas large, of those above 10 cm (else the largest), the error at the end, the largest of wheels and
@@ -21,9 +24,11 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from localization.sensor_checks import SensorChecks
+from localization.sensor_checks import SensorChecks, checks, turn_rates
+from localization.sensor_checks.faults import Fault
+from localization.sensor_checks.sensor_check import Check
 from tests.helpers import fault_drives, moving_scenes
-from tests.helpers.event_faults import faults_of_stamps, faults_of_turns
+from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, named_faults, without_gyro
 from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
 
 
@@ -34,11 +39,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="cases whose description has this in it")
     parser.add_argument("--verbose", action="store_true", help="print each case")
     parser.add_argument("--pairs", action="store_true", help="faults without a name, instead of the campaign")
+    parser.add_argument("--checks", action="store_true", help="faults with a check of their own, instead of the campaign")
     parser.add_argument("--scenes", action="store_true", help="scenes that move, instead of the campaign")
     parser.add_argument("--seeds", type=int, default=1, help="of each scene")
     options = parser.parse_args([] if arguments is None else arguments)
-    if options.pairs or options.scenes:
-        for line in _table_of_pairs(options.only) if options.pairs else _table_of_scenes(options.only, options.seeds):
+    tables = {
+        "pairs": lambda: _table_of_pairs(options.only),
+        "checks": lambda: _table_of_checks(options.only),
+        "scenes": lambda: _table_of_scenes(options.only, options.seeds),
+    }
+    chosen = [table for name, table in tables.items() if getattr(options, name)]
+    if chosen:
+        for line in chosen[0]():
             print(line, flush=True)
         return
     with tempfile.TemporaryDirectory(prefix="skidloc-faults-") as name:
@@ -93,6 +105,54 @@ def _table_of_pairs(only: str) -> Iterator[str]:
         cells += [f"{error:.3f}" for error in alone] + [""] * (2 - len(alone))
         known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in after.warnings if warning not in before.warnings)
         yield f"| {place} | {name} | {' | '.join(cells)} | {known} |"
+
+
+def _no_fault_of_turns(fault: Fault) -> Any:
+    """Turn rates without one of their faults."""
+    find = turn_rates._find_faults
+    return lambda: mock.patch.object(turn_rates, "_find_faults", lambda *a: {f: v for f, v in find(*a).items() if f is not fault})
+
+
+def _no_check(name: str) -> Any:
+    return lambda: mock.patch.object(checks, name, return_value=Check())
+
+
+_WITHOUT = {
+    "gyro opposite": _no_fault_of_turns(turn_rates.GYRO_OPPOSITE),
+    "gyro in deg/s": _no_check("GyroRate"),
+    "gyro glitches": _no_check("GyroRate"),
+    "gyro stuck": lambda: mock.patch.object(turn_rates, "_is_constant", return_value=False),
+    "sides swapped": _no_fault_of_turns(turn_rates.WHEELS_OPPOSITE),
+    "encoders": _no_check("Standstill"),
+    "LiDAR upside down": _no_fault_of_turns(turn_rates.LIDAR_OPPOSITE),
+    "LiDAR yaw": _no_check("TravelDirection"),
+    "LiDAR sees the robot": _no_check("OwnBody"),
+}
+"""What is left out for the faults whose names begin so."""
+
+
+def _table_of_checks(only: str) -> Iterator[str]:
+    husky = fault_drives.without_lidar("husky_a200")
+    of_wheels = {name: without_gyro(fault) for name, fault in named_faults().items() if "gyro" not in name}
+    of_husky = named_faults(fault_drives.upright_axis(husky))
+    drives = {
+        "room": (fault_drives.in_room(), named_faults()),
+        "room, no gyro": (fault_drives.in_room(1), of_wheels),
+        "no LiDAR": (husky, {name: fault for name, fault in of_husky.items() if "LiDAR" not in name}),
+    }
+    yield "| drive | fault | without the check | with it | wheels alone | reported |"
+    yield "|---|---|---|---|---|---|"
+    for place, (drive, faults) in drives.items():
+        for name, fault in faults.items():
+            without = next((patch for start, patch in _WITHOUT.items() if name.startswith(start)), None)
+            if only not in name or without is None:
+                continue
+            with without():
+                before = fault_drives.run(drive, fault)
+            after, wheels = fault_drives.run(drive, fault), fault_drives.run(drive, fault, estimator="odometry")
+            cells = [f"{o.worst[0]:.3f} at {o.worst[1]:.3f}{', wrong' if o.is_wrong else ''}" for o in (before, after)]
+            known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in after.warnings)
+            yield f"| {place} | {name} | {' | '.join(cells)} | {wheels.worst[0]:.3f} | {known} |"
 
 
 def _table_of_scenes(only: str, seeds: int) -> Iterator[str]:

@@ -1,6 +1,8 @@
 """What a replay costs: beside KISS-ICP alone on the same scans, per wheel sample, and in memory as the log grows.
 
-python -m tests.benchmarks.replay_cost
+python -m tests.benchmarks.replay_cost [checks]
+
+`checks` measures the sensor checks alone: their share of the steps of the EKF over the first part of fr079.
 """
 
 from __future__ import annotations
@@ -11,7 +13,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -22,11 +26,12 @@ from localization.events import Scan
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.log_replay import replay
 from localization.logs import open_log
-from localization.pipeline import Trial
+from localization.pipeline import Pipeline, Trial
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
+from tests.studies.buildings import BUILDINGS
 
 ACES = Path(__file__).parents[1] / "data" / "aces" / "aces.mcap"
 
@@ -51,6 +56,33 @@ def ekf_seconds(model: str = "diff_drive") -> float:
     log = open_log(ACES, robot)
     replay(log.events(), [Trial(make_model(model, robot), "ekf")], robot, log.mounts, has_lidar=True)
     return time.perf_counter() - begin
+
+
+def checks_share(seconds: float = 200.0) -> tuple[float, float]:
+    """CPU time of a step of fr079's EKF [s], and the share of the sensor checks, 0 to 1. The first drive compiles."""
+    drive = BUILDINGS["fr079"].open().until(seconds)
+    events = list(drive.events)
+    for _ in range(2):
+        pipeline, checks_s, steps = Pipeline(Trial(make_model("diff_drive", drive.robot), "ekf"), drive.robot, drive.mounts, True), 0.0, 0
+
+        def timed(method: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*arguments: Any) -> Any:
+                nonlocal checks_s
+                begin = time.process_time()
+                try:
+                    return method(*arguments)
+                finally:
+                    checks_s += time.process_time() - begin
+
+            return call
+
+        for name in ("apply", "compare_residuals", "inflate"):
+            setattr(pipeline.checks, name, timed(getattr(pipeline.checks, name)))
+        begin = time.process_time()
+        for event in events:
+            steps += len(pipeline.process(event))
+        total_s = time.process_time() - begin
+    return total_s / steps, checks_s / total_s
 
 
 def samples_per_second(model: str, n: int = 200_000) -> float:
@@ -95,7 +127,11 @@ def first_part(source: Path, target: Path, part: float) -> None:
                 writer.write(copies[connection.id], stamp, raw)
 
 
-def main() -> None:
+def main(part: str = "all") -> None:
+    step_s, share = checks_share()
+    print(f"step of fr079's EKF {1e3 * step_s:.2f} ms, of which sensor checks {100.0 * share:.0f} % (at most 15 is wanted)\n")
+    if part == "checks":
+        return
     kiss_seconds(), ekf_seconds()  # compile and warm up
     ratios = []
     print("whole ACES replay, 7,374 scans, one thread            KISS-ICP alone     with the EKF     ratio")
@@ -114,4 +150,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])
