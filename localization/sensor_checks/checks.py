@@ -40,7 +40,6 @@ class SensorChecks:
         self._window = window = Window(mounts, config)
         self._disagreement, self._moving = Disagreement(faults), MovingObjects(faults, window)
         self._checks: tuple[Check, ...] = (
-            LidarTilt(mounts),
             OwnBody(faults),
             GyroRate(faults),
             TurnRates(faults, step_config),
@@ -52,7 +51,7 @@ class SensorChecks:
         self._preparing, self._comparing = self._that_override("prepare"), self._that_override("compare")
         self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
         self._watching = tuple(check for check in self._applying if not check.is_of_declared_faults)
-        self._consistency, self._places = Consistency(faults), KnownPlaces(faults)
+        self._consistency, self._places, self._tilt = Consistency(faults), KnownPlaces(faults), LidarTilt(mounts)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None
@@ -71,6 +70,8 @@ class SensorChecks:
         if not math.isfinite(step.predicted.delta.sum()):
             return step  # the estimator refuses it
         self._faults.start_step(step)
+        if step.scan is not None and not step.scan.is_planar:
+            self._tilt.add(step.scan)
         for check in self._preparing:
             step = check.prepare(step)
         self._inflation.add_step(step)
@@ -127,7 +128,7 @@ class SensorChecks:
 
     def warnings(self) -> list[str]:
         """Problems so far."""
-        return [*(warning for check in self._checks for warning in check.warnings()), *self._faults.warnings()]
+        return [*self._tilt.warnings(), *self._faults.warnings()]
 
     @property
     def found(self) -> Mapping[Fault, DetectedFault]:

@@ -10,8 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from localization.events import Scan, Step
-from localization.sensor_checks.sensor_check import Check
+from localization.events import Scan
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -26,7 +25,7 @@ _BIN_RAD, _BINS = math.radians(0.1), 300  # more than the steepest ground
 _MIN_CLOUDS, _MIN_REPORTED_RAD = 10, math.radians(1.0)
 
 
-class LidarTilt(Check):
+class LidarTilt:
     """Fits the ground in clouds; memory is bounded. ``mounts`` of the LiDARs are by frame."""
 
     def __init__(self, mounts: Mapping[str, Mount]) -> None:
@@ -35,12 +34,6 @@ class LidarTilt(Check):
         self._frame = ""
         self._found = np.zeros((2, 2 * _BINS + 1), dtype=np.int64)  # how often which roll and pitch, in bins
         self._height = 0.0  # sum over clouds: how far above or below the LiDAR the rest of them is [m]
-
-    def prepare(self, step: Step) -> Step:
-        """``step`` as it is."""
-        if step.scan is not None and not step.scan.is_planar:
-            self.add(step.scan)
-        return step
 
     def add(self, scan: Scan) -> None:
         """Fit the ground in a cloud, twice a second."""

@@ -17,7 +17,7 @@ from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_re
 from localization.sensor_checks.sensor_check import Check, without_scan
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
-from localization.sensor_checks.turn_rates import LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_SPIN
+from localization.sensor_checks.turn_rates import LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from localization.sensor_checks.window import BIN_S, Window
 from localization.trajectory import BoolArray
 from motion_models import se2
@@ -28,7 +28,7 @@ MOVING_OBJECTS = Fault(
     " the wheels are matched meanwhile. Without people and vehicles about the robot, check the wheels' radius and what covers the LiDAR."
 )
 
-_EXPLAINING = (LIDAR_OWN_BODY, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_SPIN, WHEELS_STANDING)
+_EXPLAINING = (LIDAR_OWN_BODY, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_STANDING)
 """Named faults of which parts of a scan, or the wheels, move otherwise."""
 _MAX_VIEWS = 17
 """Views of the last four seconds, one for each bin of the window, after which at .05 m/s an object has moved by more than its tolerance."""

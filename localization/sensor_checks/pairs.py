@@ -16,7 +16,6 @@ from localization.sensor_checks.turn_rates import (
     GYRO_UNIT,
     LIDAR_OPPOSITE,
     WHEELS_OPPOSITE,
-    WHEELS_SPIN,
 )
 
 _FLOOR_RAD = 0.01
@@ -82,7 +81,7 @@ CAUSES: Mapping[Pair, Causes] = {
 }
 """What may explain why a pair differs. Between wheels and LiDAR the filter estimates an offset of the clocks."""
 
-_OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_SPIN, WHEELS_STANDING)
+_OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_STANDING)
 _OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)
 _OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION)
 NAMED: Mapping[Pair, tuple[Fault, ...]] = {

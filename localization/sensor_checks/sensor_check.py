@@ -34,10 +34,6 @@ class Check:
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Compare ``step`` with its motion ``delta`` (3,) by the estimate, whose normalised innovation squared is ``nis``."""
 
-    def warnings(self) -> list[str]:
-        """What is reported besides faults."""
-        return []
-
 
 def without_scan(step: Step) -> Step:
     """``step`` whose scan is not used."""

@@ -1,4 +1,4 @@
-"""Turn rates of wheels, gyro and LiDAR: opposite signs, wrong units, a gyro that is stuck, wheels that spin.
+"""Turn rates of wheels, gyro and LiDAR: opposite signs, wrong units, a gyro that is stuck.
 
 Of three sensors the one that contradicts the two others is at fault, of two either; the gyro or the LiDAR is left out then.
 """
@@ -34,10 +34,6 @@ GYRO_STUCK = Fault(
     "the gyro repeats one value while {others} turn. It is not used as long as that lasts. Check the IMU and its driver.",
     reference="wheels",
 )
-WHEELS_SPIN = Fault(
-    "the wheels turn {ratio:.2g} times as fast as {others}: one side spins. They count as unknown while that lasts. Check the load and the"
-    " floor; where it is so in every turn, the units of the gyro's driver (rad/s?).",
-)
 WHEELS_OPPOSITE = Fault(
     "the wheels turn opposite to {others}. They are not used while that lasts. Swap left and right in the robot file's [joints].",
     reference="wheels and gyro",
@@ -61,9 +57,8 @@ _MIN_T = 4.0
 _OPPOSITE_CORRELATION, _EQUAL_CORRELATION = -0.6, 0.6
 _MAX_EQUAL_RATIO = 2.5
 _MIN_DEG_PER_RAD, _MAX_DEG_PER_RAD = 12.0, 130.0
-"""Ratio of the gyro's turn rates to others that only a wrong unit explains, and of the wheels' to the gyro's that only wheels that spin do:
-57.3, with the factor of 0.45 to 2.3 by which wheels may be off on loose floor, and half of it while half of the window is of before the
-fault."""
+"""Ratio of the gyro's turn rates to others that only a wrong unit explains: 57.3, with the factor of 0.45 to 2.3 by which wheels may be off
+on loose floor, and half of it while half of the window is of before the fault."""
 _REPEATED_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 1e-7, 0.002
 """A gyro's mean rates never repeat to the last digit, but for its noise; over a whole window it is stuck if the wheels turn at all."""
 
@@ -79,17 +74,15 @@ class TurnRates(Check):
 
     def __init__(self, faults: FaultLog, config: StepConfig) -> None:
         self._faults, self._velocity = faults, UnknownVelocity(config)
-        self._evidence = {
-            fault: Evidence() for fault in (GYRO_OPPOSITE, GYRO_UNIT, GYRO_STUCK, WHEELS_SPIN, WHEELS_OPPOSITE, LIDAR_OPPOSITE)
-        }
-        self._is_gyro_stuck = self._is_spinning = False
+        self._evidence = {fault: Evidence() for fault in (GYRO_OPPOSITE, GYRO_UNIT, GYRO_STUCK, WHEELS_OPPOSITE, LIDAR_OPPOSITE)}
+        self._is_gyro_stuck = False
 
     def compare(self, window: Window) -> bool:
         """Declare faults that last; whether some turn rates are equal and none contradicts another."""
         wheels, gyro, lidar = window.bins.turn_rates
         relations = _Relation(*_relate(wheels, gyro)), _Relation(*_relate(wheels, lidar)), _Relation(*_relate(lidar, gyro))
         found, excluded = _find_faults(*relations), _excluded_faults(*relations)
-        self._is_gyro_stuck, self._is_spinning = _is_constant(gyro, wheels), WHEELS_SPIN in found
+        self._is_gyro_stuck = _is_constant(gyro, wheels)
         if self._is_gyro_stuck:
             found[GYRO_STUCK] = {"others": "the wheels"}
         for fault, evidence in self._evidence.items():
@@ -108,8 +101,7 @@ class TurnRates(Check):
             step = replace(step, turn=None)
         if LIDAR_OPPOSITE in faults:
             step = without_scan(step)
-        is_unknown = WHEELS_OPPOSITE in faults or (self._is_spinning and WHEELS_SPIN in faults)
-        if is_unknown and step.has_wheels and not step.is_standing:
+        if WHEELS_OPPOSITE in faults and step.has_wheels and not step.is_standing:
             return without_wheels(step, self._velocity.increment(step.duration, has_turn=step.turn is not None))
         self._velocity.lasted_s = 0.0
         return step
@@ -194,8 +186,6 @@ def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _R
         found[GYRO_UNIT] = {"others": "the wheels", "ratio": wheels_gyro.unit_ratio}
     elif lidar_gyro.unit_ratio:
         found[GYRO_UNIT] = {"others": "the LiDAR", "ratio": lidar_gyro.unit_ratio}
-    elif wheels_gyro.unit_ratio:
-        found[WHEELS_SPIN] = {"others": "gyro and LiDAR" if lidar_gyro.is_equal else "the gyro", "ratio": 1.0 / wheels_gyro.unit_ratio}
     return found
 
 
@@ -204,8 +194,6 @@ def _excluded_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro
     found: set[Fault] = set()
     if wheels_gyro.is_equal or lidar_gyro.is_equal:
         found |= {GYRO_OPPOSITE, GYRO_UNIT}
-    if wheels_gyro.is_equal:
-        found.add(WHEELS_SPIN)
     if wheels_gyro.is_equal or wheels_lidar.is_equal:
         found.add(WHEELS_OPPOSITE)
     if wheels_lidar.is_equal:
