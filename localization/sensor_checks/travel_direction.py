@@ -23,7 +23,7 @@ LIDAR_DIRECTION = Fault(
 
 _MEMORY_S = 120.0
 """A robot that slides has a direction of travel that is wrong (fr079: 14 deg for 7 s); it is compared over two minutes."""
-_MAX_DIRECTION_RAD, _MIN_COHERENCE = math.radians(12.0), 0.9
+_MAX_DIRECTION_RAD = math.radians(12.0)
 """A robot on a side slope or in curves slides by a few degrees."""
 _MAX_SLIDE_RAD = math.radians(20.0)
 """Directions that no slide explains are compared over seconds: 99.9 % of the windows of CSAIL, fr079 and ACES are below 17 deg. Windows
@@ -35,8 +35,8 @@ _MAX_LENGTH_RATIO = 2.0
 """Ways whose lengths differ by more show wheels that spin, or another unit, and no direction."""
 _CONFIDENCE = 0.999
 """Of the bound of a direction, one-sided: windows overlap, so that one of a thousand is one of some minutes."""
-_MAX_CURVATURE_RAD_M = 0.6
-"""Sharper turns slide sideways."""
+_NOISE_M, _SLIDE_M_PER_RAD = 0.005, 0.5
+"""Noise of a bin's way by scans at least [m], and what a robot may slide in a turn: half its length [m/rad]."""
 
 
 class TravelDirection(Check):
@@ -59,7 +59,7 @@ class TravelDirection(Check):
             degrees = math.degrees(direction.angle)
             numbers = {"degrees": abs(degrees), "side": "left" if degrees > 0.0 else "right", "correction": -degrees}
             self._faults.declare(LIDAR_DIRECTION, self._off.since_s, numbers)
-        return abs(direction.angle) <= _MAX_DIRECTION_RAD
+        return direction.exceeds(_MAX_DIRECTION_RAD) is False
 
     def apply(self, step: Step) -> Step:
         """``step`` without its scan."""
@@ -81,36 +81,37 @@ class Direction(NamedTuple):
     def exceeds(self, most: float) -> bool | None:
         """Whether it is larger than ``most`` [rad]; None where its error does not show it."""
         size = abs(self.angle)
-        return True if size - self.bound > most else False if size <= most else None
+        return True if size - self.bound > most else False if size <= most and self.bound <= most else None
 
 
 def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
-    """Direction of the LiDAR's travel against the wheels', where both motions (n, 3) agree among themselves; None where it is not known.
+    """Direction of the LiDAR's travel against the wheels', by their motions (n, 3) in bins; None where it is not known.
 
-    With products z_k = lidar_k conj(wheels_k) it is the angle of their sum. Its error is sum Im(z_k exp(-i angle)) / sum |z_k|, with
-    Student's t for a variance that is measured by n - 1 of these.
+    Least squares of lidar_k = alpha wheels_k + beta turn_k, ways as complex numbers: the angle of alpha is the direction, beta what the
+    robot slides in turns [m/rad], which is 0 +- `_SLIDE_M_PER_RAD` a priori: along one arc a slide looks like another direction.
     """
     n, angle, sigma = _mean_direction(wheels, lidar)
-    return Direction(angle, float(stdtrit(n - 1, _CONFIDENCE)) * sigma) if n else None
+    return Direction(angle, float(stdtrit(n - 2, _CONFIDENCE)) * sigma) if n else None
 
 
 @kernel
 def _mean_direction(wheels: FloatArray, lidar: FloatArray) -> tuple[int, float, float]:
-    """Number of bins whose direction counts, 0 where these do not agree; angle of the sum of their z_k, and its standard error [rad]."""
-    n, total, unit, size = 0, 0j, 0j, 0.0
-    z = np.empty(len(wheels), dtype=np.complex128)
+    """Number of bins that count, 0 where these are too few; angle of alpha, and its standard error [rad]."""
+    n, ww, wt, tt, wz, tz = 0, 0.0, 0j, (_NOISE_M / _SLIDE_M_PER_RAD) ** 2, 0j, 0j
+    w, z, t = np.empty(len(wheels), np.complex128), np.empty(len(wheels), np.complex128), np.empty(len(wheels))
     for i in range(len(wheels)):
-        if math.isnan(wheels[i, 0] + lidar[i, 0]):
-            continue
         by_wheels, by_lidar = complex(wheels[i, 0], wheels[i, 1]), complex(lidar[i, 0], lidar[i, 1])
         shorter, longer = min(abs(by_wheels), abs(by_lidar)), max(abs(by_wheels), abs(by_lidar))
-        is_long = shorter >= _MIN_TRAVEL_M and longer <= _MAX_LENGTH_RATIO * shorter
-        if is_long and abs(wheels[i, 2]) <= _MAX_CURVATURE_RAD_M * shorter:
-            z[n] = by_lidar * by_wheels.conjugate()
-            total, unit, size, n = total + z[n], unit + z[n] / abs(z[n]), size + abs(z[n]), n + 1
-    if n < _MIN_TRAVEL_BINS or abs(unit) < _MIN_COHERENCE * n:
+        if not math.isnan(abs(by_wheels) + abs(by_lidar)) and shorter >= _MIN_TRAVEL_M and longer <= _MAX_LENGTH_RATIO * shorter:
+            w[n], z[n], t[n] = by_wheels, by_lidar, wheels[i, 2]
+            ww, wt, tt = ww + abs(w[n]) ** 2, wt + w[n].conjugate() * t[n], tt + t[n] ** 2
+            wz, tz, n = wz + w[n].conjugate() * z[n], tz + t[n] * z[n], n + 1
+    if n < _MIN_TRAVEL_BINS:
         return 0, 0.0, 0.0
-    angle, across = math.atan2(total.imag, total.real), 0.0
+    determinant = ww * tt - abs(wt) ** 2
+    alpha, beta = (tt * wz - wt * tz) / determinant, (ww * tz - wt.conjugate() * wz) / determinant
+    square = 0.0
     for k in range(n):
-        across += (z[k].imag * math.cos(angle) - z[k].real * math.sin(angle)) ** 2
-    return n, angle, math.sqrt(n / (n - 1) * across) / size
+        square += abs(z[k] - alpha * w[k] - beta * t[k]) ** 2
+    variance = max(square / (2 * (n - 2)), _NOISE_M**2)
+    return n, math.atan2(alpha.imag, alpha.real), math.sqrt(variance * tt / determinant) / abs(alpha)
