@@ -10,6 +10,7 @@ DATA := tests/data
 	@echo "Making .venv with skidloc and what it needs (700 MB; a minute at the first time)."
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable .
+	$(BIN)/python -m compileall -qq -j 2 .venv/lib  # pip takes one core for it
 	touch $@
 
 .venv/ready: .venv/installed
