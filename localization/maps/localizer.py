@@ -47,6 +47,8 @@ _MAX_LOG_ODDS = 8.0
 """Log-odds of a place that is tracked, at most: a few scans from elsewhere are enough to be lost."""
 _PATIENCE, _MAX_WAIT = 6, 3
 """After each so many searches in vain, one more keyframe is left out between them, at most the second number."""
+_PROMISING = 0.3
+"""Probability of a place, from which on the search was not in vain: in maps of other buildings none has more."""
 _TRACKED_M, _TRACKED_RAD = 0.5, 0.3
 """Sigma of a pose that is tracked, at most, through places that the map does not have."""
 _NEAR_M, _NEAR_RAD = 3.0, 0.8
@@ -189,7 +191,7 @@ class Localizer:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
         place, cov = self._align(points), self._cov
         if place is not None:
-            self.is_outside = place.on_walls + place.contradicting < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
+            self.is_outside = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
         if place is None or self.is_outside:
             return
         evidence = self._evidence(place, cov)
@@ -290,6 +292,8 @@ class Localizer:
         probability = best.probability if is_confirmed else min(best.probability, LIKELY)
         self.hypotheses = [replace(best, probability=probability), *self.hypotheses[1:]]
         self._search_odds = log_odds(probability)
+        if probability >= _PROMISING:
+            self._failures = self._wait = 0
         if is_confirmed and probability >= LIKELY and is_narrow(best.cov):
             A = se2.adjoint(se2.inverse(moved))
             self._begin_tracking(best.pose, A @ (best.cov + _BEND) @ A.T + moved_cov)
