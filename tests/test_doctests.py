@@ -34,7 +34,7 @@ def test_doctests_of_the_public_functions_exist():
     } <= set(MODULES)
 
 
-@pytest.mark.parametrize("name", cases(MODULES, usual=SHORT))
+@pytest.mark.parametrize("name", cases(MODULES, usual=SHORT, others=pytest.mark.slow))
 def test_docstring_examples_are_true(name, monkeypatch):
     monkeypatch.chdir(ROOT)
     result = doctest.testmod(importlib.import_module(name), optionflags=doctest.NORMALIZE_WHITESPACE)

@@ -33,7 +33,7 @@ def test_robot_toml_of_shipped_robots_is_read_back(name: str) -> None:
 
 
 @given(TEXTS, st.dictionaries(TEXTS, st.lists(NUMBERS, min_size=6, max_size=6)), COEFFICIENTS, TEXTS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_robot_toml_of_any_robot_is_read_back(
     name: str, mounts: dict[str, list[float]], models: dict[str, dict[str, float]], joint: str
 ) -> None:

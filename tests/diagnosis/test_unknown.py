@@ -65,7 +65,7 @@ def test_diagnose_rates_that_saturate_are_unexplained(nominal: Drive) -> None:
     assert_unexplained(diagnose(UNKNOWN["rates saturate"](nominal), make_model("friction", nominal.robot)))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_extend_slip_in_left_turns_is_friction_and_a_term(nominal: Drive) -> None:
     """A part that both sides have is friction, within what robots have, and one that they have with opposite signs a term."""
     drive, model = UNKNOWN["slip in left turns only"](nominal), make_model("friction", nominal.robot)

@@ -50,6 +50,7 @@ def test_patch_of_matcher_changes_poses(name: str, drive: Drive, poses: np.ndarr
         assert not np.array_equal(drive.run("ekf", "skid_steer").trajectory.poses, poses)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", SETTINGS)
 def test_setting_changes_poses(name: str, drive: Drive, poses: np.ndarray) -> None:
     assert not np.array_equal(drive.run("ekf", "skid_steer", **SETTINGS[name]).trajectory.poses, poses)

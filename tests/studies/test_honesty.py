@@ -21,7 +21,8 @@ def test_draw_slip_over_long_times_has_the_variance_of_the_wheels(noise: Noise) 
     np.testing.assert_allclose(ends.var(axis=0), noise.wheels**2 * expected, rtol=0.25)
 
 
-@pytest.mark.parametrize("name", ["slip correlated over 0.1 s", pytest.param("wheel noise twice", marks=pytest.mark.extended)])
+@pytest.mark.extended
+@pytest.mark.parametrize("name", ["slip correlated over 0.1 s", "wheel noise twice"])
 def test_nees_under_noise_unknown_to_the_filter_is_not_above_its_band(name: str) -> None:
     found = [drive_nees(drive_with(room, NOISES[name], seed), "ekf") for room in make_rooms(2) for seed in range(2)]
     assert 0.5 < np.mean(found) < mean_band(len(found), 3.0)[1]
