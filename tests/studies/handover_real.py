@@ -31,7 +31,7 @@ _SCORES = ("relations_all_translation_m", "ate_rmse_m")
 
 def _robot(name: str) -> str:
     path = _DATA / name
-    return str(path) if path.exists() else name
+    return str(path) if path.is_file() else name
 
 
 def handed_over(log: str, folder: Path, console: Console) -> str:
