@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -80,6 +80,7 @@ _MIN_HELDOUT_GAIN = 0.003  # least held-out gain of a finding
 _SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
 _DETECTABLE_SIGMAS = 3.0
 _PART_LOG_ODDS = 14.0  # twice the log-odds by which a cause in a part of a drive leads: odds of 1000, as hundreds of parts are tried
+_MAX_MOMENT_SHARE = 0.25  # 95 % interval of the moment of an event, over the drive: a payload that is taken up has a tenth
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -218,18 +219,22 @@ def _choose_parts(
         kept = [state.causes[i] for i in best if state.causes[i].spell]
         state, best = _choose_causes(predictor, linearize(predictor, (*first.causes, *kept, *more), {}, TOLERANCE))
     located = with_intervals(predictor, state, best)
-    if not located or _is_error_of_contacts(predictor, state, best):
+    if not located or _is_error_of_contacts(predictor, state, best, located.values()):
         return linearization, chosen
     causes = tuple(located.get(i, cause) for i, cause in enumerate(state.causes))
     sizes = {causes[i]: float(size) for i, size in zip(best, state.problem.fit(best)[0], strict=True)}
     return linearize(predictor, causes, sizes, TOLERANCE), best
 
 
-def _is_error_of_contacts(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...]) -> bool:
-    """Whether those of ``chosen`` that hold in a part of the drive gain no more than errors of the contacts still do beside them: parts of
-    a drive have different motions, in which such errors differ."""
+def _is_error_of_contacts(predictor: DrivePredictor, state: Linearization, chosen: tuple[int, ...], located: Iterable[Cause]) -> bool:
+    """Whether those of ``chosen`` that hold in a part of the drive may be errors of the contacts, which differ from part to part, as its
+    motions do: they gain no more than such errors still do beside them, or have no moment (``located``), as an event has."""
     if not predictor.unmodelled.slip_share:
         return False
+    whole = float(predictor.window_times_s[1][-1])
+    widths = [high - low for cause in located if cause.spell_95 is not None for low, high in cause.spell_95 if high < math.inf]
+    if max(widths, default=0.0) > _MAX_MOMENT_SHARE * whole:
+        return True
     error = find_model_error(predictor, state)
     lasting = tuple(i for i in chosen if state.causes[i].spell is None)
     return error.is_shown and state.problem.gain(chosen) - state.problem.gain(lasting) < error.log_odds + _PART_LOG_ODDS
