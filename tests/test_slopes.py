@@ -73,7 +73,7 @@ def final_error(log, run):
 
 @pytest.mark.parametrize(
     ("model", "estimator", "gain"),
-    [("friction", "odometry", 5.0), ("skid_steer", "ekf", 3.0), pytest.param("icr", "ekf", 3.0, marks=pytest.mark.extended)],
+    [("friction", "odometry", 5.0), pytest.param("skid_steer", "ekf", 3.0, marks=pytest.mark.extended)],
 )
 def test_slope_drive_with_the_tilt_is_nearer_than_by_a_flat_model(on_slope, model, estimator, gain):
     """In the simulator, whose forces are the dynamic model's; the flat model's error is what the robot slides downhill."""

@@ -86,6 +86,7 @@ def replay_metrics(tmp_path: Path, log: Path) -> dict[str, object]:
     return found
 
 
+@pytest.mark.extended
 def test_replay_with_the_right_side_inverted_is_as_the_healthy_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     metrics = replay_metrics(tmp_path, CASES / "H06-right-side-inverted" / "log.mcap")
     for result in metrics["results"]:  # type: ignore[attr-defined]

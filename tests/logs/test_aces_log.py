@@ -143,6 +143,7 @@ def test_aces_relation_times_are_scan_stamps(log: Log) -> None:
     assert wanted <= set(stamps(log, "/scan"))
 
 
+@pytest.mark.extended
 def test_aces_independent_reader_gives_the_same_messages(log: Log) -> None:
     other = read_with_mcap(BAG)
     assert other.keys() == log.keys()
