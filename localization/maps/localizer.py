@@ -48,7 +48,7 @@ _MAX_LOG_ODDS = 8.0
 _PATIENCE, _MAX_WAIT = 6, 3
 """After each so many searches in vain, one more keyframe is left out between them, at most the second number."""
 _PROMISING = 0.3
-"""Probability of a place, from which on the search was not in vain: in maps of other buildings none has more."""
+"""Probability of a place, from which on the search was not in vain: in maps of other buildings one keyframe of 72 has more."""
 _TRACKED_M, _TRACKED_RAD = 0.5, 0.3
 """Sigma of a pose that is tracked, at most, through places that the map does not have."""
 _NEAR_M, _NEAR_RAD = 3.0, 0.8
