@@ -121,6 +121,8 @@ class ScanMatcher:
         self._keys: list[KeyScan] = []
         self._grid: VoxelGrid | None = None
         self._image: LikelihoodImage | None = None
+        self.is_new_place = False
+        """Most of the last scan lies in unmapped space, the rest are inliers and the prior is narrow: it is a key scan."""
         self.mapped_share = 1.0
         """Share of the last scan's points with a surface of the submap near them."""
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, inliers
@@ -137,6 +139,7 @@ class ScanMatcher:
         assert self._grid is not None
         fit = align_points(self._grid, points, prior, cov, prior if guess is None else guess)
         self.mapped_share = fit.n_associated / len(points)
+        self.is_new_place = fit.n_associated < 0.5 * len(points) and fit.n_inliers >= 0.5 * fit.n_associated and is_narrow(cov)
         converges, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * OUTLIER_COST
         fits = converges and fit.overlap >= self._config.search_below
         if not (fits and agrees):

@@ -84,7 +84,7 @@ class ScanMatchingSensor:
             return None, ""
         found = self._match(self._matcher, deskewed, offset)
         if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
-            self._scan = None
+            self._scan, self._matcher.is_new_place = None, False
             return None, "moved"
         self._place.update(step.end_ns * 1e-9, is_found=found is not None or is_narrow(self._cov))
         return found, "lost" if found is None else ""
@@ -113,7 +113,7 @@ class ScanMatchingSensor:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
         if self._scan is None or self._place.is_open:
             return False
-        if self._last_key is None:
+        if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
             return True
         moved = se2.between(self._last_key, pose)
         c = self._config

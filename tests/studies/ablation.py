@@ -125,6 +125,12 @@ def _align_freely(grid: VoxelGrid, points: Any, prior: Any, cov: Any, guess: Any
     return _align_points(grid, points, prior, _NO_PRIOR, guess, error)
 
 
+def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *rest: Any, **named: Any) -> Any:
+    found = original(self, *rest, **named)
+    self.is_new_place = False
+    return found
+
+
 _NO_SEARCH = (
     _attribute(ScanMatcher, "_search", lambda *a: None),
     _attribute(registration, "_BASIN", math.inf),
@@ -162,6 +168,7 @@ PATCHES: Mapping[str, Patch] = {
     "ways by wheels alone": _attribute(OpenWay, "cov", lambda self, step: np.zeros((3, 3))),
     "moving objects left out": _attribute(MovingObjects, "apply", lambda self, step: step),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
+    "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
     "loop closures": _attribute(LoopDetector, "detect", lambda self, cell, poses, marginal: None),
