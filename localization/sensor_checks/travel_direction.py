@@ -88,7 +88,8 @@ def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
     """Direction of the LiDAR's travel against the wheels', by their motions (n, 3) in bins; None where it is not known.
 
     Least squares of lidar_k = alpha wheels_k + beta turn_k, ways as complex numbers: the angle of alpha is the direction, beta what the
-    robot slides in turns [m/rad], which is 0 +- `_SLIDE_M_PER_RAD` a priori: along one arc a slide looks like another direction.
+    robot slides in turns [m/rad], which is 0 +- `_SLIDE_M_PER_RAD` a priori: along one arc a slide looks like another direction, and so
+    do wheels that spin. Where beta is beyond two sigmas, or alpha is no length that a direction has, there is none.
     """
     n, angle, sigma = _mean_direction(wheels, lidar)
     return Direction(angle, float(stdtrit(n - 2, _CONFIDENCE)) * sigma) if n else None
@@ -96,7 +97,7 @@ def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
 
 @kernel
 def _mean_direction(wheels: FloatArray, lidar: FloatArray) -> tuple[int, float, float]:
-    """Number of bins that count, 0 where these are too few; angle of alpha, and its standard error [rad]."""
+    """Number of bins that count, 0 where there is no direction; angle of alpha, and its standard error [rad]."""
     n, ww, wt, tt, wz, tz = 0, 0.0, 0j, (_NOISE_M / _SLIDE_M_PER_RAD) ** 2, 0j, 0j
     w, z, t = np.empty(len(wheels), np.complex128), np.empty(len(wheels), np.complex128), np.empty(len(wheels))
     for i in range(len(wheels)):
@@ -110,6 +111,8 @@ def _mean_direction(wheels: FloatArray, lidar: FloatArray) -> tuple[int, float, 
         return 0, 0.0, 0.0
     determinant = ww * tt - abs(wt) ** 2
     alpha, beta = (tt * wz - wt * tz) / determinant, (ww * tz - wt.conjugate() * wz) / determinant
+    if abs(beta) > 2.0 * _SLIDE_M_PER_RAD or not 1.0 <= _MAX_LENGTH_RATIO * abs(alpha) <= _MAX_LENGTH_RATIO**2:
+        return 0, 0.0, 0.0
     square = 0.0
     for k in range(n):
         square += abs(z[k] - alpha * w[k] - beta * t[k]) ** 2
