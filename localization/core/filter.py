@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from filterpy.kalman import predict
 
-from localization.core.state import Group, Layout, State
+from localization.core.state import Group, Layout, Perturbation, State
 from localization.errors import EstimatorError
 from motion_models.se2 import FloatArray
 
@@ -93,7 +93,7 @@ def propagate(state: State, transition: Transition) -> State:
 def update(state: State, measurement: Measurement, considered: Collection[str] = ()) -> tuple[State, Innovation]:
     """The state after ``measurement``, and the innovation. Raises `EstimatorError` for numbers that would spoil the state for good.
 
-        S = H P H^T + R      K = P H^T S^-1      e = K residual      P' = (I - K H) P (I - K H)^T + K R K^T
+        S = H P H^T + R      K = P H^T S^-1      d = K residual      P' = G [(I - K H) P (I - K H)^T + K R K^T] G^T
 
     ``considered`` variables keep their means: their rows of K are zero, and their covariance and correlations count (Schmidt 1966,
     consider states). Joseph's form is the covariance for any gain, and each row of K has an aim of its own: K_i = P_i H^T S^-1 minimises
@@ -102,6 +102,8 @@ def update(state: State, measurement: Measurement, considered: Collection[str] =
     Of a measurement that is `Measurement.relative`, of a variable a against a considered b, the rows of a minimise the covariance of the
     difference: E |e_a - e_b - K y|^2 is least at K = (P_a - P_b) H^T S^-1, the difference of both optimal gains. With its own optimal gain,
     a pose that is better known than the submap around it would stay off the submap, and later scans be matched from a wide prior.
+
+    G turns the error of the submap with the pose that d has moved (`_reset_jacobian`).
     """
     P, R, residual, rows = state.P, measurement.R, measurement.residual, state.layout.rows
     H = np.zeros((len(residual), len(P)))
@@ -116,10 +118,12 @@ def update(state: State, measurement: Measurement, considered: Collection[str] =
     for name in considered:
         K[rows[name]] = 0.0
     A = np.eye(len(P)) - K @ H
-    P = A @ P @ A.T + K @ R @ K.T
+    means = _retract(state, K @ residual, considered)
+    G = _reset_jacobian(state, means)
+    P = G @ (A @ P @ A.T + K @ R @ K.T) @ G.T
     P = 0.5 * (P + P.T)
     _check(measurement.what, P)
-    return State(state.layout, _retract(state, K @ residual, considered), P), Innovation(residual, S, H, K)
+    return State(state.layout, means, P), Innovation(residual, S, H, K)
 
 
 def _retract(state: State, error: FloatArray, considered: Collection[str]) -> dict[str, FloatArray]:
@@ -129,6 +133,23 @@ def _retract(state: State, error: FloatArray, considered: Collection[str]) -> di
         if name not in considered:
             means[name] = group.retract(means[name], error[state.layout.rows[name]])
     return means
+
+
+def _reset_jacobian(state: State, means: Mapping[str, FloatArray]) -> FloatArray:
+    """G (n, n) of the errors about ``means``, which an update has moved by d, by those about the former means (Solà 2017, sec. 6.3).
+
+    The true pose is mean exp(e_map) exp(e), to first order e_pose = e_map + e: the submap around the robot is off by e_map, and the pose by
+    e against that. Noise of a scan is a perturbation of the pose that it measures, where the new mean is: e keeps its covariance. Of a
+    former error e_map the new mean, mean exp(d), has exp(-d) exp(e_map) exp(d) = exp(Ad(exp(-d)) e_map): it keeps its direction in the
+    world. Solà's right Jacobian, I - 1/2 ad(d), is for e_map and d that are Gaussian together, as if they had grown at the same time.
+    """
+    G, rows, groups = np.eye(len(state.P)), state.layout.rows, state.layout.groups
+    for name, group in groups.items():
+        if isinstance(group, Perturbation) and means[group.of] is not state[group.of]:
+            pose = groups[group.of]
+            A = pose.adjoint(pose.compose(pose.inverse(means[group.of]), state[group.of]))
+            G[rows[name], rows[name]], G[rows[group.of], rows[name]] = A, A - np.eye(group.dim)
+    return G
 
 
 def clone(state: State, source: str, name: str) -> State:

@@ -16,7 +16,7 @@ import numpy as np
 
 from localization.bounded_settings import Settings
 from localization.core.filter import Transition
-from localization.core.state import SE2, Group, Layout, State, Vector
+from localization.core.state import SE2, Group, Layout, Perturbation, State, Vector
 from localization.events import Step
 from motion_models import se2
 from motion_models.base import Motion
@@ -47,7 +47,7 @@ def initial_state(gyro: GyroNoise, corrections: Corrections, config: FilterConfi
     priors: dict[str, tuple[Group, FloatArray]] = {
         "pose": (SE2, np.zeros((3, 3))),
         "start": (SE2, np.zeros((3, 3))),
-        "map": (Vector(3), np.zeros((3, 3))),
+        "map": (Perturbation(3, "pose"), np.zeros((3, 3))),
         "key": (SE2, np.zeros((3, 3))),
         "gyro_bias": (one, unknown + gyro.bias_sigma_rad_per_s**2),
         "gyro_scale": (one, unknown + gyro.scale_sigma**2),

@@ -15,7 +15,7 @@ import numpy as np
 
 from localization.bounded_settings import Settings, at_least
 from localization.core.filter import Measurement, Transition
-from localization.core.state import Layout, State, Vector
+from localization.core.state import Group, Layout, Perturbation, State, Vector
 from localization.events import BodyTurn, Gravity, Step
 from motion_models import se3
 from motion_models.robot import GyroNoise
@@ -60,9 +60,8 @@ class SpaceConfig(Settings):
 
 def initial_space_state(gyro: GyroNoise, bias_sigma: float, config: SpaceConfig) -> State:
     """At the origin of the odometry frame, level within 10 degrees; ``bias_sigma`` of the gyro's axes across the vertical [rad/s]."""
-    layout = Layout(
-        {"pose": SE3, "start": SE3, "map": Vector(6), "gyro_bias": Vector(3), "gyro_scale": Vector(1), "accelerometer": Vector(3)}
-    )
+    groups: dict[str, Group] = {"pose": SE3, "start": SE3, "map": Perturbation(6, "pose"), "gyro_bias": Vector(3)}
+    layout = Layout({**groups, "gyro_scale": Vector(1), "accelerometer": Vector(3)})
     n = sum(group.dim for group in layout.groups.values())
     P = np.zeros((n, n))
     P[3, 3] = P[4, 4] = _FIRST_TILT_SIGMA**2

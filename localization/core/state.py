@@ -86,6 +86,14 @@ class Vector:
         return np.eye(self.dim)
 
 
+@dataclass(frozen=True)
+class Perturbation(Vector):
+    """Error of what a pose is measured against, as a right perturbation of that pose, whose own error contains it."""
+
+    of: str
+    """Name of the pose."""
+
+
 SE2 = PlanarPose()
 
 

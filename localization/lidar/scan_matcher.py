@@ -193,7 +193,7 @@ class ScanMatcher:
         return KeyScanError(share, key_scan_noise(noise, new))
 
     def _fitting_keys(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> list[KeyScan]:
-        """The key scans that stay beside a new one: the last ones, and older ones from which the drift is below the noise of a range.
+        """The key scans that stay beside a new one: the last ones, and older ones from which the drift is within two sigmas of a range's.
 
         These thicken no surface; the drift does not grow where the robot comes back to them.
         """
@@ -201,7 +201,7 @@ class ScanMatcher:
         recent = self._keys[max(len(self._keys) - n, 0) :]
         if map_cov is None:
             return recent
-        range_m, limit = float(np.median(np.hypot(points[:, 0], points[:, 1]))), self._config.range_noise_m**2
+        range_m, limit = float(np.median(np.hypot(points[:, 0], points[:, 1]))), (2.0 * self._config.range_noise_m) ** 2
         older = [key for key in self._keys[: len(self._keys) - len(recent)] if key.drift_variance(pose, map_cov, range_m) < limit]
         return [*older[-_MAX_OLD_SUBMAPS * self._config.key_scans :], *recent]
 

@@ -252,8 +252,10 @@ def test_update_turn_equals_scalar_kalman_filter():
     K = (P @ H.T)[:, 0] / S
     K[CONSIDERED] = 0.0
     A = np.eye(SIZE) - np.outer(K, H)
-    nis = ekf.update_turn(turn)
-    np.testing.assert_allclose(ekf.P, A @ P @ A.T + 1e-6 * np.outer(K, K), rtol=1e-7, atol=1e-14)
+    turned, nis = np.array(ekf["pose"]), ekf.update_turn(turn)
+    turned, G = se2.between(ekf["pose"], turned), np.eye(SIZE)
+    G[MAP, MAP], G[POSE, MAP] = se2.adjoint(turned), se2.adjoint(turned) - np.eye(3)  # the submap's error stays where it is in the world
+    np.testing.assert_allclose(ekf.P, G @ (A @ P @ A.T + 1e-6 * np.outer(K, K)) @ G.T, rtol=1e-7, atol=1e-14)
     assert ekf.state.number("gyro_bias") == pytest.approx(K[BIAS] * 0.001)
     assert ekf.state.number("gyro_scale") == pytest.approx(K[SCALE] * 0.001)
     assert nis == pytest.approx(0.001**2 / S)
