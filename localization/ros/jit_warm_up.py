@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import threading
 from collections.abc import Iterator
@@ -9,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from localization.estimators import Estimate
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
 from localization.ros.publisher import Predictor
@@ -25,8 +27,8 @@ _PUSH = np.array([0.6, 0.4, 0.2])
 _GRAVITY = np.array([-2.0, 0.0, 9.6])
 """On a slope [m/s^2]: what models it is compiled, too."""
 _PERIOD_NS, _EVENTS, _EVENTS_PER_SCAN = 20_000_000, 180, 5
-_STANDING, _PUSHED_AT = 15, 110
-"""Events up to the first motion, and up to the push: a key scan and its search grid are there by then."""
+_EVENTS_BY_WHEELS, _STANDING, _PUSHED_AT = 60, 15, 110
+"""Events of odometry by wheels alone; up to the first motion; and up to the push: a key scan and its search grid are there by then."""
 
 
 class WarmUp:
@@ -70,6 +72,7 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
         model = arms_model(run.robot.arms, run.robot.folder)
         model.estimate(np.zeros_like(model.chain.lower))
     predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s)
+    _predict_alone(Predictor(trial.model, run.robot, run.config.step.max_hold_s))
     for event in synthetic_drive(is_planar):
         predictor.insert(event)
         for estimate in pipeline.process(event):
@@ -79,6 +82,15 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
     pipeline.estimator.map_points()
     pipeline.estimator.occupancy()
     pipeline.finish()
+
+
+def _predict_alone(predictor: Predictor) -> None:
+    """What odometry by wheels needs comes first: it does not wait for the estimator."""
+    for event in itertools.islice(synthetic_drive(is_planar=True), _EVENTS_BY_WHEELS):
+        if predictor.insert(event):
+            predictor.predict()
+        elif isinstance(event, WheelSample):
+            predictor.reset(Estimate(event.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
 
 
 def synthetic_drive(is_planar: bool) -> Iterator[Event]:
