@@ -13,7 +13,7 @@
 #
 # The robot is simulated by the physics of its tyres. Its file does not hold that this floor grips 30 % more sideways, nor that its centre
 # of gravity lies 3 cm farther ahead than it was weighed. It drives squares and turns on the spot at their corners; before each lap the
-# arms move on to the next of three postures. The LiDAR sees 61 beams, five times a second; it is the same for all models.
+# arms move on to the next of three postures. The LiDAR has 61 beams, five times a second; it is the same for all models.
 
 # %%
 import math

@@ -30,7 +30,7 @@ CERTAINLY_FREE = 0.125
 0.3 of the points of a right place in free space (ACES, halves); with four, 0.13."""
 _MARGIN_BLOCKS = 1
 """Positions that are searched around free space, in blocks of `COARSE` cells: 0.4 m. At the border of a map the robot stands where no beam
-has passed twice, and sees mapped walls all the same: 22 of 263 such keyframes in halves of fr079, and one of them farther outside."""
+has passed twice, and measures mapped walls all the same: 22 of 263 such keyframes in halves of fr079, and one of them farther outside."""
 _FREE_BORDER_CELLS = 2
 """Points in free space contradict a tracked place from so many cells inside it: 0.2 m. Walls that a map has from afar alone, by slanting
 beams, are free cells in part: in a corridor of ACES that the map had from its end, 0.29 of the points of the right place lay in such."""

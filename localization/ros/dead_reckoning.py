@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-import numpy as np
-
 from localization.estimators import Estimate
 from localization.events import WheelSample
 from localization.ros.discovery import MAX_BACKLOG
@@ -34,7 +32,7 @@ class DeadReckoning:
             is_due = self._predictor.insert(event)
             if isinstance(event, WheelSample) and not self._has_begun:
                 self._has_begun = True
-                self._predictor.reset(Estimate(event.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
+                self._predictor.begin(event.stamp_ns)
             elif is_due and (estimate := self._predictor.predict()) is not None:
                 self._predictor.reset(estimate, None, 0.0)
                 newest = estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False)

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators import Estimate
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
 from localization.ros.publisher import Predictor
@@ -90,7 +89,7 @@ def _predict_alone(predictor: Predictor) -> None:
         if predictor.insert(event):
             predictor.predict()
         elif isinstance(event, WheelSample):
-            predictor.reset(Estimate(event.stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
+            predictor.begin(event.stamp_ns)
 
 
 def synthetic_drive(is_planar: bool) -> Iterator[Event]:

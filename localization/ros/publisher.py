@@ -240,6 +240,10 @@ class Predictor:
         self._params = self._model.nominal if params is None else params
         self._clock_offset_ns = round(clock_offset_s / _NS)
 
+    def begin(self, stamp_ns: int) -> None:
+        """Predict from the origin on, where the robot is at ``stamp_ns``, with the nominal parameters."""
+        self.reset(Estimate(stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
+
     def stop(self) -> None:
         """Predict nothing until the next estimate."""
         self._last = None

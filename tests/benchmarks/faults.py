@@ -126,7 +126,7 @@ _WITHOUT = {
     "encoders": _no_check("Standstill"),
     "LiDAR upside down": _no_fault_of_turns(turn_rates.LIDAR_OPPOSITE),
     "LiDAR yaw": _no_check("TravelDirection"),
-    "LiDAR sees the robot": _no_check("OwnBody"),
+    "beams on the robot": _no_check("OwnBody"),
 }
 """What is left out for the faults whose names begin so."""
 

@@ -134,7 +134,7 @@ def named_faults(axis: int = 2) -> dict[str, EventFault]:
         "LiDAR upside down": change_scans(lambda scan, begin_ns: replace(scan, points=scan.points * (1.0, -1.0, 1.0))),
         "LiDAR yaw 25 deg": turn_scans(25.0),
         "LiDAR yaw 90 deg": turn_scans(90.0),
-        "LiDAR sees the robot": change_scans(lambda scan, begin_ns: _cover(scan)),
+        "beams on the robot": change_scans(lambda scan, begin_ns: _cover(scan)),
     }
 
 
