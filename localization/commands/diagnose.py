@@ -99,12 +99,14 @@ class Diagnose:
         check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
         model = make_model(self.model or default_model(robot), robot)
+        is_table = self.source.suffix.lower() == ".csv"
+        reader = None if is_table else Reader(lambda robot: self._open(self.source, robot), self._cut)
         with console.status("reading"):
-            drive = self._drive(robot)
+            drive = self._drive(robot, reader)
         baseline = None
         if self.healthy is not None:
             with console.status("reading the healthy drive"):
-                baseline = estimate_baseline(self._drive_of_log(self.healthy, robot), model)
+                baseline = estimate_baseline(self._cut(self._open(self.healthy, robot)), model)
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
             found = self._with_suited_model(found, drive)
@@ -113,11 +115,11 @@ class Diagnose:
         extended = None
         if self.extend:
             with console.status("searching for terms"):
-                extended = extend(found, drive, model, self.config, self._reader)
+                extended = extend(found, drive, model, self.config, reader)
                 found = extended.found
         if self.out is not None and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):
-                found = self._with_written_robot(found)
+                found = self._with_written_robot(found, reader)
         content = found.diagnosis.to_dict()
         if extended is not None:
             content["extension"] = None if extended.extension is None else extended.extension.to_dict()
@@ -135,12 +137,12 @@ class Diagnose:
             print_handover(console, corrected, manual_steps, shares)
             console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
 
-    def _drive(self, robot: Robot) -> Drive:
+    def _drive(self, robot: Robot, reader: Reader | None) -> Drive:
         name = self.source.name
-        if self.source.suffix.lower() != ".csv":
+        if reader is not None:
             if self.healthy is not None and self.reference is not None and self.reference.endswith(".tum"):
                 raise CalibrationError(f"--reference {self.reference} is of {name} alone: with --healthy name a topic that both logs have.")
-            return self._drive_of_log(self.source, robot)
+            return reader.drive(robot)
         if self.healthy is not None:
             raise CalibrationError(f"{name} is a table: --healthy takes the log of another drive to compare a log with.")
         given = (self.reference, self.reference_sigma, self.antenna)
@@ -159,20 +161,12 @@ class Diagnose:
         found = drive_of_table(name, robot, maneuvers, "windows")
         return dataclasses.replace(found, warnings=(*notes, *found.warnings))
 
-    def _log(self, robot: Robot) -> Log:
-        return open_wired(self.source, robot, self.topic.scored_against(self.reference))
+    def _open(self, path: Path, robot: Robot) -> Log:
+        return open_wired(path, robot, self.topic.scored_against(self.reference))
 
-    def _drive_of_log(self, path: Path, robot: Robot) -> Drive:
-        log = open_wired(path, robot, self.topic.scored_against(self.reference))
+    def _cut(self, log: Log) -> Drive:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
-
-    @property
-    def _reader(self) -> Reader | None:
-        """How the log is read with another robot; None for a table."""
-        if self.source.suffix.lower() == ".csv":
-            return None
-        return Reader(lambda robot: self._drive_of_log(self.source, robot), self._log)
 
     def _with_suited_model(self, found: DiagnosisResult, drive: Drive) -> DiagnosisResult:
         """``found`` with what the model that suits the robot would find, where a simpler one was chosen and differs from the drive."""
@@ -184,14 +178,14 @@ class Diagnose:
         note = f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}."
         return dataclasses.replace(found, diagnosis=dataclasses.replace(d, warnings=(note, *d.warnings)))
 
-    def _with_written_robot(self, found: DiagnosisResult) -> DiagnosisResult:
+    def _with_written_robot(self, found: DiagnosisResult, reader: Reader | None) -> DiagnosisResult:
         """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""
         d = found.diagnosis
-        if d.handover is None or found.predictor is None or found.linearization is None or self._reader is None:
+        if d.handover is None or found.predictor is None or found.linearization is None or reader is None:
             return found
         named = d.handover.corrected if d.handover.is_better else [f.definition.key for f in correctable_findings(d)]
         try:
-            handover = check_findings(found.predictor, found.linearization, named, self._reader)
+            handover = check_findings(found.predictor, found.linearization, named, reader)
         except SkidlocError as error:  # a robot that no command runs with keeps its old values
             note = f"the corrected robot cannot be replayed: {error}"
             handover = dataclasses.replace(d.handover, gain=Interval(0.0, 0.0, 0.0))

@@ -49,10 +49,24 @@ _SENSOR_FIELDS = (
 class Reader:
     """How the diagnosed log is read with a robot: its drive, and its events."""
 
-    drive: Callable[[Robot], Drive]
-    log: Callable[[Robot], Log]
+    open: Callable[[Robot], Log]
+    """The log as a robot reads it, with its wiring checked."""
+    cut: Callable[[Log], Drive]
+    """A log's windows."""
+    _logs: dict[int, tuple[Robot, Log]] = dataclasses.field(default_factory=dict, init=False, repr=False)
+    """By robot; with the robot, so that its identity stays its own."""
     _replayed: dict[tuple[int, str, int], tuple[Robot, list[Run]]] = dataclasses.field(default_factory=dict, init=False, repr=False)
-    """Runs by robot, model and start; with the robot, so that its identity stays its own."""
+    """Runs by robot, model and start; with the robot as above."""
+
+    def log(self, robot: Robot) -> Log:
+        """The log by ``robot``; opened and checked once."""
+        if id(robot) not in self._logs:
+            self._logs[id(robot)] = robot, self.open(robot)
+        return self._logs[id(robot)][1]
+
+    def drive(self, robot: Robot) -> Drive:
+        """The windows of the log by ``robot``."""
+        return self.cut(self.log(robot))
 
     def runs(self, robot: Robot, model: str, start_ns: int) -> list[Run]:
         """The log from ``start_ns`` on by ``robot`` and this model, by each of `_ESTIMATORS`; replayed once."""
