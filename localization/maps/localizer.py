@@ -18,7 +18,17 @@ from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanob
 from localization.lidar.scan_matcher import MIN_POINTS
 from localization.maps.background_search import BackgroundSearch
 from localization.maps.grid import Grid
-from localization.maps.place_probability import MAX_SEARCH_ODDS, SEARCH_WEIGHTS, Hypothesis, Weights, log_odds, sigmoid, weigh, with_fix
+from localization.maps.place_probability import (
+    MAX_SEARCH_ODDS,
+    NEAR_WEIGHTS,
+    SEARCH_WEIGHTS,
+    Hypothesis,
+    Weights,
+    log_odds,
+    sigmoid,
+    weigh,
+    with_fix,
+)
 from localization.maps.place_search import CELL_M, OPEN_INFORMATION, Place, PlaceMap
 from localization.maps.position_plane import PositionFix
 from localization.maps.recent_scans import Motion, RecentScans
@@ -189,10 +199,12 @@ class Localizer:
 
     def _track(self, points: Points2) -> None:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
-        place, cov = self._align(points), self._cov
-        if place is not None:
-            self.is_outside = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
-        if place is None or self.is_outside:
+        likely, cov = self._align(points), self._cov
+        place = likely or self.places.align(points, self.pose, cov)
+        self.is_outside = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
+        if likely is None:
+            self._is_doubtful |= place.contradicting >= _CONTRADICTING_SHARE
+        if likely is None or self.is_outside:
             return
         evidence = self._evidence(place, cov)
         if evidence < -_TRACK_GAIN:  # the odometry may be an outlier, as by slip in a turn
@@ -235,10 +247,12 @@ class Localizer:
             return self.places.align(points, self.pose, self._cov)
         joined = self._recent.joined(_JOINED_M, _TRACKED_SCANS)
         found = self.places.search(joined, self.pose, _three_sigma(self._cov))
-        return found[0] if found and weigh(found, len(joined), self._weights, is_narrowed=True)[0].probability >= LIKELY else None
+        return found[0] if found and weigh(found, len(joined), NEAR_WEIGHTS, is_narrowed=True)[0].probability >= LIKELY else None
 
     def _reckon(self) -> None:
         """The pose is too wide to align scans: search about it, or everywhere where it is wider than that."""
+        if self._is_tracking:
+            self.hypotheses, self._search_odds = (), -MAX_SEARCH_ODDS
         self._is_tracking, self._is_reckoned = False, True
         is_near = np.trace(self._cov[:2, :2]) < _NEAR_M**2 and self._cov[2, 2] < _NEAR_RAD**2
         self.state = "searching" if is_near else "lost"

@@ -31,6 +31,9 @@ _WIDE_M, _WIDE_RAD = 0.02, 0.01
 0.08 rad in turns of 25 degrees (fr079)."""
 _BASIN_M, _BASIN_RAD = 0.4, 0.3
 """Sigma of the odometry up to which it is: alignments converge from about there."""
+_LEAST_COV = np.diag([1e-3, 1e-3, 1e-4]) ** 2
+"""Covariance of any motion at least [m^2, m^2, rad^2]: a robot that stands in a bare corridor may be pushed along it, and in no other
+direction, so that its covariance alone has no inverse."""
 _LEAST_OVERLAP = 0.6
 """Share of a scan's points on those before, from which on it is aligned."""
 _NEW_VIEW_M = 2.0 / math.pi
@@ -106,7 +109,7 @@ class RecentScans:
         return np.vstack([se2.transform(se2.between(pose, key.pose), key.points) for key in list(self._keys)[-n:]])
 
     def _aligned(self, motion: Motion, points: Points2) -> Motion:
-        delta, cov = motion
+        delta, cov = motion.delta, motion.cov + _LEAST_COV
         is_wide = np.trace(cov[:2, :2]) > _WIDE_M**2 or cov[2, 2] > _WIDE_RAD**2
         is_near = np.trace(cov[:2, :2]) < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2
         if not (is_wide and is_near) or not self._keys or len(points) < MIN_POINTS:

@@ -56,3 +56,12 @@ def test_recent_scans_of_a_carried_robot_are_forgotten() -> None:
     _, _, recent = driven(1)
     recent.move(Motion(np.zeros(3), np.diag([3.0, 3.0, math.pi]) ** 2), np.empty((0, 2)))
     assert not len(recent)
+
+
+def test_motion_that_is_uncertain_along_one_axis_alone_is_aligned() -> None:
+    """A robot that stands, and may be pushed along a corridor only."""
+    _, _, recent = driven(1)
+    motion = recent.move(Motion(np.zeros(3), np.diag([0.16, 0.0, 0.0]) ** 2), floor_plan.scan(OFFICE, WAY[-1], noise=0.02, seed=1))
+    assert len(recent) == 12
+    assert math.sqrt(motion.cov[0, 0]) < 0.02
+    assert math.hypot(motion.delta[0], motion.delta[1]) < 0.02
