@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -104,6 +104,17 @@ class SlopeWeighing(NamedTuple):
     given_mu: float
 
 
+class Nuisance(NamedTuple):
+    """What else could turn the robot as a load does, as it was estimated with the CG."""
+
+    size: float
+    sigma: float
+    prior_sigma: float
+    """How far robots, floors and mounts differ from their files."""
+    unit: str
+    """Of all three; "1" for a share."""
+
+
 @dataclass(frozen=True)
 class DrivenWeighing:
     """Centre of gravity by a drive, and the load that would explain how far it is from where the robot file has it."""
@@ -124,8 +135,8 @@ class DrivenWeighing:
     """By the robot file."""
     noise_ratio: float
     """Noise of the drive over that of the motion reference by its own covariance."""
-    corrections: Mapping[str, tuple[float, float]]
-    """What else was estimated with the CG: size and sigma by cause."""
+    corrections: Mapping[str, Nuisance]
+    """What else was estimated with the CG, by the label of its cause."""
     model_errors: tuple[str, ...] = ()
     """Why the friction model does not describe this drive, in sentences; the covariance has the errors of such models in it."""
     warnings: tuple[str, ...] = ()
@@ -186,7 +197,7 @@ class DrivenWeighing:
             "p_value": self.p_value,
             "noise_over_reference": self.noise_ratio,
             "model_errors": list(self.model_errors),
-            "corrections": {name: {"size": size, "sigma": sigma} for name, (size, sigma) in self.corrections.items()},
+            "corrections": {name: {"size": one.size, "sigma": one.sigma} for name, one in self.corrections.items()},
             "notes": list(self.warnings),
             "slope": None if self.slope is None else self.slope._asdict(),
         }
@@ -214,12 +225,16 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
         covariance=cov[:2, :2] * _student_factor(estimate.linearization) + np.diag(systematic),
         mass_kg=robot.geometry.mass_kg,
         noise_ratio=ratio,
-        corrections={c.key: (float(v), math.sqrt(s)) for c, v, s in zip(causes[2:], values[2:], np.diagonal(cov)[2:], strict=True)},
+        corrections=_nuisances(causes[2:], values[2:], np.sqrt(np.diagonal(cov)[2:])),
         model_errors=model_errors,
         warnings=(*model_errors, *drive.warnings),
         slope=_slope_weighing(robot, estimate, bool(model_errors)),
     )
     return found, predictor
+
+
+def _nuisances(causes: Sequence[Cause], sizes: FloatArray, sigmas: FloatArray) -> dict[str, Nuisance]:
+    return {c.label: Nuisance(float(v), float(s), c.prior_sigma, c.unit) for c, v, s in zip(causes, sizes, sigmas, strict=True)}
 
 
 def _slope_weighing(robot: Robot, estimate: MapEstimate, has_model_errors: bool) -> SlopeWeighing | None:

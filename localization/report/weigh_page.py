@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from localization.diagnosis.causes import CAUSES
-from localization.diagnosis.weigh import PRIOR_SIGMAS, DrivenWeighing
+from localization.diagnosis.weigh import DrivenWeighing, Nuisance
 from localization.report import page as html
 from localization.report.charts import Chart, Series
 from localization.report.figures import Figure as Canvas
@@ -134,14 +133,11 @@ def _table(found: DrivenWeighing, at: tuple[float, float] | None) -> html.Table:
     return html.Table([html.Cell(title) for title in titles], [[html.Cell(text) for text in row.texts] for row in weigh_rows(found, at)])
 
 
-def _corrections(corrections: Mapping[str, tuple[float, float]]) -> list[html.Table | html.Paragraph]:
+def _corrections(corrections: Mapping[str, Nuisance]) -> list[html.Table | html.Paragraph]:
     """What else could turn the robot in the same way: size, sigma, and its share of what robots differ by."""
     rows = []
-    for name, (size, sigma) in corrections.items():
-        prior = PRIOR_SIGMAS.get(name)
-        in_prior = "" if prior is None else f"{size / prior:+.1f}"
-        unit = CAUSES[name].unit if name in CAUSES else "1"
-        cells = (f"{size:+.3g}", f"{sigma:.2g}", "" if unit == "1" else unit, in_prior)
+    for name, one in corrections.items():
+        cells = (f"{one.size:+.3g}", f"{one.sigma:.2g}", "" if one.unit == "1" else one.unit, f"{one.size / one.prior_sigma:+.1f}")
         rows.append([html.Cell(name, is_code=True), *map(html.Cell, cells)])
     if not rows:
         return []

@@ -12,7 +12,7 @@ import pytest
 
 from localization.comparison.comparison_page import comparison_page
 from localization.comparison.statistics import find
-from localization.diagnosis.weigh import DrivenWeighing
+from localization.diagnosis.weigh import DrivenWeighing, Nuisance
 from localization.report.charts import Chart, Series
 from localization.report.page import Cell, Page, Section, Table, render
 from localization.report.weigh_page import confidence_ellipse, weigh_page
@@ -101,7 +101,9 @@ def test_confidence_ellipse_holds_its_share_of_a_gaussian():
 def test_weigh_page_shows_the_ellipse_and_the_load():
     robot = load_robot("husky_a200")
     offset, cov = np.array([0.036, 0.0004]), np.diag([0.001, 0.003]) ** 2
-    found = DrivenWeighing("<a>.bag", "husky_a200", "scans", 28, 49.0, np.zeros(2), offset, cov, 46.0, 1.0, {"scrub": (0.01, 0.002)})
+    found = DrivenWeighing(
+        "<a>.bag", "husky_a200", "scans", 28, 49.0, np.zeros(2), offset, cov, 46.0, 1.0, {"scrub": Nuisance(0.01, 0.002, 0.01, "m")}
+    )
     made = weigh_page("The centre of gravity is there.", found, robot.geometry, (0.3, 0.0))
     text = made
     assert "&lt;a&gt;.bag" in text
