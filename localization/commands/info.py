@@ -63,7 +63,7 @@ def _print(console: Console, info: LogInfo) -> None:
         values = list(mount.values())
         at = ", ".join(f"{value:.3f}" for value in values[:3])
         turned = ", ".join(f"{math.degrees(value):.1f}" for value in values[3:])
-        console.print(f"mount of {frame}: [{at}] m, roll, pitch and yaw [{turned}] deg", markup=False)
+        console.print(f"mount of {frame}: [{at}] m, roll, pitch and yaw [{turned}] deg", markup=False, soft_wrap=True)
     console.print(f"tilt of the ground: {info.tilt}", markup=False, soft_wrap=True)
     for problem in info.problems:
         console.print(f"[yellow]![/] {escape(problem)}", soft_wrap=True)
