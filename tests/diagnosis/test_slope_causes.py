@@ -43,6 +43,16 @@ def test_weigh_on_a_slope_gives_height_of_the_cg_and_mu():
 
 
 @pytest.mark.extended
+def test_weigh_on_a_slope_in_mujoco_gives_height_and_mu():
+    """Coulomb's friction of rigid bodies, which the friction model does not describe."""
+    pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
+    case = run_case(33, "mujoco")
+    assert case.found.model_errors
+    assert np.abs(case.errors).max() < 0.1
+    assert np.abs(case.z).max() < 3.5
+
+
+@pytest.mark.extended
 @pytest.mark.parametrize(("slope_deg", "causes"), [(7.0, {"slope"}), (0.0, set())], ids=["slope", "level"])
 def test_diagnose_names_a_slope_without_imu(slope_deg, causes):
     robot = load_robot("husky_a200")

@@ -98,12 +98,11 @@ def test_weigh_robot_with_casters_is_refused(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize(("robot", "x", "y"), [("jackal", 0.015, -0.02), ("husky_a200", 0.04, 0.03)], ids=["jackal", "husky_a200"])
-def test_weigh_on_other_contacts_widens_interval_and_says_why(robot: str, x: float, y: float) -> None:
+def test_weigh_on_other_contacts_widens_interval_and_says_why() -> None:
     """MuJoCo's contacts turn a robot otherwise than the friction model: corrections absorb the load, and noise is hardly more."""
     pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
-    found = weigh_simulated(robot, {"cg_offset_x": x, "cg_offset_y": y}, 422, "mujoco")
-    assert np.all(np.abs(found.offset - [x, y]) < 2.0 * found.sigmas)
+    found = weigh_simulated("husky_a200", {"cg_offset_x": 0.04, "cg_offset_y": 0.03}, 422, "mujoco")
+    assert np.all(np.abs(found.offset - [0.04, 0.03]) < 2.0 * found.sigmas)
     assert found.model_errors
     assert "that of the robot file" not in describe(found, None)
 

@@ -17,12 +17,11 @@ from motion_models.robot import Mount, Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.helpers.hills import HillDrive, gradient, terrain
+from tests.helpers.mujoco_vehicle import CONE, CONTACT, FLATTENING
 
 _STEP_S, _IMU_EVERY, _WHEELS_EVERY, _GROUND_EVERY = 0.001, 10, 20, 2
 _FIELD_M = 40.0
 _WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, -1.0))
-_CONTACT = 'solref="0.01 1" solimp="0.05 0.05 0.001" solreffriction="0.016 1"'
-_FLATTENING = 0.0034
 _RAMP_RAD_PER_S2 = 8.0
 _K = 0.55
 _GYRO_SIGMA, _FORCE_SIGMA, _BIAS = 0.01, 0.1, (0.002, -0.003, 0.0002)
@@ -143,7 +142,7 @@ def _xml(robot: Robot, mu: float) -> str:
     chassis = mass - 4.0 * wheel_mass
     height = (g.cg_height_m - radius) * mass / chassis
     inertia = mass * (g.track_width_m**2 + g.wheelbase_m**2) / 12.0
-    own = radius * (1.0 + _FLATTENING)
+    own = radius * (1.0 + FLATTENING)
     floor = "".join(
         f'<body name="ground_{n}" mocap="true"><geom name="ground_{n}" type="plane" size="100 100 1" contype="0"/></body>'
         for n, _, _ in _WHEELS
@@ -154,11 +153,11 @@ def _xml(robot: Robot, mu: float) -> str:
         f'<geom name="{name}" type="ellipsoid" size="{own} {0.25 * radius} {own}" mass="{wheel_mass}" contype="0"/></body>'
         for name, x, y in _WHEELS
     )
-    pairs = "".join(f'<pair geom1="ground_{n}" geom2="{n}" condim="3" friction="{mu} {mu} 0 0 0" {_CONTACT}/>' for n, _, _ in _WHEELS)
+    pairs = "".join(f'<pair geom1="ground_{n}" geom2="{n}" condim="3" friction="{mu} {mu} 0 0 0" {CONTACT}/>' for n, _, _ in _WHEELS)
     servos = "".join(f'<velocity joint="{n}" kv="{20.0 * mass * 9.81 * radius}"/>' for n, _, _ in _WHEELS)
     return f"""
 <mujoco>
- <option timestep="{_STEP_S}" integrator="implicitfast" cone="elliptic"/>
+ <option timestep="{_STEP_S}" integrator="implicitfast" {CONE}/>
  <worldbody>{floor}
   <body name="base" pos="0 0 {radius}"><freejoint/>
    <inertial pos="0 0 {height}" mass="{chassis}" diaginertia="{0.6 * inertia} {0.8 * inertia} {inertia}"/>
