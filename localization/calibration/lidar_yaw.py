@@ -1,7 +1,8 @@
-"""Yaw of a LiDAR's mount against the direction in which the wheels drive, before a log is replayed.
+"""Mount and clock of a LiDAR against wheels and gyro, before a log is replayed.
 
 A turned LiDAR travels in another direction than the wheels, and turns alike; wheels that count backwards turn the other way as well. That
-decides between the two. Healthy mounts are recognised after a metre of driving.
+decides between the two. Healthy mounts are recognised after a metre of driving. One that turns opposite to wheels and gyro is upside down,
+and one that turns as they do, but later, has another clock; with a gyro the drive is read until it has turned.
 """
 
 from __future__ import annotations
@@ -10,15 +11,19 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
-from localization.events import Event, Scan, WheelSample
+from localization.calibration.lidar_turns import GyroHeading, LidarTurns, compare_turns
+from localization.calibration.wheel_units import CORRECTED
+from localization.calibration.wheel_wiring import WiringReport, open_checked
+from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.lidar import LidarConfig
-from localization.logs import Log
+from localization.logs import Log, TopicOverrides, open_log
 from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models import se2
-from motion_models.robot import Mount, Robot
+from motion_models.robot import Clock, Mount, Robot
 from motion_models.se2 import FloatArray, Pose2
 
 _INTERVAL_S = 0.5
@@ -40,7 +45,7 @@ _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
 
 @dataclass(frozen=True)
 class LidarYaw:
-    """A LiDAR whose yaw is wrong."""
+    """A LiDAR whose mount or clock is wrong."""
 
     text: str
     """What was found, in a sentence."""
@@ -49,6 +54,8 @@ class LidarYaw:
     """The mount that is used in place of the log's; None where other causes are as likely."""
     is_certain: bool = False
     """More driving would not change it."""
+    clock: Clock | None = None
+    """The clocks that are used in place of the robot file's, where the LiDAR's is wrong."""
 
 
 @dataclass
@@ -65,9 +72,11 @@ class _Travel:
 class LidarYawCheck:
     """`add` the events of a drive until `is_done`; then `result` is what they show."""
 
-    def __init__(self, mounts: Mapping[str, Mount], robot: Robot, topic: str) -> None:
-        """``topic``: of the scans, for the sentence."""
-        self._mounts, self._radius_m, self._topic = mounts, robot.geometry.wheel_radius_m, topic
+    def __init__(self, mounts: Mapping[str, Mount], robot: Robot, topic: str, has_gyro: bool = False) -> None:
+        """``topic``: of the scans, for the sentence. ``has_gyro``: one whose turns are to be compared as well."""
+        self._mounts, self._robot, self._topic = mounts, robot, topic
+        self._radius_m = robot.geometry.wheel_radius_m
+        self._gyro = GyroHeading(mounts) if has_gyro else None
         self._wheels: list[WheelSample] = []
         self._travels: dict[str, _Travel] = defaultdict(_Travel)
         self._config = LidarConfig()
@@ -87,6 +96,8 @@ class LidarYawCheck:
         """Take the next event."""
         if isinstance(event, WheelSample):
             self._add_wheels(event)
+        elif isinstance(event, ImuSample) and self._gyro is not None:
+            self._gyro.add(event)
         elif isinstance(event, Scan) and self.has_moved:
             self._scans += 1
             travel = self._travels[event.frame_id]
@@ -119,7 +130,15 @@ class LidarYawCheck:
 
     def _is_healthy(self, frame: str) -> bool:
         direction = _direction(*self._compare(frame)[:2])
-        return direction is not None and abs(direction) <= _MAX_SLIDE_RAD
+        is_known = self._gyro is None or self._by_turns(frame) is not None
+        return direction is not None and abs(direction) <= _MAX_SLIDE_RAD and is_known
+
+    def _by_turns(self, frame: str) -> LidarTurns | None:
+        """Against wheels and gyro; None for too few turns."""
+        if self._gyro is None or len(self._wheels) < 2:
+            return None
+        t, ways = _ways(self._wheels, self._radius_m)
+        return compare_turns(self._travels[frame].rows, (t, ways[:, 1] - ways[:, 0]), self._gyro, self._wheels[0].stamp_ns)
 
     def _is_contradicted(self, frame: str) -> bool:
         by_wheels, by_scans, _ = self._compare(frame)
@@ -145,14 +164,16 @@ class LidarYawCheck:
         return np.array(by_wheels), np.array(by_scans), np.array(turns).reshape(-1, 2)
 
     def _judge(self, frame: str) -> LidarYaw | None:
-        mount = self._mounts[frame]
+        mount, by_turns = self._mounts[frame], self._by_turns(frame)
         by_wheels, by_scans, turns = self._compare(frame)
         direction = _direction(by_wheels, by_scans)
+        if by_turns is not None and by_turns.late_s:
+            return self._other_clock(frame, by_turns.late_s)
+        if by_turns is not None and by_turns.is_opposite:
+            return None if direction is None else self._upside_down(frame, direction)
         if direction is None or abs(direction) <= _MAX_SLIDE_RAD:
             return None
-        quarter = round(direction / (0.5 * math.pi)) * 0.5 * math.pi
-        is_quarter = abs(direction - quarter) <= _SNAP_RAD
-        direction = quarter if is_quarter else direction
+        direction, is_quarter = _snapped(direction)
         yaw = math.remainder(mount.yaw - direction, math.tau)
         side = "backwards" if abs(abs(direction) - math.pi) < _SNAP_RAD else f"{abs(math.degrees(direction)):.0f} deg to the "
         side += "" if side == "backwards" else "left" if direction > 0.0 else "right"
@@ -172,17 +193,67 @@ class LidarYawCheck:
         )
         return LidarYaw(text, frame, replace(mount, yaw=yaw), is_certain=is_quarter and likeness is not None)
 
+    def _upside_down(self, frame: str, direction: float) -> LidarYaw:
+        """``direction``: of its travel, by the mount that is assumed: a mirrored sensor's is the sum of the two yaws."""
+        mount, (direction, _) = self._mounts[frame], _snapped(direction)
+        yaw = math.remainder(direction - mount.yaw, math.tau)
+        right = replace(mount, roll=math.remainder(mount.roll + math.pi, math.tau), yaw=yaw)
+        text = (
+            f"{self._topic}: by its scans the robot turns opposite to wheels and gyro, which agree: '{frame}' is mounted upside down"
+            f" against its transform. Corrected in this run; write roll = {right.roll:.4f}, yaw = {yaw:.4f} rad in /tf_static, or in"
+            f" [mounts.{frame}] where the log has none."
+        )
+        return LidarYaw(text, frame, right, is_certain=True)
+
+    def _other_clock(self, frame: str, late_s: float) -> LidarYaw:
+        value = round(self._robot.clock.lidar_time_offset_s + late_s, 2)
+        way = "later" if late_s > 0.0 else "earlier"
+        text = (
+            f"{self._topic} measures the turns of wheels and gyro, which agree, {abs(late_s):.2f} s {way} by its stamps:"
+            f" the clocks of two computers, or stamps of arrival. {CORRECTED} clock.lidar_time_offset_s = {value:g}, or"
+            " synchronize the clocks."
+        )
+        return LidarYaw(text, frame, None, is_certain=True, clock=replace(self._robot.clock, lidar_time_offset_s=value))
+
 
 def check_lidar_yaw(log: Log) -> LidarYaw | None:
     """Compare the first minute of driving; None where the mount agrees, or the drive does not show it."""
     if log.sources.lidar is None or log.sources.wheels is None or log.wheels_error is not None:
         return None
-    check = LidarYawCheck(log.mounts, log.robot, log.sources.lidar.topic)
+    check = LidarYawCheck(log.mounts, log.robot, log.sources.lidar.topic, has_gyro=log.sources.imu is not None)
     for event in log.events():
         check.add(event)
         if check.is_done:
             break
     return check.result()
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedLog:
+    """A log whose wheels, gyro and LiDAR were compared, with what is certain corrected."""
+
+    log: Log
+    wiring: WiringReport
+    mounts: Mapping[str, Mount]
+    """By frame."""
+    lidar: tuple[LidarYaw, ...] = ()
+    """What is wrong with the LiDAR; the sentences are in `Log.warnings` as well."""
+
+
+def open_log_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> CheckedLog:  # noqa: B008
+    """`open_checked`, and the LiDAR's mount and clock after that. Raises what that does."""
+    log, wiring = open_checked(path, robot, topics)
+    if wiring.is_ambiguous:
+        return CheckedLog(log, wiring, log.mounts)
+    found = check_lidar_yaw(log)
+    of_clock: tuple[LidarYaw, ...] = ()
+    if found is not None and found.clock is not None:
+        log, of_clock = open_log(path, replace(log.robot, clock=found.clock), topics), (found,)
+        log.add_notes(wiring.findings)
+        found = check_lidar_yaw(log)
+    lidar = (*of_clock, *(() if found is None else (found,)))
+    log.add_notes(one.text for one in lidar)
+    return CheckedLog(log, wiring, corrected(log.mounts, found), lidar)
 
 
 def _has_moved(first: WheelSample, now: WheelSample) -> bool:
@@ -219,6 +290,13 @@ def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
     if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < _MIN_COHERENCE * size:
         return None
     return float(np.angle(product.sum()))
+
+
+def _snapped(direction: float) -> tuple[float, bool]:
+    """The quarter turn that ``direction`` [rad] is near, and True; else it, and False."""
+    quarter = round(direction / (0.5 * math.pi)) * 0.5 * math.pi
+    is_quarter = abs(direction - quarter) <= _SNAP_RAD
+    return (quarter if is_quarter else direction), is_quarter
 
 
 def _likeness(turns: FloatArray) -> float | None:

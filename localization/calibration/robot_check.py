@@ -12,13 +12,13 @@ from typing import Literal
 import numpy as np
 
 from localization.calibration.dead_reckoning import dead_reckon, forward_rate
-from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
+from localization.calibration.lidar_yaw import CheckedLog, open_log_checked
 from localization.calibration.log_survey import survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
 from localization.calibration.robot_setup import draft_robot, finish_robot
 from localization.calibration.wheel_signals import LidarMotion, WheelSignals, lidar_motion, read_signals
 from localization.calibration.wheel_units import CORRECTED, expected_scaling
-from localization.calibration.wheel_wiring import WiringReport, open_checked
+from localization.calibration.wheel_wiring import WiringReport
 from localization.errors import LogError
 from localization.evaluation.reference_check import compare_reference
 from localization.evaluation.reference_files import load_reference
@@ -121,17 +121,19 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     if robot is None:
         assert draft is not None
         robot = _drafted(draft, given, path)
-    log, wiring = open_checked(path, robot, given.topics)
+    checked_log = open_log_checked(path, robot, given.topics)
+    log, wiring = checked_log.log, checked_log.wiring
     if log.sources.wheels is None:
         raise log.wheels_error or LogError(f"{path.name} has {log.no_wheels or 'no wheels by these options.'} Record one of them.")
     info = inspect_log(log)
     signals = read_signals(log)
-    rows, mounts = [*_topic_rows(info), *_stamp_rows(info)], dict(log.mounts)
+    rows = [*_topic_rows(info), *_stamp_rows(info)]
     motion = None if signals is None else lidar_motion(log, signals)
-    rows += _wiring_rows(wiring, {} if signals is None else _by_lidar(log, signals, motion))
+    by_lidar = {} if signals is None or checked_log.lidar else _by_lidar(log, signals, motion)
+    rows += _wiring_rows(wiring, by_lidar)
     if signals is not None:
-        rows += [*_scale_rows(log, wiring, signals, motion), *_lidar_rows(log, signals, motion, mounts)]
-    run = _replayed(log, mounts, "ekf", signals)
+        rows += [*_scale_rows(log, wiring, signals, motion), *_lidar_rows(checked_log, signals, motion)]
+    run = _replayed(log, checked_log.mounts, "ekf", signals)
     rows += [
         *_filter_rows(log, run),
         *_imu_rows(log),
@@ -182,7 +184,13 @@ def _first_minute(log: Log, start_ns: int) -> Iterator[Event]:
 
 def _topic_rows(info: LogInfo) -> list[CheckRow]:
     rates = {topic.topic: topic.rate_hz for topic in info.topics}
-    chosen = {"option": "given", "robot": "named in the robot file", "only": "the only one of its type", "arms": "the arms' joints"}
+    chosen = {
+        "option": "given",
+        "robot": "named in the robot file",
+        "only": "the only one of its type",
+        "arms": "the arms' joints",
+        "names": "the wheels' by its name",
+    }
     rows = []
     for role in ("wheels", "lidar", "imu"):
         used, name = info.parts[role], {"wheels": "wheels", "lidar": "LiDAR", "imu": "IMU"}[role]
@@ -285,28 +293,34 @@ def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: L
     return [CheckRow("wheel radius", f"{radius:.4g} m", f"{radius * ratio:.4g} m, {name}", verdict, advice)]
 
 
-def _lidar_rows(log: Log, signals: WheelSignals, motion: LidarMotion | None, mounts: dict[str, Mount]) -> list[CheckRow]:
-    """Yaw of the LiDAR by the direction of travel; ``mounts`` are corrected, so that what follows is not blamed on other sensors."""
+def _lidar_rows(checked: CheckedLog, signals: WheelSignals, motion: LidarMotion | None) -> list[CheckRow]:
+    """Mount of the LiDAR by the direction of travel and the turns, and its clock."""
+    log = checked.log
     if log.sources.lidar is None:
         return []
     name, frame = "mount of LiDAR", log.frames.get(log.sources.lidar.topic, "")
+    rows = [
+        CheckRow("clock of LiDAR", "as in the robot file", "wheels and gyro", "contradiction", found.text.replace(CORRECTED, _IN_FILE))
+        for found in checked.lidar
+        if found.clock is not None
+    ]
     mount = log.mounts.get(frame)
     if mount is None:
-        return [CheckRow(name, f"frame '{frame}' unknown", "", "cannot be seen", f"publish it on /tf_static, or write [mounts.{frame}].")]
+        unknown = CheckRow(name, f"frame '{frame}' unknown", "", "cannot be seen", f"publish it on /tf_static, or write [mounts.{frame}].")
+        return [*rows, unknown]
     value = f"{frame}: yaw {math.degrees(mount.yaw):.0f} deg"
     forward = forward_rate(log, signals)
     direction = None if motion is None else _direction(motion, forward)
-    yaw = check_lidar_yaw(log)
-    if direction is None and yaw is None:
-        return [CheckRow(name, value, "", "cannot be seen", "drive straight on for 10 s where walls are in reach.")]
+    wrong = next((found for found in checked.lidar if found.clock is None), None)
+    if direction is None and wrong is None:
+        return [*rows, CheckRow(name, value, "", "cannot be seen", "drive straight on for 10 s where walls are in reach.")]
     degrees = 0.0 if direction is None else math.degrees(direction)
     side = "left" if degrees > 0.0 else "right"
     second = f"travel is {abs(degrees):.0f} deg to the {side} of it" if abs(degrees) >= 1.0 else "travel agrees"
-    if yaw is not None:
-        mounts.update(corrected(log.mounts, yaw))
-        return [CheckRow(name, value, second, "contradiction", yaw.text)]
+    if wrong is not None:
+        return [*rows, CheckRow(name, value, second, "contradiction", wrong.text)]
     advice = "" if abs(degrees) <= _MAX_YAW_DEG else f"if the robot did not slide, turn its yaw by {-degrees:+.0f} deg."
-    return [CheckRow(name, value, second, "contradiction" if advice else "ok", advice)]
+    return [*rows, CheckRow(name, value, second, "contradiction" if advice else "ok", advice)]
 
 
 def _direction(motion: LidarMotion, forward: FloatArray) -> float | None:

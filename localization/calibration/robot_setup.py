@@ -153,7 +153,8 @@ def _choose_topics(draft: Draft, survey: Survey, given: TopicOverrides) -> None:
         )
         draft.missing.append(f"wheels: the log has neither joint states nor the driver's odometry{why}. Record one of them.")
     if not {"scan", "points"} & draft.topics.keys():
-        draft.missing.append("LiDAR: none in the log; without it or a gyro nothing measures slip.")
+        alone = "the gyro alone measures slip, of turns." if "imu" in draft.topics else "without it or a gyro nothing measures slip."
+        draft.missing.append(f"LiDAR: none in the log; {alone}")
     if "imu" not in draft.topics:
         draft.missing.append("IMU: none in the log; its yaw rate makes turns better.")
 

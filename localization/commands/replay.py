@@ -18,8 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
-from localization.calibration.wheel_wiring import open_checked
+from localization.calibration.lidar_yaw import open_log_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError, MapError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator
@@ -113,11 +112,9 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json, self.save_map, self.extend_map)
-        log, wiring = open_checked(self.log, robot, self.topic.scored_against(self.reference))
-        robot = log.robot
+        checked = open_log_checked(self.log, robot, self.topic.scored_against(self.reference))
+        log, robot, mounts = checked.log, checked.log.robot, checked.mounts
         has_lidar = log.sources.lidar is not None
-        yaw = None if wiring.is_ambiguous else check_lidar_yaw(log)
-        mounts = corrected(log.mounts, yaw)
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")
         pairs = self._trials(log, models, check_forms(forms))
@@ -150,7 +147,6 @@ class Replay:
                     [
                         *prior_notes(robot, [m.name for m in models]),
                         *held_out,
-                        *([] if yaw is None else [yaw.text]),
                         *log.warnings(),
                         *warnings_of(found),
                         *_in_space_notes(found),

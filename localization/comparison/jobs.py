@@ -19,7 +19,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-from localization.calibration.wheel_wiring import open_checked
+from localization.calibration.lidar_yaw import open_log_checked
 from localization.comparison.remote import AccessError, is_url, local_copy, url_fingerprint
 from localization.comparison.turning import MeanCg, turning
 from localization.errors import EvaluationError, LogError, OutputError, TransportError
@@ -148,7 +148,8 @@ def _failed(job: Job, trial: TrialSpec, reason: str, cause: str = INPUT) -> Row:
 
 
 def _run(job: Job, path: Path) -> list[Row]:
-    log, _ = open_checked(path, job.robot, job.topics.scored_against(job.reference))
+    checked = open_log_checked(path, job.robot, job.topics.scored_against(job.reference))
+    log = checked.log
     has_lidar = log.sources.lidar is not None
     rows, able = [], []
     for trial in job.trials:
@@ -162,7 +163,7 @@ def _run(job: Job, path: Path) -> list[Row]:
     reference = _reference(log, job)
     named = [Trial(make_model(trial.model, log.robot), trial.estimator, trial.corrections) for trial in able]
     cg = MeanCg(log.robot.center_of_gravity)
-    runs = replay(cg.watch(log.events()), named, log.robot, log.mounts, has_lidar, job.config)
+    runs = replay(cg.watch(log.events()), named, log.robot, checked.mounts, has_lidar, job.config)
     problems = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
     date, has_time, _ = describe_instant(log.start_ns).partition("T")
     day = {"day": job.place.day or (date if has_time else "")}

@@ -32,9 +32,10 @@ _MAX_OFFSET_S = 40.0
 _MIN_OVERLAP_S, _MIN_OVERLAP_SHARE = 20.0, 0.5
 _ALIKE = 0.9
 """Correlation from which on chords need not be longer."""
-_SAME_RUN = 0.8
-"""Correlation without an offset from where on a reference is of the same run, where the drive is too short to be sure: another run of the
-same robot on the same way has 0.4 to 0.94, the same run 0.99, or 0.93 where wheels slip and the reference is coarse."""
+_SAME_RUN = 0.9
+"""Correlation without an offset, and without the positions' noise, from where on a reference is of the same run, where the drive is too
+short to be sure: another run of the same robot on the same way has 0.4 to 0.94, the same run 0.99, or 0.93 where wheels slip and the
+reference is coarse."""
 _MIRRORED = -0.35
 """Correlation of turns of opposite sign; GPS of 2 m noise has +0.44 in a healthy log."""
 _MIN_OFFSET_S = 0.3
@@ -96,6 +97,8 @@ class ReferenceComparison:
     """Length of the reference's chords over the sensors'."""
     sigmas: float
     """Significance of ``likeness``."""
+    most: float
+    """Correlation of equal motions that the noise of the positions leaves, 0 to 1."""
     bend: float | None
     """Correlation of the turns of the path, -1 to 1; None where it hardly turns."""
     turn: float | None
@@ -105,7 +108,7 @@ class ReferenceComparison:
         """What contradicts the sensors, of a reference of this ``name``; its clock only where it ``has_times`` of its own."""
         found = []
         if self.sigmas < _MIN_SIGMAS:
-            if self.unshifted >= _SAME_RUN:
+            if self.unshifted >= _SAME_RUN * self.most:
                 return ()
             return (
                 f"{name}: its motion is not that of the robot's sensors (correlation {self.unshifted:.2f}), at no offset of the clocks"
@@ -182,6 +185,7 @@ def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) 
         float(scores[n_offset]),
         scale,
         math.atanh(min(float(scores[best]), 0.999999)) * math.sqrt(max(n_independent - 3.0, 0.0)),
+        1.0 / math.sqrt(1.0 + 2.0 * (noise / spread) ** 2),
         _correlation(sensors.bends, part.bends) if bends else None,
         _correlation(sensors.turns, part.turns) if turns and part.turns is not None and sensors.turns is not None else None,
     )

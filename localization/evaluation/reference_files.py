@@ -135,7 +135,7 @@ def _of_poses(found: _Poses, path: Path, log_stamps: LogStamps | None) -> Refere
     stamps = found.stamps_ns
     if stamps is None:
         stamps = _spread_stamps(len(found.positions), log_stamps, path)
-        warnings.append(f"{path} has no times: its {len(stamps)} poses are spread over the log's scans, which may be seconds off.")
+        warnings.append(f"{path} has no times: its {len(stamps)} poses are spread over the log's time, which may be seconds off.")
     xy, yaws = found.positions[:, :2], found.yaws
     turns = None if found.quaternions is None or not found.quaternions.any() else found.quaternions
     if turns is not None:

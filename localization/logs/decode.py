@@ -54,6 +54,7 @@ class Oddity(Enum):
     WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
     SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
     FROZEN_WHEEL = "with an angle that never changes while another wheel of its side turns; it was left out (check its encoder)"
+    CONSTANT_ANGLES = "with wheel angles that never change while the rates do; the increments were taken from the rates"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
     def sentence(self, topic: str, n: int) -> str:

@@ -63,6 +63,8 @@ _VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
 brake at up to 3 m/s^2."""
 _FROZEN_AFTER_RAD = 0.5
 """Turned by another wheel of the same side; these are coupled by a chain or by the ground."""
+_NO_ANGLES_AFTER_RAD = 0.1
+"""Turned by the rates alone, from where on angles that never changed are none: above encoders' steps and the rates' noise at standstill."""
 
 
 class TopicDecoder(NamedTuple):
@@ -303,6 +305,7 @@ class JointsToWheels:
         self._rates = PublisherSeparator()
         self._turned = np.zeros(len(self._names))  # by each joint so far [rad]
         self._is_working = np.ones(len(self._names), dtype=bool)
+        self._by_rates, self._last_ns = np.zeros(len(self._names)), 0  # turned while no angle has changed [rad]
         self.angle_period = math.tau
         """After which angles wrap [rad]."""
 
@@ -317,6 +320,10 @@ class JointsToWheels:
             velocity = np.where(np.abs(velocity) * self._radius > _MAX_SPEED_M_S, np.nan, velocity)
         if not has_angles:
             yield from self._convert_rates(reading.stamp_ns, velocity)
+            return
+        if self._has_constant_angles(reading, velocity):
+            self._stats.count(self._topic, Oddity.CONSTANT_ANGLES)
+            yield WheelSample(reading.stamp_ns, self._side_means(velocity), np.full(2, np.nan))
             return
         publisher = self._publisher
         if publisher is None:
@@ -341,6 +348,16 @@ class JointsToWheels:
             publisher = self._publisher = self._accumulate(publisher, reading, step)
         self._find_frozen(publisher)
         yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(publisher.angle))
+
+    def _has_constant_angles(self, reading: JointReading, velocity: FloatArray) -> bool:
+        """Whether no angle has changed yet, though the wheels have turned by their rates."""
+        publisher = self._publisher
+        if publisher is None or self._turned.any() or (reading.position != publisher.reading.position).any():
+            return False
+        passed_s = (reading.stamp_ns - max(self._last_ns, publisher.reading.stamp_ns)) * 1e-9
+        self._by_rates += np.nan_to_num(velocity) * min(max(passed_s, 0.0), _MAX_PUBLISHER_GAP_NS * 1e-9)
+        self._last_ns = reading.stamp_ns
+        return bool(np.abs(self._by_rates).max() > _NO_ANGLES_AFTER_RAD)
 
     def _convert_rates(self, stamp_ns: int, velocity: FloatArray) -> Iterator[WheelSample]:
         """A reading without angles, unless it is of a second publisher."""

@@ -7,16 +7,23 @@ from collections.abc import Iterable
 
 _OTHER_ESTIMATE = re.compile(
     r"truth|reference|mocap|vicon|optitrack|vrpn|qualisys|motive"  # measured from outside
-    r"|filter|fused|ekf|ukf|kalman|gps|gnss|rtk|navsat|slam|icp|lidar|laser|visual|vio(?!l)|vslam|amcl|map(?!p)|rtab|camera|zed|t265",
+    r"|filter|fused|ekf|ukf|kalman|gps|gnss|rtk|navsat|slam|icp|lidar|laser|visual|vio(?!l)|vslam|amcl|map(?!p)|rtab|camera|zed|t265"
+    r"|kiss|loam|cartographer|(?<![a-z])[a-z]{0,5}_?lio(?![a-z])",  # odometry of scans by the names of its programs
     re.IGNORECASE,
 )
 _FILTER = re.compile(r"filter|fused|ekf|ukf|kalman", re.IGNORECASE)
+_BY_WHEELS = re.compile(r"wheel|encoder|diff_?drive|base_controller|velocity_controller|motor|chassis", re.IGNORECASE)
 _MEASURED_OUTSIDE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack|vrpn|qualisys", re.IGNORECASE)
 
 
 def is_other_estimate(topic: str) -> bool:
     """Whether an Odometry is by its name no driver's: ground truth, mocap, GPS, SLAM, or a filter's."""
     return bool(_OTHER_ESTIMATE.search(topic))
+
+
+def is_by_wheels(topic: str) -> bool:
+    """Whether an Odometry is by its name made of the wheels."""
+    return bool(_BY_WHEELS.search(topic)) and not is_other_estimate(topic)
 
 
 def is_filter(topic: str) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from localization.errors import TopicError
 from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
-from localization.logs.topic_names import find_in_namespace, is_filter, is_other_estimate
+from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.cg_model import CgModel
 from motion_models.center_of_gravity.files import arms_model
@@ -63,7 +63,8 @@ class TopicSource:
     kind: str
     """Its entry in [topics] of the robot file, which sets the message type (`TYPES`)."""
     chosen_by: str
-    """"option", "robot", "only" (the only one of its type in the log) or "points" (by names and places of several)."""
+    """"option", "robot", "only" (the only one of its type in the log), "names" (of several the wheels' by its name) or "points" (by names
+    and places of several)."""
     type: str = ""
     """Message type, where it is another than that of ``kind``."""
 
@@ -136,6 +137,11 @@ class TopicChooser:
         if topic is not None and len(topics) > 1:
             self.warnings.append(f"{topic} is used as {kind.replace('_', ' ')}: it is {wanted} in a namespace.")
             return TopicSource(topic, kind, "robot")
+        by_wheels = [topic for topic in topics if is_by_wheels(topic)] if kind == "odometry" else []
+        if len(by_wheels) == 1 and len(topics) > 1:
+            others = ", ".join(other for other in topics if other != by_wheels[0])
+            self.warnings.append(f"{by_wheels[0]} is used as odometry: of it and {others} it is by its name the wheels'.")
+            return TopicSource(by_wheels[0], kind, "names")
         if len(topics) > 1:
             option = f"--topic.{kind.replace('_', '-')}"
             self.warnings.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
@@ -153,6 +159,9 @@ class TopicChooser:
         if wanted.joint_states == "" or wanted.odometry == "":
             return ""
         found = f"no wheels: neither joint states ({topics.joint_states}) nor the driver's odometry ({topics.odometry}) are in {self._log}."
+        several = self.candidates("odometry") if wanted.odometry is None else []
+        if len(several) > 1:
+            return f"{found} {', '.join(several)} could each be it: name the wheels' with --topic.odometry."
         return f"{found}{self.describe_other_odometry()}"
 
     def describe_other_odometry(self) -> str:
@@ -286,7 +295,7 @@ class _RoleChooser:
         return named if named is not None else self._warn_default(self._chooser.find_only(kind))
 
     def _warn_default(self, source: TopicSource | None) -> TopicSource | None:
-        if source is not None:
+        if source is not None and source.chosen_by == "only":
             wanted = getattr(self._robot.topics, source.kind)
             part = source.kind.replace("_", " ")
             self._warnings.append(

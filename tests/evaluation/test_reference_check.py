@@ -85,6 +85,17 @@ def test_reference_of_another_run_is_named(has_yaws):
     assert "another run" in _sentence(_reference(drive=_drive(seed=8), has_yaws=has_yaws))
 
 
+@pytest.mark.parametrize("noise_m", [0.0, 0.02])
+def test_reference_of_the_same_maneuvers_on_another_day_is_named(noise_m):
+    """Half a minute, whose maneuvers last for other times by a tenth: their correlation is .8."""
+    paces = np.cumsum(np.repeat(np.random.default_rng(2).uniform(0.8, 1.25, 60), 10))
+    short = Trajectory(DRIVE.stamps_ns[:600], DRIVE.poses[:600])
+    other = replace(short, poses=DRIVE.at(DRIVE.stamps_ns[0] + (5e7 * paces).astype(np.int64)))
+    assert reference_contradictions([short], _reference(drive=short, noise_m=noise_m)) == ()
+    (found,) = reference_contradictions([short], _reference(drive=other, noise_m=noise_m))
+    assert "another run" in found
+
+
 def test_reference_check_counts_the_run_that_agrees_best():
     wrong = replace(DRIVE, poses=_drive(seed=8).poses)
     assert reference_contradictions([wrong, DRIVE], _reference()) == ()

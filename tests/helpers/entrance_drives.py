@@ -130,6 +130,11 @@ class Publishing:
 
 def write(path: Path, vehicle: Vehicle, motion: Motion, how: Publishing) -> Path:
     """The log of a ``motion`` at ``path`` (.mcap)."""
+    return bags.write_mcap(path, records_of(vehicle, motion, how))
+
+
+def records_of(vehicle: Vehicle, motion: Motion, how: Publishing) -> list[Record]:
+    """The messages of a ``motion``, by time of recording."""
     found = [*_wheels(vehicle, motion, how), *_imu(vehicle, motion, how), *_scans(vehicle, motion, how), *_reference(motion, how)]
     records: list[Record] = [("/tf_static", _mounts(how), START)]
     for topic, rows in _by_topic(found, how).items():
@@ -138,7 +143,16 @@ def write(path: Path, vehicle: Vehicle, motion: Motion, how: Publishing) -> Path
             records.append((topic, rows[0][1](START - round(age * S)), START + S // 1000))
         records += [(topic, make(START + round((t + offset) * S)), START + round((t + 0.012) * S)) for t, make in rows]
     records.sort(key=lambda record: record[2])
-    return bags.write_mcap(path, records)
+    return records
+
+
+def with_times(message: Any, change: Callable[[int], int]) -> Any:
+    """``message`` with the stamp of its header, or of its transforms, changed [ns]."""
+    parts = [part.header for part in message.transforms] if hasattr(message, "transforms") else [message.header]
+    for header in parts:
+        new = change(header.stamp.sec * S + header.stamp.nanosec)
+        header.stamp = bags.header(new).stamp
+    return message
 
 
 Row = tuple[str, float, Callable[[int], Any]]

@@ -167,6 +167,22 @@ def test_encoder_reset_is_no_second_publisher(tmp_path: Path) -> None:
     assert "/joint_states: 1 message with a wheel angle that wheels cannot reach" in warnings_of(log)
 
 
+def test_encoder_angles_that_never_change_give_way_to_rates(tmp_path: Path) -> None:
+    records = drive(10.0)
+    messages = [message for topic, message, _ in records if topic == "/joint_states"]
+    angles = np.array([message.position for message in messages])
+    for message, rates in zip(messages, np.gradient(angles, 0.02, axis=0), strict=True):
+        message.position, message.velocity = np.zeros(4), rates
+    log = opened(tmp_path, records)
+    found = wheels_of(log)
+    unknown = np.array([not np.isfinite(sample.position).any() for sample in found])
+    assert not unknown[0]
+    assert unknown[-1]
+    turned = sum(0.02 * sample.velocity.mean() for sample, is_unknown in zip(found, unknown, strict=True) if is_unknown)
+    assert turned == pytest.approx((angles[-1] - angles[0]).mean(), abs=0.3)
+    assert "wheel angles that never change while the rates do" in warnings_of(log)
+
+
 # LiDAR stamps that jump by less than the second that latencies may have
 
 

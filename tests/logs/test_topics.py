@@ -221,7 +221,16 @@ def test_reference_topic_missing_or_of_wrong_type_is_refused(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     "topic",
-    ["/gazebo/ground_truth", "/vrpn_client/robot/odom", "/mocap/odom", "/odometry/filtered", "/odometry/gps", "/amcl_odom", "/truth/odom"],
+    [
+        "/gazebo/ground_truth",
+        "/kiss/odometry",
+        "/vrpn_client/robot/odom",
+        "/mocap/odom",
+        "/odometry/filtered",
+        "/odometry/gps",
+        "/amcl_odom",
+        "/truth/odom",
+    ],
 )
 def test_topic_odometry_of_another_estimate_is_never_wheels(tmp_path: Path, topic: str) -> None:
     log = log_of(tmp_path, {topic: "odom", "/scan": "scan"})
@@ -230,6 +239,19 @@ def test_topic_odometry_of_another_estimate_is_never_wheels(tmp_path: Path, topi
     assert f"{topic} is a reference or another estimate by its name" in log.no_wheels
     (tmp_path / "named").mkdir()
     assert log_of(tmp_path / "named", {topic: "odom"}, TopicOverrides(odometry=topic)).no_wheels == ""
+
+
+@pytest.mark.parametrize("other", ["/kiss/odometry", "/base/odometry"])
+def test_topic_odometry_of_several_is_the_wheels_by_its_name(tmp_path: Path, other: str) -> None:
+    log = log_of(tmp_path, {"/wheel_odom": "odom", other: "odom"})
+    assert log.sources.wheels is not None
+    assert log.sources.wheels.topic == "/wheel_odom"
+    assert any(note.startswith("/wheel_odom is used as odometry") for note in log.warnings())
+
+
+def test_topic_odometry_of_several_is_asked_for(tmp_path: Path) -> None:
+    found = log_of(tmp_path, {"/base/odometry": "odom", "/other/odometry": "odom"}).no_wheels
+    assert found.endswith("/base/odometry, /other/odometry could each be it: name the wheels' with --topic.odometry.")
 
 
 def test_topic_joint_states_without_wheels_name_the_reference(tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+"""Turns by scans against those by wheels and gyro: a LiDAR upside down, or with another clock than both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.events import ImuSample
+from motion_models.robot import Mount
+from motion_models.se2 import FloatArray, Pose2
+
+_MIN_INTERVALS, _MIN_TURN_RAD = 12, 1.5
+"""Intervals, and turns in all, that are compared."""
+_SURE_LIKENESS = 0.95
+"""Correlation about zero of turns that are the same motion; healthy logs have more, slipping wheels too."""
+_MAX_LATE_S, _MIN_LATE_S, _STEP_S = 1.5, 0.15, 0.01
+"""Largest offset that is searched, the smallest that is named (drivers have latencies of up to 0.1 s, which the filter estimates), and the
+step [s]. Clocks that are further apart are set by the times of recording."""
+_CLEARER = 3.0
+"""How many times nearer to 1 the correlation with an offset is than that without."""
+
+
+class LidarTurns(NamedTuple):
+    """What the turns of a LiDAR show against wheels and gyro, which agree."""
+
+    is_opposite: bool = False
+    """It turns the other way."""
+    late_s: float = 0.0
+    """By how much its stamps are late [s]; 0 where no offset is clear."""
+
+
+class GyroHeading:
+    """Heading by the samples of one IMU."""
+
+    def __init__(self, mounts: Mapping[str, Mount]) -> None:
+        self._mounts = mounts
+        self._frame: str | None = None
+        self._up = np.array([0.0, 0.0, 1.0])
+        self._stamps: list[int] = []
+        self._rates: list[float] = []
+
+    def add(self, sample: ImuSample) -> None:
+        """Take the next sample; those of other frames than the first's are left out."""
+        if self._frame is None:
+            self._frame = sample.frame_id
+            self._up = self._mounts.get(sample.frame_id, Mount()).rotation()[2]
+        if sample.frame_id == self._frame:
+            self._stamps.append(sample.stamp_ns)
+            self._rates.append(float(self._up @ sample.angular_velocity))
+
+    def at(self, seconds: FloatArray, origin_ns: int) -> FloatArray:
+        """Heading (N,) [rad] at ``seconds`` (N,) after ``origin_ns``, from zero at the first sample; NaN outside of the samples."""
+        if len(self._stamps) < 2:
+            return np.full(len(seconds), np.nan)
+        t, rates = np.array([stamp - origin_ns for stamp in self._stamps]) * 1e-9, np.array(self._rates)
+        headings = np.r_[0.0, np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t))]
+        return np.interp(seconds, t, headings, left=np.nan, right=np.nan)
+
+
+def compare_turns(
+    rows: Sequence[tuple[int, int, Pose2]], wheels: tuple[FloatArray, FloatArray], gyro: GyroHeading, origin_ns: int
+) -> LidarTurns | None:
+    """``rows``: begin and end [ns] of intervals and the motion (3,) by scans. ``wheels``: times (n,) [s] after ``origin_ns`` and right less
+    left way (n,) [m]. None for too few turns; nothing is shown where wheels and gyro do not agree."""
+    edges = np.array([[begin - origin_ns, end - origin_ns] for begin, end, _ in rows]).reshape(-1, 2) * 1e-9
+    scans = np.array([delta[2] for _, _, delta in rows])
+    by_wheels = np.diff(np.interp(edges, *wheels, left=np.nan, right=np.nan), axis=1)[:, 0]
+    by_gyro = _turns(gyro, edges, 0.0, origin_ns)
+    known = np.isfinite(by_wheels) & np.isfinite(by_gyro)
+    if known.sum() < _MIN_INTERVALS or np.abs(by_gyro[known]).sum() < _MIN_TURN_RAD:
+        return None
+    if _likeness(by_wheels, by_gyro) < _SURE_LIKENESS:
+        return LidarTurns()
+    offsets = np.arange(-round(_MAX_LATE_S / _STEP_S), round(_MAX_LATE_S / _STEP_S) + 1) * _STEP_S
+    found = np.array([_likeness(_turns(gyro, edges, late, origin_ns), scans) for late in offsets])
+    best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])
+    is_clear = 1.0 - abs(at_zero) > _CLEARER * (1.0 - abs(found[best]))
+    late = float(offsets[best])
+    if abs(found[best]) < _SURE_LIKENESS or not is_clear or abs(late) < _MIN_LATE_S:
+        return LidarTurns(at_zero < -_SURE_LIKENESS)
+    return LidarTurns(bool(found[best] < 0.0), round(late, 2))
+
+
+def _turns(gyro: GyroHeading, edges: NDArray[np.float64], late_s: float, origin_ns: int) -> FloatArray:
+    """(N,) over ``edges`` (N, 2) of stamps that are late."""
+    return np.asarray(np.diff(gyro.at((edges - late_s).ravel(), origin_ns).reshape(-1, 2), axis=1)[:, 0])
+
+
+def _likeness(a: FloatArray, b: FloatArray) -> float:
+    """Correlation about zero; 0 with too few values."""
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < _MIN_INTERVALS:
+        return 0.0
+    a, b = a[both], b[both]
+    return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
