@@ -92,7 +92,7 @@ class OperatorCommands:
         self.topics = list(self._commands)
         self._loaded: queue.SimpleQueue[tuple[str, PlaceMap | MapError]] = queue.SimpleQueue()
         for full, topic in self._commands.items():
-            transport.subscribe(full, _TOPIC_TYPES[topic], is_latched=False)
+            transport.subscribe(full, _TOPIC_TYPES[topic], is_latched=False, is_command=True)
         transport.offer_service(names.resolve(RESET), "std_srvs/srv/Empty", self.reset)
         transport.offer_service(names.resolve(PAUSE), "std_srvs/srv/SetBool", self.pause)
         transport.offer_service(names.resolve(TARE_PAYLOAD), "std_srvs/srv/Trigger", self.tare_payload)

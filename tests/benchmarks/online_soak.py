@@ -69,7 +69,7 @@ class SimulatedRobot(MonotonicTime):
         self.published = 0
         self.is_over = False
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
         self._topics.add(topic)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:

@@ -96,7 +96,7 @@ class LogTransport(MonotonicTime):
         self.published: dict[str, list[bytes]] = {}
         self.is_closed = False
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
         self.subscribed[topic] = is_latched
         if self.kept is not None:
             self.kept.add(topic)

@@ -442,9 +442,10 @@ def test_publishers_without_a_participant_that_left_are_found(chatter, transport
 
 
 def test_node_and_type_hashes_are_published_as_by_ros2():
-    """Received by a peer whose types are written out by hand."""
+    """Received by a peer whose types are written out by hand. Commands are received reliably, sensor data as they come."""
     here = importlib.import_module("localization.ros.transports.dds").DdsTransport(DOMAIN, name="rover", namespace="/team")
     here.subscribe("/scan", "sensor_msgs/msg/LaserScan", is_latched=False)
+    here.subscribe("/reset", "std_msgs/msg/Empty", is_latched=False, is_command=True)
     here.advertise("/odometry", "nav_msgs/msg/Odometry")
     code = (
         "import json, sys, time\n"
@@ -456,7 +457,7 @@ def test_node_and_type_hashes_are_published_as_by_ros2():
         "b = [BuiltinDataReader(p, t) for t in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription, BuiltinTopicDcpsParticipant)]\n"
         "def data(s): return (s.qos[Policy.Userdata] or Policy.Userdata(b'')).data.decode()\n"
         "node, ends, end = None, [], time.monotonic() + 100\n"
-        "while not (node and {'rt/scan', 'rt/odometry'} <= {e[0] for e in ends}) and time.monotonic() < end:\n"
+        "while not (node and {'rt/scan', 'rt/reset', 'rt/odometry'} <= {e[0] for e in ends}) and time.monotonic() < end:\n"
         "    time.sleep(0.1)\n"
         "    for info in r.take(99):\n"
         "        for n in info.node_entities_info_seq:\n"
@@ -464,14 +465,16 @@ def test_node_and_type_hashes_are_published_as_by_ros2():
         "    ends = [(s.topic_name, data(s), list(s.key.bytes)) for q in b[:2] for s in q.read(99)]\n"
         "user_data = [data(s) for s in b[2].read(9)]\n"
         "gids = [[list(g.data) for g in seq] for seq in (node.writer_gid_seq, node.reader_gid_seq)]\n"
-        "print(json.dumps([node.node_namespace, node.node_name, gids, ends, user_data]))\n"
+        "kinds = {s.topic_name: type(s.qos[Policy.Reliability]).__name__ for s in b[1].read(99)}\n"
+        "print(json.dumps([node.node_namespace, node.node_name, gids, ends, user_data, kinds]))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(DOMAIN)], capture_output=True, text=True, cwd=Path(__file__).parents[2], timeout=_DEADLINE_S
     )
     here.close()
     assert done.returncode == 0, done.stderr
-    namespace, name, (writers, readers), ends, participants = json.loads(done.stdout)
+    namespace, name, (writers, readers), ends, participants, kinds = json.loads(done.stdout)
+    assert (kinds["rt/scan"], kinds["rt/reset"]) == ("Reliability.BestEffort", "Reliability.Reliable")
     assert (namespace, name) == ("/team", "rover")
     found = {topic: (data, gid) for topic, data, gid in ends if topic.startswith("rt/")}
     # ROS 2's own hashes, as its message packages ship them

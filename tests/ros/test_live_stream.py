@@ -760,8 +760,10 @@ def test_rclpy_transport_calls_the_documented_interface(monkeypatch):
     transport = RclpyTransport()
     transport.subscribe("/scan", "sensor_msgs/msg/LaserScan", is_latched=False)
     transport.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", is_latched=True)
+    transport.subscribe("/reset", "sensor_msgs/msg/LaserScan", is_latched=False, is_command=True)
     transport.advertise("/skidloc/odometry", "nav_msgs/msg/Odometry")
     assert (fake.subscriptions["/scan"][2].reliability, fake.subscriptions["/scan"][2].durability) == ("best effort", "volatile")
+    assert (fake.subscriptions["/reset"][2].reliability, fake.subscriptions["/reset"][2].durability) == ("reliable", "volatile")
     latched = fake.subscriptions["/tf_static"][2]
     assert (latched.reliability, latched.durability) == ("reliable", "transient local")
     fake.waiting = [("/scan", b"one"), ("/tf_static", b"two")]

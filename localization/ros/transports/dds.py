@@ -94,9 +94,9 @@ class DdsTransport(MonotonicTime):
         self._name, self._namespace = name, namespace
         self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _latched_output())
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """Receive ``topic``: transient local and reliable where ``is_latched``, else best effort."""
-        quality = _latched() if is_latched else _sensor_data()
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
+        """Receive ``topic``: transient local and reliable where ``is_latched``, reliable where ``is_command``, else best effort."""
+        quality = _latched() if is_latched else _command() if is_command else _sensor_data()
         reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
         self._waiting.attach(is_new)
@@ -232,6 +232,11 @@ def _hashed(quality: Qos, kind: str) -> Qos:
 def _sensor_data() -> Qos:
     latest = Policy.History.KeepLast(_LATEST)
     return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, latest, Policy.IgnoreLocal.Participant, *_COMMON)
+
+
+def _command() -> Qos:
+    reliable = Policy.Reliability.Reliable(duration(milliseconds=100))
+    return Qos(reliable, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH), Policy.IgnoreLocal.Participant, *_COMMON)
 
 
 def _latched() -> Qos:

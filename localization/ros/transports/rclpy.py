@@ -64,12 +64,12 @@ class RclpyTransport(MonotonicTime):
         self._writers: dict[str, Any] = {}
         self._services: list[Any] = []
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """Receive ``topic``: transient local and reliable where ``is_latched``, else best effort."""
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
+        """Receive ``topic``: transient local and reliable where ``is_latched``, reliable where ``is_command``, else best effort."""
         q = self._qos
         quality = q.QoSProfile(
             depth=_LATCHED_DEPTH if is_latched else _LATEST,
-            reliability=q.ReliabilityPolicy.RELIABLE if is_latched else q.ReliabilityPolicy.BEST_EFFORT,
+            reliability=q.ReliabilityPolicy.RELIABLE if is_latched or is_command else q.ReliabilityPolicy.BEST_EFFORT,
             durability=q.DurabilityPolicy.TRANSIENT_LOCAL if is_latched else q.DurabilityPolicy.VOLATILE,
         )
 

@@ -57,7 +57,7 @@ class RospyTransport(MonotonicTime):
         self._subscribers: dict[str, Any] = {}
         self._writers: dict[str, tuple[Any, type[Any]]] = {}
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
         """Receive ``topic``; a latched message comes to whoever subscribes."""
 
         def on_message(message: Any) -> None:

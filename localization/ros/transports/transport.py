@@ -48,8 +48,9 @@ class Transport(Protocol):
     elsewhere: str
     """What to do where a robot is not discovered there: a sentence, or empty."""
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """Receive ``topic``. ``is_latched``: earlier messages too (tf_static); else as sensor data, the newest only."""
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
+        """Receive ``topic``. ``is_latched``: earlier messages too (tf_static); ``is_command``: each message of a reliable publisher, also
+        one that is sent before both sides know of each other; else as sensor data, the newest only."""
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         """Receive only these of the topics subscribed to, from now on; `take` returns at once for those that are ``urgent``."""
@@ -123,9 +124,9 @@ class SimTimeTransport:
         self.is_ros1, self.place, self.elsewhere = transport.is_ros1, transport.place, transport.elsewhere
         transport.subscribe(CLOCK, CLOCK_TYPE, is_latched=False)
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
         """Receive ``topic`` by the wrapped transport."""
-        self._transport.subscribe(topic, kind, is_latched=is_latched)
+        self._transport.subscribe(topic, kind, is_latched=is_latched, is_command=is_command)
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         """Receive only these of the topics subscribed to, by the wrapped transport; /clock stays."""

@@ -64,8 +64,8 @@ class ZenohTransport(MonotonicTime):
         tokens = f"{_TOKENS}/{domain}/*/*/*/MP/**"
         self._discovery = self._session.liveliness().declare_subscriber(tokens, self._on_token, history=True)
 
-    def subscribe(self, topic: str, kind: str, *, is_latched: bool) -> None:
-        """Receive ``topic``: with the history of late publishers where ``is_latched``."""
+    def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
+        """Receive ``topic``: with the history of late publishers where ``is_latched``; reliable where ``is_command``."""
         key = f"{self._domain}{topic}/{_dds_type(kind)}/*"  # any hash: that of Humble is none
 
         def on_sample(sample: Any) -> None:
@@ -81,7 +81,7 @@ class ZenohTransport(MonotonicTime):
             if is_latched
             else self._session.declare_subscriber(key, on_sample)
         )
-        quality = _LATCHED.format(_LATCHED_DEPTH) if is_latched else _BEST_EFFORT.format(_DEPTH)
+        quality = _LATCHED.format(_LATCHED_DEPTH) if is_latched else (_RELIABLE if is_command else _BEST_EFFORT).format(_DEPTH)
         self._subscribers[topic] = [subscriber, self._session.liveliness().declare_token(self._token("MS", topic, kind, quality))]
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
