@@ -72,6 +72,11 @@ class Innovation:
         """Normalised innovation squared, residual^T S^-1 residual: chi-square with m degrees of freedom."""
         return float(self.residual @ np.linalg.solve(self.S, self.residual))
 
+    def nis_of(self, rows: list[int]) -> float:
+        """NIS of some ``rows`` of the residual: chi-square with as many degrees of freedom."""
+        residual = self.residual[rows]
+        return float(residual @ np.linalg.solve(self.S[np.ix_(rows, rows)], residual))
+
     def component(self, i: int) -> tuple[float, float]:
         """Component ``i`` of the residual and its variance."""
         return float(self.residual[i]), float(self.S[i, i])

@@ -121,7 +121,10 @@ class SpaceFusion(Estimator):
         self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(share, noise)))
 
     def _update_cloud(self, step: Step) -> float | None:
-        """Match the cloud of ``step`` and update by it; its NIS (6 degrees of freedom), or None where there is no cloud or no match."""
+        """Match the cloud of ``step`` and update by it; the NIS of x, y and yaw in the body's axes (3 degrees of freedom, as in the plane).
+
+        None where there is no cloud or no match.
+        """
         self._counts["planar"] += step.scan is not None and step.scan.is_planar
         if step.scan is None or step.scan.is_planar or not self._has_vertical:
             self._lost.add(step.end_ns, "excluded") if step.is_scan_excluded else self._lost.add_no_scan(step.end_ns)
@@ -153,7 +156,7 @@ class SpaceFusion(Estimator):
         self._cloud_cov = cov
         measured = self._odom_T_map @ match.measured
         self.state, innovation = update(self.state, measure_scan(self.state, measured, cov), ("map",))
-        return innovation.nis
+        return innovation.nis_of(_PLANAR)
 
     def _twist_of(self, step: Step) -> FloatArray:
         """(6,) at the end of ``step``, the middle of the sweep: by the wheels, and turns by the gyro."""

@@ -29,6 +29,7 @@ __all__ = [
     "overview",
     "picture",
     "plain_logs",
+    "plot_run",
     "relation_bins_svg",
     "svg",
     "timeline_svg",
@@ -96,7 +97,7 @@ def timeline_svg(lines: Sequence[PlottedRun], timelines: Sequence[Timeline]) -> 
             for axes, values in zip(panels, (timeline.position_m, timeline.heading_deg), strict=False):
                 if values is not None and len(values):
                     kept = thin_series(values)
-                    _plot(axes, line, timeline.seconds[kept], values[kept])
+                    plot_run(axes, line, timeline.seconds[kept], values[kept])
         panels[0].set_ylabel("position error [m]")
         panels[0].set_ylim(bottom=0.0)
         if has_heading:
@@ -113,7 +114,7 @@ def relation_bins_svg(lines: Sequence[PlottedRun], bins: Sequence[RelationBins])
         panels = figure.subplots(1, 2)
         for line, span in zip(lines, bins, strict=True):
             for axes, values in zip(panels, (span.translation_m, span.rotation_deg), strict=True):
-                _plot(axes, line, span.seconds, np.maximum(values, 1e-6), marker="o", markersize=3.0)
+                plot_run(axes, line, span.seconds, np.maximum(values, 1e-6), marker="o", markersize=3.0)
         for axes, name in zip(panels, ("translation error [m]", "rotation error [deg]"), strict=True):
             axes.set(xscale="log", yscale="log", ylabel=f"mean {name}")
             plain_logs(axes)
@@ -131,7 +132,7 @@ def nis_svg(lines: Sequence[PlottedRun], means: Sequence[NisMeans]) -> str:
         axes.axhspan(*band, facecolor=COLOURS["band"], edgecolor="none", zorder=0.5, gid="band")
         axes.axhline(3.0, color=COLOURS["soft"], linewidth=0.8, zorder=0.6)
         for line, mean in zip(lines, means, strict=True):
-            _plot(axes, line, mean.seconds, np.maximum(mean.mean, 1e-3))
+            plot_run(axes, line, mean.seconds, np.maximum(mean.mean, 1e-3))
         axes.set(
             yscale="log", xlabel="time since the first pose [s]", ylabel=f"NIS, means of {means[0].group}" if means[0].group > 1 else "NIS"
         )
@@ -175,7 +176,7 @@ def _draw_map(axes: Axes, lines: Sequence[PlottedRun], view: MapView, pixels: in
         kept = path[thin_path(path, resolution)]
         # what is better lies on top
         order = 3.0 + 0.9 / (1.0 + view.ranks[line.number])
-        _plot(axes, line, kept[:, 0], kept[:, 1], zorder=order)
+        plot_run(axes, line, kept[:, 0], kept[:, 1], zorder=order)
     if view.best is not None:
         colour = COLOURS[view.best.colour]
         for e in view.ellipses:
@@ -213,7 +214,8 @@ def _draw_bars(axes: Axes, lines: Sequence[PlottedRun], measure: str) -> None:
     axes.spines["left"].set_visible(False)
 
 
-def _plot(axes: Axes, line: PlottedRun, x: np.ndarray, y: np.ndarray, **more: object) -> None:
+def plot_run(axes: Axes, line: PlottedRun, x: np.ndarray, y: np.ndarray, **more: object) -> None:
+    """Draw ``y`` over ``x`` in the style of ``line``, which the page's legend hides and shows; ``more`` of matplotlib's keywords."""
     style: dict[str, object] = {"color": COLOURS[line.colour], "gid": f"series-{line.number}", **more}
     (drawn,) = axes.plot(x, y, **style)  # type: ignore[arg-type]  # matplotlib's keywords are typed one by one
     if line.dashes:

@@ -19,6 +19,7 @@ from localization.report import page as html
 from localization.report.interactive import Scans, explorer
 from localization.report.map_page import change_blocks, grid_figure, picture_grid
 from localization.report.runs import MapView, PlottedRun, best_run, map_view, nis_means, plotted_runs, relation_bins, timeline
+from localization.report.space_view import profile_svg, space_tracks, stretch, view_svg
 from localization.report.summary import is_close, metres, verdict, verdict_sentences
 
 __all__ = ["ReportHead", "overview_png", "verdict", "write_report"]
@@ -121,6 +122,7 @@ def _sections(
         html.Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
         html.Section("Map", _grid_blocks(runs)),
         html.Section("Errors", _error_figure(runs, reference), is_static=bool(explore) and not isinstance(reference, Relations)),
+        html.Section("In space", _space_figures(runs)),
         html.Section("Innovations: are the covariances consistent?", _nis_figure(runs), is_static=bool(explore)),
         html.Section("Estimated parameters", _with_note(parameter_table(runs), "Mean ± sigma at the end of the drive.")),
         html.Section("Counts", _with_note(count_table(runs), "")),
@@ -207,6 +209,20 @@ def _error_figure(runs: Sequence[PlottedRun], reference: ReferenceTrack | Relati
         "between is a path that bends."
     )
     return [html.Figure(figures.timeline_svg(shown, series), "Errors over time", caption, _legend(shown))]
+
+
+def _space_figures(runs: Sequence[PlottedRun]) -> list[html.Block]:
+    tracks = space_tracks(runs)
+    if not tracks:
+        return []
+    legend = _legend([track.line for track in tracks])
+    profile = "Height of the body's origin above that of the first pose, with two sigmas; roll is positive with the left side up, pitch "
+    stretched = stretch(tracks)
+    view = "The way in three dimensions" + (f", heights stretched {stretched:.1f} times." if stretched > 1.05 else ".")
+    return [
+        html.Figure(profile_svg(tracks), "Height and tilt", profile + "with the nose down.", legend),
+        html.Figure(view_svg(tracks), "The way in three dimensions", view, legend),
+    ]
 
 
 def _nis_figure(runs: Sequence[PlottedRun]) -> list[html.Block]:

@@ -15,10 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from localization.errors import OutputError
 from localization.evaluation.references import ReferenceTrack, Relations, with_noise
 from localization.evaluation.scores import Result, score
+from localization.lifting import Trajectory3
 from localization.report.replay_page import MISSING, ReportHead, number, overview_png, page, plus_minus, unit_of, verdict, write_report
 from localization.report.runs import (
     baseline_run,
@@ -32,6 +34,7 @@ from localization.report.runs import (
     thin_path,
     thin_series,
 )
+from localization.report.space_view import space_tracks
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.report import HEAD, PageText, chi_square_nis, relations, run, three_runs, track, with_error, without_scripts
@@ -556,3 +559,25 @@ def test_summary_of_a_large_nees_asks_for_the_noise_of_an_exact_reference() -> N
     exact, noisy = track(), with_noise(track(), 0.02, 0.01)
     assert "pass its noise with --reference-sigma" in verdict(results, exact)
     assert "--reference-sigma" not in verdict(results, noisy)
+
+
+def _over_hills(tilt_deg):
+    planar = run("skid_steer", "ekf")
+    n = len(planar.trajectory)
+    pitch = np.radians(tilt_deg) * np.sin(np.linspace(0.0, 9.0, n))
+    turns = Rotation.from_euler("ZY", np.column_stack([planar.trajectory.poses[:, 2], pitch]))
+    positions = np.column_stack([planar.trajectory.poses[:, :2], np.cumsum(-0.08 * pitch)])
+    covariances = np.tile(0.01 * np.eye(6), (n, 1, 1))
+    in_space = Trajectory3(planar.trajectory.stamps_ns, positions, turns.as_quat(), covariances, is_lifted=False)
+    return score([dataclasses.replace(planar, in_space=in_space)], None)
+
+
+def test_page_of_hills_has_height_and_tilt_and_of_level_ground_none():
+    hills, level = (page(HEAD, _over_hills(tilt), None, is_interactive=False) for tilt in (8.0, 1.0))
+    for label in ("Height and tilt", "The way in three dimensions"):
+        assert f'aria-label="{label}"' in hills
+        assert f'aria-label="{label}"' not in level
+    assert "pitch [deg]" in hills
+    (track,) = space_tracks(plotted_runs(_over_hills(8.0)))
+    assert track.pitch_deg.max() == pytest.approx(8.0, abs=0.01)
+    assert np.abs(track.roll_deg).max() == pytest.approx(0.0, abs=1e-9)
