@@ -185,6 +185,14 @@ def test_correctable_findings_are_none_beside_sizes_that_no_robot_has() -> None:
     assert correctable_findings(diagnosis((finding(),), (), table)) == [finding()]
 
 
+def test_correctable_findings_have_no_ranges_that_the_wheels_explain_as_well() -> None:
+    table = {"x": row("attributed")}
+    alone, shared = finding("range_scale", -0.0077), finding("range_scale", -0.0077, (("wheel_radius_scale", -0.0067),))
+    assert correctable_findings(diagnosis((alone,), (), table)) == [alone]
+    assert correctable_findings(diagnosis((finding(), shared), (), table)) == [finding()]
+    assert "Not written" in sentence(diagnosis((finding(), shared), (), table))
+
+
 def test_trend_in_place_of_several_causes_reports_no_better_fit() -> None:
     one = Trend("yaw", "distance x heading (sine)", 12.0, 1.0, 0.0, "scrub and track_width", -4.2)
     assert one.text == "yaw follows distance x heading (sine), one trend in place of scrub and track_width (log-likelihood -4)"
