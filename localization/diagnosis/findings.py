@@ -429,9 +429,9 @@ def unit_of(name: str) -> str:
 
 
 _RANGES = (RANGE_SCALE.id, RANGE_BIAS.id)
-"""A Hokuyo UTM-30LX measures 10 m to 30 mm by its data sheet, tyres differ by 2 %; and all that scans measure is as wrong as a file's scale of
-the ranges: on ACES, where the wheels' radius explained a drive as well as ranges 0.8 % short, the filter's error was 0.069 m with that scale
-and 0.062 m without."""
+"""A Hokuyo UTM-30LX measures 10 m to 30 mm by its data sheet, tyres differ by 2 %; and all that scans measure is as wrong as a file's scale
+of the ranges. On ACES, where the wheels' radius explained a drive as well as ranges 0.8 % short, the filter's error was 0.069 m with that
+scale and 0.062 m without."""
 
 
 def correctable_findings(d: Diagnosis) -> list[Finding]:
