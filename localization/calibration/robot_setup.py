@@ -238,6 +238,11 @@ def _same(a: Sides | WheelSides, b: Sides | WheelSides) -> bool:
     return {*a.left} == {*b.left} and {*a.right} == {*b.right}
 
 
+def _fits(part: Sides, whole: Sides | WheelSides) -> bool:
+    """Whether the wheels of ``part``, which may be some of them as in plugins of one axle, have the sides of ``whole``."""
+    return {*part.left} <= {*whole.left} and {*part.right} <= {*whole.right}
+
+
 def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[Sides], measured: WheelSides | None) -> None:
     """Sides by names, positions and controllers; where they contradict each other, the log's motion decides."""
     names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
@@ -257,7 +262,7 @@ def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[
     draft.joints = Joints(chosen.left, chosen.right, backwards)
     draft.reasons.append(f"joints: left {', '.join(chosen.left)}; right {', '.join(chosen.right)}: {chosen.reason}.")
     by_log = "cannot decide" if measured is None else f"left {', '.join(measured.left)}"
-    wrong = [c for c in of_log if not _same(c, chosen if measured is None else measured)]
+    wrong = [c for c in of_log if not _fits(c, chosen if measured is None else measured)]
     draft.contradictions += [Contradiction("left wheels", c.reason, ", ".join(c.left), by_log) for c in wrong]
     if wrong and measured is None and chosen.reason != "given":
         draft.missing.append(

@@ -192,6 +192,22 @@ def signals_of_readings(
     return WheelSignals((*joints[0], *joints[1]), len(joints[0]), rates, of_angles, turns, {}, is_upright, first_ns=first_ns)
 
 
+def signals_of_odometry(
+    topic: str, readings: Sequence[OdometryReading], gyro: Sequence[ImuSample], mounts: Mapping[str, Mount]
+) -> WheelSignals | None:
+    """Signals of live readings of the driver's odometry on ``topic`` and the gyro; None for too short a time."""
+    first_ns = readings[0].stamp_ns
+    edges = np.arange(0.0, (readings[-1].stamp_ns - first_ns) * 1e-9, STEP_S)
+    if len(edges) < 3:
+        return None
+    speed, turn = _odometry(readings, edges, first_ns)
+    turns, is_upright = {topic: turn}, True
+    if gyro:
+        turns["gyro"], is_upright = _gyro(gyro, mounts, edges, first_ns)
+    none = np.empty((len(edges) - 1, 0))
+    return WheelSignals((), 0, none, none, turns, {topic: speed}, is_upright, first_ns=first_ns)
+
+
 def _seconds(readings: Sequence[Any], first_ns: int) -> FloatArray:
     return np.array([reading.stamp_ns - first_ns for reading in readings], dtype=float) * 1e-9
 

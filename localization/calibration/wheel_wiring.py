@@ -154,7 +154,10 @@ def check_live(sensors: LiveSensors, signals: WheelSignals, is_clock_known: bool
 
     The first of them that is wrong is reported; readings by `WiringReport.robot` show the next.
     """
-    signals, found = _wiring_of(sensors, signals, is_clock_known or len(signals.rates) < _MIN_CLOCK_INTERVALS)
+    is_clock_known = is_clock_known or len(signals.rates) < _MIN_CLOCK_INTERVALS
+    if not signals.joints:
+        return _odometry_of(sensors, signals, is_clock_known)
+    signals, found = _wiring_of(sensors, signals, is_clock_known)
     if found.findings:
         return found
     units = _units_of(sensors, signals, sensors.robot)
@@ -255,7 +258,15 @@ def _corrected(sensors: Log | LiveSensors, signals: WheelSignals, base: Wiring, 
 
 
 def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
-    """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's."""
+    """`_odometry_of` a log; what another clock hides is compared on the right one."""
+    found = _odometry_of(log, signals, is_clock_known)
+    if not any(key.startswith("clock.") for key in found.keys):
+        return found
+    return _joined(found, check_wiring(open_log(log.path, found.robot, log.overrides), is_clock_known=True))
+
+
+def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
+    """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's, after their clocks."""
     assert log.sources.wheels is not None
     topic = log.sources.wheels.topic
     gyro, turn = signals.turns.get("gyro"), signals.turns.get(topic)
@@ -266,8 +277,7 @@ def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> Wi
         return WiringReport(log.robot)
     offset_s = None if is_clock_known else clock_offset(turn, gyro)
     if offset_s is not None:
-        found = _other_clock(log, signals, offset_s)
-        return _joined(found, check_wiring(open_log(log.path, found.robot, log.overrides), is_clock_known=True))
+        return _other_clock(log, signals, offset_s)
     measured = {f"turn of {topic} by the gyro": r}
     if r > -_SURE_CORRELATION:
         return _check_multiplier(log, float(np.nansum(turn * gyro) / max(np.nansum(turn**2), 1e-12)), measured)
@@ -286,7 +296,7 @@ def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> Wi
     return WiringReport(robot, (text,), {"imu.rate_unit_rad_s": f"{unit:g}"}, correlations=measured)
 
 
-def _check_multiplier(log: Log, ratio: float, measured: Mapping[str, float]) -> WiringReport:
+def _check_multiplier(log: Log | LiveSensors, ratio: float, measured: Mapping[str, float]) -> WiringReport:
     """A driver that corrects for skidding turns as the gyro does; its multiplier is needed to invert its odometry."""
     robot = log.robot
     expected = expected_scaling(robot) * robot.driver.wheel_separation_multiplier

@@ -1,6 +1,7 @@
 """Signs, sides, units and clocks of live wheels and gyro: once the drive shows them, it is estimated anew with the right ones.
 
-Messages are kept as they came, since the start of the drive, until the sensors agree: what is wrong is the way in which they are read.
+Of a driver's odometry its turns are compared. Messages are kept as they came, since the start of the drive, until the sensors agree: what
+is wrong is the way in which they are read.
 """
 
 from __future__ import annotations
@@ -9,11 +10,11 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from localization.calibration.wheel_signals import signals_of_readings
+from localization.calibration.wheel_signals import WheelSignals, signals_of_odometry, signals_of_readings
 from localization.calibration.wheel_units import CORRECTED
 from localization.calibration.wheel_wiring import LiveSensors, WiringReport, check_live
 from localization.events import ImuSample, Scan
-from localization.logs.decode import ArmReading, JointReading
+from localization.logs.decode import ArmReading, JointReading, OdometryReading
 from localization.ros.transports.transport import Received
 
 _FIRST_NS, _LAST_NS, _LONGER = 6_000_000_000, 120_000_000_000, 1.5
@@ -37,7 +38,7 @@ class LiveWiring:
         """``joints``: of the left and right wheels that come. ``is_clock_known``: do not compare the gyro's clock."""
         self._sensors, self._joints, self._is_clock_known = sensors, joints, is_clock_known
         self._messages = KeptMessages("" if sensors.sources.lidar is None else sensors.sources.lidar.topic)
-        self._wheels: deque[JointReading] = deque()
+        self._wheels: deque[JointReading | OdometryReading] = deque()
         self._gyro: deque[ImuSample] = deque()
         self._points = 0
         self._moving_ns: int | None = None
@@ -72,7 +73,7 @@ class LiveWiring:
             self._gyro.append(reading)
         elif isinstance(reading, Scan):
             self._add_scan(reading)
-        elif isinstance(wheels, JointReading):
+        elif isinstance(wheels, JointReading | OdometryReading):
             self._add_wheels(wheels)
             if self._moving_ns is not None and wheels.stamp_ns >= self._next_ns:
                 self._check(wheels.stamp_ns, self._moving_ns)
@@ -83,19 +84,25 @@ class LiveWiring:
             self._points += len(scan.points)
             self._sensors.kept.append(scan)
 
-    def _add_wheels(self, sample: JointReading) -> None:
+    def _add_wheels(self, sample: JointReading | OdometryReading) -> None:
         first = self._wheels[0] if self._wheels else sample
-        has_moved = bool((abs(sample.velocity) > _MOVED).any() or (abs(sample.position - first.position) > _MOVED).any())
-        if self._moving_ns is None and has_moved:
+        if self._moving_ns is None and _has_moved(first, sample):
             self._moving_ns, self._next_ns = sample.stamp_ns, sample.stamp_ns + _FIRST_NS
         self._wheels.append(sample)
         if self._moving_ns is None:  # while it stands
             _forget(self._wheels, sample.stamp_ns - _STANDING_NS)
             _forget(self._gyro, sample.stamp_ns - _STANDING_NS)
 
+    def _signals(self) -> WheelSignals | None:
+        gyro, mounts, wheels = list(self._gyro), self._sensors.mounts, self._sensors.sources.wheels
+        odometry = [reading for reading in self._wheels if isinstance(reading, OdometryReading)]
+        if odometry:
+            return None if wheels is None else signals_of_odometry(wheels.topic, odometry, gyro, mounts)
+        return signals_of_readings([r for r in self._wheels if isinstance(r, JointReading)], gyro, mounts, self._joints)
+
     def _check(self, now_ns: int, moving_ns: int) -> None:
         self._next_ns = moving_ns + min(round((now_ns - moving_ns) * _LONGER), _LAST_NS)
-        signals = signals_of_readings(list(self._wheels), list(self._gyro), self._sensors.mounts, self._joints)
+        signals = self._signals()
         if signals is None:
             return
         report = check_live(self._sensors, signals, self._is_clock_known)
@@ -103,6 +110,14 @@ class LiveWiring:
         agrees = bool(turns) and min(report.correlations.values()) >= _AGREE
         self.found = report if report.findings else None
         self.is_done = bool(report.findings) or agrees or now_ns >= moving_ns + _LAST_NS
+
+
+def _has_moved(first: JointReading | OdometryReading, sample: JointReading | OdometryReading) -> bool:
+    if isinstance(sample, JointReading) and isinstance(first, JointReading):
+        return bool((abs(sample.velocity) > _MOVED).any() or (abs(sample.position - first.position) > _MOVED).any())
+    if isinstance(sample, OdometryReading) and isinstance(first, OdometryReading):
+        return bool((abs(sample.twist) > _MOVED).any() or (abs(sample.pose - first.pose) > _MOVED).any())
+    return False
 
 
 def _forget(readings: deque[Any], before_ns: int) -> None:

@@ -158,7 +158,7 @@ class Node:
                 self._continue_from(self.session.head, discovered.start_ns)
             else:
                 self._check_lidar()
-            if not self.session.head and self._sources.wheels is not None and self._sources.wheels.kind == "joint_states":
+            if not self.session.head and self._has_wiring():
                 self._check_wiring(is_clock_known=False)
             if not self._is_compiled():
                 self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
@@ -190,6 +190,11 @@ class Node:
         if self._sources.lidar is not None and self._sources.wheels is not None:
             check = LidarYawCheck(self.session.pipeline.mounts, self._run.robot, self._sources.lidar.topic)
             self._entrance = LidarEntrance(check)
+
+    def _has_wiring(self) -> bool:
+        """Whether something can contradict the wheels: each other, or a driver's odometry the gyro."""
+        wheels = self._sources.wheels
+        return wheels is not None and (wheels.kind == "joint_states" or self._sources.imu is not None)
 
     def _check_wiring(self, is_clock_known: bool) -> None:
         """Compare wheels with gyro and LiDAR from here on, until they agree."""

@@ -74,6 +74,13 @@ LIVE = {
         "joints.rate_unit_rad_s = 0.10472",
         0.03,
     ),
+    "driver that corrects for skidding": (
+        Vehicle(seed=5),
+        Publishing(forms="odometry", odometry_k=0.6),
+        "driver.wheel_separation_multiplier",
+        1.0,
+    ),
+    "driver that turns the other way": (SCANNING, Publishing(forms="odometry", gyro=-1.0), "imu.rate_unit_rad_s = -1", 0.03),
     "swapped by the gyro alone": (Vehicle(seed=5), Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]])), "swapped, or", math.inf),
 }
 
