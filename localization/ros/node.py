@@ -25,10 +25,10 @@ from localization.logs.decode import MessageStats
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
-from localization.ros.dead_reckoning import DeadReckoning
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TopicDiscovery, TransformConflicts
 from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
+from localization.ros.interim_odometry import InterimOdometry
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.lidar_entrance import LidarEntrance
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
@@ -80,8 +80,7 @@ class Node:
         self._commands = OperatorCommands(self, transport, names, report)
         self._gnss = _gnss(run, transport, self._stats)
         self._problems: set[str] = set()  # that were reported
-        self._is_compiled: Callable[[], bool] = lambda: True
-        self._compiling: DeadReckoning | None = None
+        self._interim: InterimOdometry | None = None
         self._entrance: LidarEntrance | None = None
         self._wiring: LiveWiring | None = None
         self._wiring_notes: list[str] = []
@@ -127,11 +126,10 @@ class Node:
         for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report)
-        node._is_compiled = is_compiled
-        node._open_session(discovered, view)
+        node._open_session(discovered, view, is_compiled)
         return node
 
-    def _open_session(self, discovered: DiscoveredTopics, view: View | None) -> None:
+    def _open_session(self, discovered: DiscoveredTopics, view: View | None, is_compiled: Callable[[], bool]) -> None:
         gc.collect()
         gc.freeze()  # these objects stay: later collections skip them
         mounts = discovered.mounts
@@ -160,9 +158,9 @@ class Node:
                 self._check_lidar()
             if not self.session.head and self._has_wiring():
                 self._check_wiring(is_clock_known=False)
-            if not self._is_compiled():
+            if not is_compiled():
                 self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
-                self._compiling = DeadReckoning(self._open_stream(MessageStats()), _predictor(self._trial, self._run))
+                self._interim = InterimOdometry(self._open_stream(MessageStats()), _predictor(self._trial, self._run), is_compiled)
             self._take_up(discovered.backlog)
             failing.pop_all()
 
@@ -172,14 +170,14 @@ class Node:
             self._receive(received)
         self._caught_up_ns = self._transport.now_ns()
 
-    def _reckon(self, compiling: DeadReckoning, received: Received) -> None:
+    def _reckon(self, interim: InterimOdometry, received: Received) -> None:
         """Odometry by wheels, until the estimator is compiled: then it takes up what has waited."""
-        if (found := compiling.add(received)) is not None:
+        if (found := interim.add(received)) is not None:
             self._publisher.publish_prediction(*found)
-        if self._is_compiled():
-            self._compiling = None
+        if interim.is_over():
+            self._interim = None
             self._report("compiled: the estimator begins.")
-            self._take_up(compiling.messages)
+            self._take_up(interim.messages)
 
     def _open_stream(self, stats: MessageStats | None = None) -> LiveStream:
         counts = self._stats if stats is None else stats
@@ -323,8 +321,8 @@ class Node:
 
     def _receive(self, received: Received) -> bool:
         """Process a message; True if it made an estimate."""
-        if self._compiling is not None:
-            self._reckon(self._compiling, received)
+        if self._interim is not None:
+            self._reckon(self._interim, received)
             return False
         if received.topic == self._tf:
             if (conflict := self._conflicts.check(received.data, self._publisher.recent_transforms)) is not None:

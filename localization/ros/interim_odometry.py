@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 from localization.estimators import Estimate
 from localization.events import WheelSample
@@ -12,15 +13,15 @@ from localization.ros.publisher import Predictor
 from localization.ros.transports.transport import Received
 
 
-class DeadReckoning:
+class InterimOdometry:
     """`add` each message. `messages` holds them all for the estimator, which begins with the first of them.
 
     The pose starts at the origin of `odom`, as the estimator's does. A gap of the wheels ends it.
     """
 
-    def __init__(self, stream: LiveStream, predictor: Predictor) -> None:
-        """``stream`` and ``predictor`` are its own: those of the node begin when the estimator does."""
-        self._stream, self._predictor = stream, predictor
+    def __init__(self, stream: LiveStream, predictor: Predictor, is_over: Callable[[], bool]) -> None:
+        """``stream`` and ``predictor`` are its own: those of the node begin when the estimator does, which is when ``is_over``."""
+        self._stream, self._predictor, self.is_over = stream, predictor, is_over
         self._has_begun = False
         self.messages: deque[Received] = deque(maxlen=MAX_BACKLOG)
 
