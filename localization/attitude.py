@@ -90,11 +90,11 @@ class _Imu(NamedTuple):
     place: FloatArray
     """(3,) in the body [m]."""
     scale: float
-    """Of its forces; 0 until known."""
+    """Scale of the accelerometer's forces; 0 until known."""
     radius: float
-    """Of the wheels [m]."""
+    """Radius of the wheels [m]."""
     white: float
-    """Of its gyro [rad/sqrt(s)]."""
+    """White noise of the gyro's angle [rad/sqrt(s)]."""
 
 
 class _Sums(NamedTuple):

@@ -43,7 +43,7 @@ class ExtendedModel(ModelWrapper):
 
     terms: tuple[Term, ...]
     series: Series | None = None
-    """Of the samples that `twist` gets next, in the same order; None for steady motion at the drive's start."""
+    """Time, place and wheel angle of the samples that `twist` gets next, in the same order; None for steady motion at the drive's start."""
 
     @property
     def params(self) -> tuple[Param, ...]:

@@ -85,7 +85,7 @@ class Factor(NamedTuple):
     """Empty, abs, sign or rise."""
     power: int
     time_constant_s: float = 0.0
-    """Of a rise [s]."""
+    """Time constant of a rise [s]."""
 
     def __str__(self) -> str:
         if self.form == "rise":

@@ -120,7 +120,7 @@ def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
 
 
 def _decode_fast_imu(message: Any, stamp: int, unit: float) -> ImuSample:
-    """As `decode_imu`, with rates that only another unit than rad/s explains."""
+    """Decode an IMU message (`decode_imu`) whose rates only another unit than rad/s explains."""
     sample = decode_imu(message, stamp, unit / _DEG_PER_RAD)
     return replace(sample, angular_velocity=_DEG_PER_RAD * sample.angular_velocity)
 

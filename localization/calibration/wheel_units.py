@@ -29,7 +29,7 @@ _SIGMAS = 1.5
 _MIN_CORRELATION = 0.9
 _MIN_INTERVALS = 12
 _MAX_BIAS = 3.0
-"""Of a gyro in deg/s: 0.05 rad/s."""
+"""Largest bias of a gyro in deg/s: 0.05 rad/s."""
 _FASTEST_M_S = 3.0
 """Speed of such robots; velocities that mean more are no rad/s."""
 _SCALE_UNKNOWN_M2_PER_M = 0.2

@@ -13,9 +13,9 @@ from localization.report.replay_page import number, unit_of
 from localization.report.runs import capitalize
 
 _LOG_SCALE_RATIO = 8.0
-"""Of the largest value to the smallest: from here on the axis is logarithmic, so that a failing baseline does not set the scale."""
+"""Ratio of the largest value to the smallest from which on the axis is logarithmic, so that a failing baseline does not set the scale."""
 _SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down")
-"""Of Plotly, by motion model; those of the static figures."""
+"""Symbols of Plotly by motion model; those of the static figures."""
 _NUMBERS = (
     *("ate_rmse_m", "ate_rmse_deg", "rpe_translation_percent", "rpe_rotation_deg_per_m", "end_error_m", "drift_percent"),
     *("relations_all_translation_m", "relations_all_rotation_deg", "nees_mean", "nis_mean", "lidar_lost_share", "distance_m"),

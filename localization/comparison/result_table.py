@@ -19,7 +19,7 @@ _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "
 _TEXTS = (*_HEAD, "floor", "day", "cause", "notes", "damage", "faults")
 _SUFFIXES = (".csv", ".parquet")
 _MOST_CHARACTERS = 60
-"""Of a log's name in names of files; digits of its path distinguish logs."""
+"""Longest part of a log's name in names of files; digits of its path distinguish logs."""
 
 Name = tuple[str, str, str, str]
 """Log, model, estimator and corrections."""

@@ -29,9 +29,9 @@ _EXACT_UP_TO = 14
 _SIGNIFICANCE_LEVEL = 0.05
 _UNKNOWN = (math.nan, math.nan)
 _LEAST_STEP, _MOST_STEPS = 1e-3, 1e4
-"""Of the search for the end of an interval: its first step, and how many times that the last one is."""
+"""First step of the search for the end of an interval, and how many times that the last one is."""
 _BOUND_ACCURACY = 1e-4
-"""Of an end, over the interval in which it was found."""
+"""Accuracy of an end, over the interval in which it was found."""
 _MEASURES = {
     "ate_rmse_m": "position error (ATE)",
     "ate_rmse_deg": "heading error (ATE)",

@@ -62,7 +62,7 @@ class MeanCg:
         self._sum, self._count = np.zeros(2), 0
 
     def watch(self, events: Iterable[Event]) -> Iterator[Event]:
-        """The same events."""
+        """Pass the events on, and take the CG of each that has one into the mean."""
         for event in events:
             if isinstance(event, CgSample):
                 self._sum += event.position

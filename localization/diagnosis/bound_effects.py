@@ -29,7 +29,7 @@ _MIN_TURNS = 3.0
 _MIN_TILT_M_S2 = 0.05
 """Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
 _PRICE = 3.0
-"""Of an effect that holds in this drive alone, in twice the log-odds beside terms."""
+"""Price of an effect that holds in this drive alone, in twice the log-odds beside terms."""
 
 
 class BoundShape(NamedTuple):
@@ -62,7 +62,7 @@ def bound_columns(predictor: DrivePredictor, hypothesis: Hypothesis) -> tuple[li
 
 
 def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[FloatArray, list[BoundShape]]:
-    """Of additions to the twist."""
+    """Columns of additions to the twist, and what each of them is bound to."""
     batch = predictor.batch
     densities = [*_of_time(predictor, twist), *_of_place(predictor, twist), *_of_wheel_angle(predictor), *_of_tilt(predictor, twist)]
     table = np.column_stack([values for _, values in densities]) if densities else np.zeros((len(twist), 0))
@@ -177,7 +177,7 @@ def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> Densities:
 
 
 def _sensor_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[FloatArray, list[BoundShape]]:
-    """Of gyro and accelerometers: g-sensitivity, scales that drift with time or differ by side, a lever arm."""
+    """Columns of gyro and accelerometers: g-sensitivity, scales that drift with time or differ by side, a lever arm."""
     batch, drive = predictor.batch, predictor.drive
     shapes: list[BoundShape] = []
     columns: list[FloatArray] = []

@@ -42,7 +42,7 @@ from motion_models.se2 import FloatArray
 from motion_models.terms import Term
 
 _FEWEST_WINDOWS = 16
-"""Of a drive: eight in each half, as many as a diagnosis takes."""
+"""Fewest windows of a drive: eight in each half, as many as a diagnosis takes."""
 _TWO_SIDED_95 = 1.96
 _NS = 1e-9
 _NOT_WRITTEN = {
@@ -65,7 +65,7 @@ class Extension:
     replaced: tuple[str, ...]
     """Findings of the plain model in whose place the terms explain the drive better."""
     check: HandoverCheck | None
-    """Of its file on the half of the drive that it was not fitted to; None without terms, and where nothing was measured there."""
+    """Check of its file on the half of the drive that it was not fitted to; None without terms, and where nothing was measured there."""
     effects: tuple[FoundEffect, ...] = ()
     """Effects bound to time, place or sensors, which are not written."""
 
@@ -135,7 +135,7 @@ class ExtendedResult:
     """A diagnosis with the model extended, where that is better; and what was found."""
 
     found: DiagnosisResult
-    """Of the extended model, where its file is better on the half held out; else of the plain one."""
+    """Diagnosis with the extended model, where its file is better on the half held out; else with the plain one."""
     extension: Extension | None
     """None where no term explains the drive."""
     robot: Robot | None = None

@@ -84,7 +84,7 @@ class Candidate:
 
     corrected: CorrectedRobot
     sizes: Mapping[Cause, float]
-    """Of the causes that it was corrected by."""
+    """Sizes of the causes that it was corrected by."""
     held: NDArray[np.bool_]
     """(W,) windows that did not correct it."""
 

@@ -40,7 +40,7 @@ _OF_CAUSES = frozenset({("vx", "v"), ("vx", "wz"), ("vy", "v"), ("vy", "wz"), ("
 """Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference. A term has them only where such a
 cause would be larger than robots have it."""
 _OF_CAUSES_PRICE = 7.0
-"""Of a term with the shape of a cause, in twice the log-odds: 33 robots have the cause for one that turns so without."""
+"""Price of a term with the shape of a cause, in twice the log-odds: 33 robots have the cause for one that turns so without."""
 _MORE = {
     "vx": ("dv", "abs(dv)", "sign(v)*abs(dv)", "v*abs(dv)", "v*t", "abs(v)*t", "dv*abs(v)"),
     "vy": ("dwz", "v*dwz", "wz*dv", "wz*t", "v*wz*t", "v*dv"),
@@ -50,7 +50,7 @@ _MORE = {
 _WARMING = {"vx": "v", "wz": "wz"}
 """Motion whose share changes while tyres and gears warm up, by component."""
 _TIME_CONSTANTS = (0.125, 0.25, 0.5)
-"""Of what warms up, over the drive's length: slower is a drift with t, and faster is over before it is measured."""
+"""Time constants of what warms up, over the drive's length: slower is a drift with t, and faster is over before it is measured."""
 _SHORTEST_S = 16.0
 """Drive in which a drift can be distinguished from what warms up: eight windows [s]."""
 _OF_CG = {
@@ -61,9 +61,9 @@ _OF_CG = {
 _CG_MOVES_M = 0.005
 _COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
 _ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
-"""Of a term that a robot with equal sides does not have; two in three robots have such sides."""
+"""Price of a term that a robot with equal sides does not have; two in three robots have such sides."""
 _COMPLEXITY_PRICE = 1.5
-"""Of each factor beyond the first, in twice the log-odds: of two shapes that fit alike the simpler is taken."""
+"""Price of each factor beyond the first, in twice the log-odds: of two shapes that fit alike the simpler is taken."""
 _ROUNDS, _STEPS = 4, 12
 _SIZE_SHARE = 0.75
 """Largest size of a cause in the search, over the largest that robots have: by full predictions, and by half of a drive, it differs."""

@@ -190,8 +190,9 @@ _MAX_LARGER_SQUARES = 2.0
 """Squares of the discrepancies once causes are corrected, over those before. What is tolerated may hide a part of a cause: of one of 3.7
 times the sigma that it is known by, as it takes to be named, in 1.5 % of robots so much that correcting it makes squares twice as large."""
 _FOREIGN_SHARE = 0.1
-"""The same where the contacts are not the model's and no healthy drive shows what they do: loads move the centre of rotation by a quarter
-more or less, so that 6 % of their squares are left; a CG 68 mm aside in MuJoCo's Warthog explains 8 % less than a LiDAR 69 mm aside."""
+"""`_BASELINE_SHARE` where the contacts are not the model's and no healthy drive shows what they do: loads move the centre of rotation by a
+quarter more or less, so that 6 % of their squares are left; a CG 68 mm aside in MuJoCo's Warthog explains 8 % less than a LiDAR 69 mm
+aside."""
 _FOREIGN_MISSING_SHARE = 0.5
 """Share of what signatures promise that may be missing there: about the other explanation, that CG promises 45 % less."""
 _REFINED_SETS = 2  # sets of each number of causes that are tried by full prediction

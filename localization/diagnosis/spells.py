@@ -31,7 +31,7 @@ from motion_models.se2 import FloatArray
 _OF_WHOLE_DRIVES = ("friction_change", "wheel_radius_drift", "encoder_dropout", "missing_joint_messages")
 """Causes that change on the way by themselves."""
 _FEWEST_WINDOWS = 24
-"""Of a drive, as for changes of the floor."""
+"""Fewest windows of a drive, as for changes of the floor."""
 _FEWEST_INSIDE = 6
 """Windows of a part, and outside of it: of fewer, a cause cannot be distinguished from an outlier."""
 _MARGIN = 7.0

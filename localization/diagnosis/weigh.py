@@ -94,7 +94,7 @@ class SlopeWeighing(NamedTuple):
 
     steepness_rad: float
     height: float
-    """Of the centre of gravity above the floor [m]."""
+    """Height of the centre of gravity above the floor [m]."""
     height_sigma: float
     given_height: float
     """By the robot file [m]."""
@@ -112,7 +112,7 @@ class Nuisance(NamedTuple):
     prior_sigma: float
     """How far robots, floors and mounts differ from their files."""
     unit: str
-    """Of all three; "1" for a share."""
+    """Unit of all three; "1" for a share."""
 
 
 @dataclass(frozen=True)

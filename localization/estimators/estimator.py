@@ -65,7 +65,7 @@ class Residuals(NamedTuple):
     scan_turn: tuple[float, float] | None = None
     """Innovation of the matched scan's yaw by what all other measurements predict, and its variance [rad, rad^2]; None without a scan."""
     scan_way: tuple[float, float] | None = None
-    """The same of the way ahead [m, m^2]."""
+    """Innovation of the matched scan's way ahead, and its variance [m, m^2]."""
 
 
 class GyroCalibration(NamedTuple):

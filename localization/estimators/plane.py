@@ -31,7 +31,7 @@ class Plane:
         config: SpaceConfig,
         smoothing: SpaceSmoothing | None = None,
     ) -> None:
-        """As `SpaceFusion`; ``smoothing``: of the graph."""
+        """Arguments are those of `SpaceFusion`; ``smoothing`` is the graph's."""
         self._of_space, self._lifting, self._smoothing = (gyro, mounts, lidar, config), Lifting(), smoothing
         self._map_T_odom = np.zeros(3)
         self._pose: Pose3 | None = None

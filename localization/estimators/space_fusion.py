@@ -35,7 +35,7 @@ _MIN_POINTS_MAPPED = 50
 """Points with a surface in the submap, below which a cloud is lost. The first cloud of a standing robot has surfaces for a sixth of it."""
 
 _SYSTEMATIC_COV = np.diag([1.5e-3, 1.5e-3, 1.5e-3, 2e-4, 2e-4, 2e-4]) ** 2
-"""Of errors that all points of a cloud have in common, which no residual shows: ground that is not plane within the pooled voxels, and
+"""Covariance of errors that all points of a cloud share, which no residual shows: ground that is not plane within the pooled voxels, and
 motion that changes within a sweep. Clouds matched to maps of true poses err by .5 to 1.4 mm and .04 to .35 mrad beyond their noise
 [m^2, rad^2]."""
 
@@ -77,7 +77,7 @@ class SpaceFusion(Estimator):
 
     @property
     def accelerometer_sigma(self) -> float:
-        """Of the prior of its bias [m/s^2]."""
+        """Sigma of the accelerometer's bias before any measurement [m/s^2]."""
         return self._config.accelerometer_m_s2
 
     def start_key(self) -> None:
@@ -182,7 +182,7 @@ class SpaceFusion(Estimator):
 
     @property
     def clock_offset_s(self) -> float:
-        """Of the wheels' stamps [s]: what the estimator in the plane has found."""
+        """Offset of the wheels' stamps [s]: what the estimator in the plane has found."""
         return self._clock_offset_s
 
     @property

@@ -21,7 +21,7 @@ _STRETCHES = (16, 8)
 above 1.8, the 97.5th percentile of one that is right."""
 _MIN_STRETCHES = 6
 _MAX_NOISE_SHARE = 1.0 / 3.0
-"""Of the variance of a stretch that may be the reference's: neighbours share it, and what is left must show an error of the claim."""
+"""Largest share of the reference in a stretch's variance: neighbours share it, and what is left must show an error of the claim."""
 
 
 def stretch_consistency(

@@ -29,7 +29,7 @@ _FIRST_VOXELS = 1 << 14
 _MIN_POINTS = 6
 """Points without which voxels have no surface."""
 _PLANE_RATIO = 9.0
-"""Of the second to the least variance of a plane, at least: sigma across a third of that along."""
+"""Ratio of the second to the least variance of a plane, at least: sigma across is a third of that along."""
 _UPRIGHT = 0.8
 """Cosine of a line's angle with the vertical, from which on it is a trunk or pole."""
 _KERNEL = 3.0
@@ -37,14 +37,14 @@ _KERNEL = 3.0
 _THINNING = 0.4
 """Edge of the cubes with one point each, in voxels: 3,300 of the 5,200 points of 16 rings on hills."""
 _INLIER_WEIGHT = 0.25
-"""Of Geman-McClure's loss at `_KERNEL` sigmas, over that at none."""
+"""Weight by Geman-McClure's loss at `_KERNEL` sigmas, over that at none."""
 _BLOCK = 2
 """Voxels along each side of a block, whose residuals err together."""
 _BLOCKS = 1 << 13
 _ROWS, _COLUMNS = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
-"""Of the second moments xx, xy, xz, yy, yz, zz."""
+"""Places of the second moments xx, xy, xz, yy, yz, zz in their matrix."""
 _SWEEPS = 6
-"""Of Jacobi's rotations, until off-diagonal entries vanish."""
+"""Sweeps of Jacobi's rotations, until off-diagonal entries vanish."""
 _ITERATIONS, _MIN_STEP = 20, 0.05
 """Most steps of Gauss-Newton, and length below which a step is the last [sigmas]."""
 _OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0])

@@ -60,7 +60,7 @@ class Changes:
 
     @property
     def changed_share(self) -> float:
-        """Of the walls that were measured, the share that is new or gone."""
+        """Share of the measured walls that is new or gone."""
         changed = len(self.new) + len(self.gone)
         return changed / max(changed + self.confirmed, 1)
 

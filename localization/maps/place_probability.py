@@ -48,7 +48,7 @@ SEARCH_WEIGHTS = Weights(7.2, -5.3, 11.2, 1.7, -7.8)
 are right."""
 
 NEAR_WEIGHTS = Weights(17.3, -5.3, 3.2, 4.2, -5.0)
-"""The same for searches of the last 2 m within 3 sigma of a pose that is tracked, where the best place is right within 0.15 m and 0.05 rad:
+"""Weights of searches of the last 2 m within 3 sigma of a pose that is tracked, where the best place is right within 0.15 m and 0.05 rad:
 597 searches in halves of fr079 and ACES. Of 336 in MIT-CSAIL, 296 of the 297 above 0.9 are right (Brier score 0.022)."""
 
 

@@ -96,7 +96,7 @@ class PlaceMap:
         self.fingerprint = hashlib.sha256(b"".join(array.tobytes() for array in arrays)).hexdigest()[:12]
         self.grid: Grid = draw_grid(keyframes, CELL_M)
         self.certain_grid: Grid = draw_grid(keyframes, CELL_M, CERTAINLY_FREE)
-        """The same, free where the map certainly is."""
+        """`grid`, free where the map certainly is."""
         self._inside_free = ndimage.binary_erosion(self.certain_grid.cells.T == 0, iterations=_FREE_BORDER_CELLS)
         points = keyframes.points_in_map()
         index = np.floor((points - self.grid.origin) / CELL_M).astype(np.int64)

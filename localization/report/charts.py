@@ -28,7 +28,7 @@ class Series:
     name: str
     """In the legend; empty for none."""
     colour: str
-    """Of `page.COLOURS`."""
+    """Name of a colour of `page.COLOURS`."""
     x: str = ""
     """Column; "" for what the chart's x axis shows."""
     y: str = ""
@@ -40,7 +40,7 @@ class Series:
     """Fill the area that the line encloses."""
     size: float = 6.0
     symbol: str = "circle"
-    """Of Plotly."""
+    """Name of a symbol of Plotly."""
     texts: Sequence[str] = ()
     """Shown for each point where the pointer is."""
     error: str = ""

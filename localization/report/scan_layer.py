@@ -12,7 +12,7 @@ from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
 _MOST_SCANS, _MOST_POINTS = 150, 60
-"""Of a replay: 60 points show walls, and all scans together are 150 kB of a page."""
+"""Scans of a replay, and points of each: 60 show walls, and all scans together are 150 kB of a page."""
 
 
 def thin_scan(scan: Scan, mounts: Mapping[str, Mount], most: int) -> FloatArray:
@@ -32,7 +32,7 @@ class ScanLayer:
         """Stamp [ns] of the middle of each scan, and its points (M, 2) in the body frame [m]."""
 
     def watch(self, events: Iterable[Event]) -> Iterator[Event]:
-        """The same events."""
+        """Pass the events on, and keep the scans among them."""
         next_ns = -(1 << 62)
         for event in events:
             if isinstance(event, Scan) and event.stamp_ns >= next_ns:

@@ -20,7 +20,7 @@ from motion_models.se2 import FloatArray
 
 _SHOWN = 0.95
 _POINTS = 73
-"""Of an ellipse: one each 5 degrees."""
+"""Points of an ellipse: one each 5 degrees."""
 _WIDTH_IN = 6.0
 _TERMS = {
     "Ellipse": f"Holds the centre of gravity in {100 * _SHOWN:.0f} of 100 such drives, by the covariance of the estimate; where the "

@@ -27,7 +27,8 @@ from motion_models.robot import Robot
 _MAGIC = b"skidloc state 1\n"
 _INT_END = 2**63 - 1
 _MAX_SHARE = 0.01
-"""Of a core, for writing states down: 11 ms with the map of a minute in four rooms (`python -m tests.benchmarks.online latency`)."""
+"""Largest share of a core for writing states down: 11 ms with the map of a minute in four rooms
+(`python -m tests.benchmarks.online latency`)."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class LidarEntrance:
 
     @property
     def largest_error_m(self) -> float:
-        """Of the position [m]: twice the way by the wheels, while the LiDAR travels in another direction; else 0."""
+        """Largest error of the position [m]: twice the way by the wheels, while the LiDAR travels in another direction; else 0."""
         return 2.0 * self._check.contradicted_way_m
 
     def result(self) -> tuple[LidarYaw | None, Iterable[Event]]:

@@ -27,7 +27,8 @@ _AGREE = 0.95
 """Correlation of a turn from where on wheels are as the robot file has them, and no more is read: healthy drives have more."""
 _LIDAR_S = 60.0
 _MAX_POINTS, _MAX_BYTES = 2_000_000, 150_000_000
-"""Of the scans and of the LiDAR's messages that are kept; beyond, its oldest messages are left out, and wheels and gyro bridge them."""
+"""Largest size of the scans, and of the LiDAR's messages, that are kept; beyond, its oldest messages are left out, and wheels and
+gyro bridge them."""
 _NOW = "Corrected from the start of the drive on; write to the robot file:"
 
 

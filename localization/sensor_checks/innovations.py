@@ -52,7 +52,7 @@ class Bin(NamedTuple):
     variance: float
     seconds: float
     regressors: Regressors
-    """Of this bin alone."""
+    """What faults would add within this bin alone."""
     poses: FloatArray
     """(k, 3) by the estimate and by dead reckonings, before its last step."""
 

@@ -37,9 +37,9 @@ _MAX_WAY_M, _MAX_TURN_RAD = 0.6, 0.6
 _MIN_MOVED = 0.12
 """Share of a scan on objects that move, from where on they are left out. Healthy drives: at most .09 (fr079), .17 once in ACES."""
 _MIN_MOVED_WITHOUT_GYRO = 0.2
-"""The same of a robot whose wheels alone measure its turns."""
+"""That share for a robot whose wheels alone measure its turns."""
 _MIN_UNSURE = 0.06
-"""The same from where on it is not sure that the scene is still."""
+"""Share of a scan on objects that move, from where on it is not sure that the scene is still."""
 _MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
 """Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
 from where on labels show whether they do [m]."""

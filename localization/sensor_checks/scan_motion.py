@@ -67,7 +67,7 @@ class ScanOdometry:
 
     def __init__(self) -> None:
         self.last: Profile | None = None
-        """Of the last scan."""
+        """Profile of the last scan."""
 
     def register(self, now: Profile | None) -> ScanMotion | None:
         """Motion since the last call; ``now`` is of any of the body's LiDARs, None of one with too few points.

@@ -41,7 +41,7 @@ simulated robots; Husky outdoors 1.0), LiDAR and gyro 3.3, ways by LiDAR and whe
 _MIN_LEARNED_SIGMAS = 4.0
 """Distance of a learned parameter from the robot file's, in its own sigmas."""
 _MIN_PRIOR_SIGMAS = 3.0
-"""The same, in those of its prior."""
+"""Distance of a learned parameter from the robot file's, in sigmas of its prior."""
 _MIN_TURNING_SIGMAS, _MIN_TURNING_SHARE = 1.4, 0.18
 """Factors on turns stand for the gyro's scale as well, whose prior is far narrower: they count from so many sigmas of the prior
 on, and from this share of the file's value. ACES, fr079, CSAIL and the Husky outdoors have 0.2 sigmas and 3 %, simulated robots 11 %

@@ -34,7 +34,7 @@ _MIN_TRAVEL_BINS = 6
 _MAX_LENGTH_RATIO = 2.0
 """Ways whose lengths differ by more show wheels that spin, or another unit, and no direction."""
 _CONFIDENCE = 0.999
-"""Of the bound of a direction, one-sided: windows overlap, so that one of a thousand is one of some minutes."""
+"""Confidence of a direction's one-sided bound: windows overlap, so that one of a thousand is one of some minutes."""
 _NOISE_M, _SLIDE_M_PER_RAD = 0.005, 0.5
 """Noise of a bin's way by scans at least [m], and what a robot may slide in a turn: half its length [m/rad]."""
 
@@ -71,7 +71,7 @@ class TravelDirection(Check):
 
 
 class Direction(NamedTuple):
-    """Of the LiDAR's travel against the wheels'."""
+    """Direction of the LiDAR's travel against the wheels'."""
 
     angle: float
     """[rad]"""

@@ -84,7 +84,7 @@ class Maneuver:
     """When it starts, after the drive's first wheel message [s]; for terms of a model that change with time."""
 
     middle: int = 0
-    """Of a maneuver whose positions alone were measured, intervals driven until the one between start and end: the one pose measured is
+    """Intervals driven until the pose between start and end of a maneuver whose positions alone were measured: the one pose measured is
     that of the second chord relative to the first (`motion_models.calibration.chords`). 0 for measured poses."""
 
 
@@ -120,7 +120,7 @@ class Batch:
     """Names of the groups, in order of their first maneuver."""
 
     def intervals(self) -> Iterator[slice]:
-        """Of each measured pose, the intervals from its maneuver's start to it."""
+        """Intervals from a maneuver's start to each measured pose."""
         for end, owner in zip(self.ends, self.owner, strict=True):
             yield slice(self.first[owner] + self.lead[owner], end)
 

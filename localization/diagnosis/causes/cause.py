@@ -73,7 +73,7 @@ class Hypothesis:
     cg: tuple[float, float] = _part("load", (0.0, 0.0))
     payload_kg: float = _part("load")
     cg_height: float = _part("floor")
-    """Of the centre of gravity, more [m]."""
+    """Height of the centre of gravity beyond the robot file's [m]."""
     split_friction: float = _part("load")
     """Grip of the left wheels less that of the right ones, over their mean."""
     lidar_offset: tuple[float, float, float] = _part("reference", (0.0, 0.0, 0.0))
@@ -140,7 +140,7 @@ class Setting:
 
     robot: Robot
     kind: str
-    """As `Drive.kind`: log, windows, rotations or runs."""
+    """Kind of the drive (`Drive.kind`): log, windows, rotations or runs."""
     has_positions: bool
     """Positions were measured, and not headings alone."""
     has_headings: bool
