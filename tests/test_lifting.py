@@ -9,6 +9,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from localization.events import ImuSample
 from localization.lifting import AttitudeTable, Lifting, Pose3, quaternion, write_tum3
 from localization.logs.serialization import FusedWriter
 from localization.logs.writer import FusedEstimate, odometry_message, transform_message
@@ -80,6 +81,8 @@ def test_slope_drive_in_mujoco_slides_as_the_odometry_has_it(degrees, mu):
     from tests.studies.hills import errors
 
     made = drive(turn_in_place, 12.0, mu, degrees)
+    resting = [e.linear_acceleration for e in made.events if isinstance(e, ImuSample)][:150]
+    assert np.linalg.norm(np.mean(resting, axis=0)) == pytest.approx(9.81, abs=0.02)
     flat, tilted = errors(made, "ekf", slopes=False), errors(made, "ekf", slopes=True)
     assert flat[0] > 1.0
     assert tilted[0] < 0.25 * flat[0]

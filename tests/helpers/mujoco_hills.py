@@ -89,7 +89,7 @@ def _record(model, data, command, seconds: float, robot: Robot, tilt: FloatArray
     events: list[Event] = []
     stamps, positions, rotations, set_points = [], [], [], np.zeros(2)
     sums, bias, start = np.zeros(6), np.array(_BIAS), round(_START_S / _STEP_S)
-    parked = None  # where the robot stands
+    is_standing = False
     for i in range(round((seconds + _START_S) / _STEP_S) + 1):
         t = i * _STEP_S - _START_S
         R = data.body("base").xmat.reshape(3, 3)
@@ -105,19 +105,23 @@ def _record(model, data, command, seconds: float, robot: Robot, tilt: FloatArray
             goal = np.array([vx - half, vx + half]) / g.wheel_radius_m
             set_points += np.clip(goal - set_points, *(s * _RAMP_RAD_PER_S2 * _WHEELS_EVERY * _STEP_S for s in (-1.0, 1.0)))
             data.ctrl[:] = np.tile(set_points, 2)
-            parked = None if set_points.any() else data.qpos.copy() if parked is None else parked
-        sums += np.concatenate([gyro, force])
+            is_standing = not set_points.any()
+        if is_standing:  # else soft contacts let the robot creep downhill by millimetres a second
+            data.qvel[:] = 0.0
+            sums[3:] -= R.T @ model.opt.gravity
+        else:
+            sums += np.concatenate([gyro, force])
         if i % _IMU_EVERY == 0:
             if i >= start:
                 noise = rng.normal(size=6) * np.repeat([_GYRO_SIGMA, _FORCE_SIGMA], 3)
                 mean = sums / _IMU_EVERY + noise + np.concatenate([bias, np.zeros(3)])
                 events.append(ImuSample(1_000_000_000 + round(t * 1e9), mean[:3], mean[3:], "imu_link"))
             sums[:] = 0.0
+        if is_standing:
+            continue
         if has_hills and i % _GROUND_EVERY == 0:
             _move_ground(data, g.wheel_radius_m)
         mujoco.mj_step(model, data)
-        if parked is not None:  # soft contacts let a standing robot creep downhill by millimetres a second
-            data.qpos[:] = parked
     mounts = {"base_link": Mount(), "imu_link": Mount(0.1, 0.0, 0.2)}
     return HillDrive(robot, mounts, events, np.array(stamps), np.array(positions), np.array(rotations))
 
