@@ -237,6 +237,8 @@ class Problem:
         sigmas = np.array([config.prior_sigma.get(name, np.inf) for name in names])
         self.prior = 1.0 / sigmas**2
         measured = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
+        self.is_whole = measured.all(axis=1)
+        """(M,) whether position and heading of a pose are measured."""
         self.components = int(measured.sum())
         """How many numbers were measured."""
         self.stretch = _MEDIAN_LENGTH[2] / _MEDIAN_LENGTH[np.maximum(measured.sum(axis=1), 1) - 1]
@@ -280,16 +282,24 @@ class Problem:
         return d @ self.combine.T, cov + np.where(np.isfinite(usual), usual, _UNMEASURED)
 
     def residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened residuals (M, 3) and their derivatives (M, 3, c)."""
+        """Whitened residuals (M, 3) and their derivatives (M, 3, c).
+
+        Those of whole poses are exponential coordinates, log(measured^-1 predicted), in which a covariance of right perturbations holds for
+        ways that bend: differences of positions are biased by half the covariance of heading and side (Barfoot and Furgale 2014,
+        "Associating uncertainty with three-dimensional poses", sec. III). Without a measured heading there is no such logarithm.
+        """
         poses, d, _ = predict(self.model, self.batch, self.params(x), self.reference_params(x), self.all_columns, self.config.noise)
         off = se2.between(self.batch.measured, poses)
+        d = d @ self.combine.T
         # d is in the frame of the predicted pose, the derivative of `off` in that of the measured one.
         c, s = np.cos(off[:, 2]), np.sin(off[:, 2])
-        d = d @ self.combine.T
         J = np.stack(
             [c[:, None] * d[:, 0] - s[:, None] * d[:, 1], s[:, None] * d[:, 0] + c[:, None] * d[:, 1], d[:, 2]],
             axis=1,
         )
+        whole = self.is_whole
+        off[whole] = se2.log(off[whole])
+        J[whole] = se2.right_jacobian_inverse(off[whole]) @ d[whole]
         return np.einsum("nij,nj->ni", self.whiten, off), self.whiten @ J
 
     def cost(self, r: FloatArray, x: FloatArray, knee: float, scale: float) -> float:

@@ -18,9 +18,11 @@ from tests.helpers.extended import cases
 START = 1_700_000_000 * S
 GYRO = r"gyro's|by (the )?gyro|and gyro|gyro alone|only headings|headings alone|gyro \+|axes of IMU"
 LIDAR = r"LiDAR alone|by (the )?LiDAR|and LiDAR|scan matching|wheels and scans|mount of LiDAR|along walls"
+WHEELS = r"by (the )?wheels|and wheels|wheels alone|wheels' (stamps|clock|radius)|dead reckoning|wheels and scans|slip"
 REFERENCE = r"against /|position error|mean NEES|covers only"
 COMMANDS = {
     "info": (),
+    "init": ("--out", "new.toml"),
     "check": ("--out", "out"),
     "weigh": (),
     "diagnose": ("--out", "out"),
@@ -47,8 +49,9 @@ def log_of(path: Path, has_imu: bool) -> Path:
 
 def texts(command: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """All that a command prints."""
-    options: Sequence[str] = [str(tmp_path / "out") if option == "out" else option for option in COMMANDS[command]]
-    assert main([command, str(log), "--robot", "husky_a200", *options]) in (0, 2)
+    options: Sequence[str] = [str(tmp_path / option) if option in ("out", "new.toml") else option for option in COMMANDS[command]]
+    robot = ("--like", "husky_a200") if command == "init" else ("--robot", "husky_a200")
+    assert main([command, str(log), *robot, *options]) in (0, 2)
     shown = capsys.readouterr()
     return " ".join((shown.out + shown.err).split())
 
@@ -74,3 +77,18 @@ def test_sentences_on_wheels_and_lidar_name_no_gyro(command: str, tmp_path: Path
 def test_sentences_on_wheels_and_gyro_name_no_other_sensor(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = texts(command, log_of(tmp_path / "log.mcap", has_imu=True), tmp_path, capsys)
     assert re.findall(f"{LIDAR}|{REFERENCE}", text) == []
+    assert "without it or a gyro" not in text
+
+
+@pytest.mark.extended
+def test_sentences_on_lidar_and_gyro_name_no_wheels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = Vehicle(0.165, 0.555, 0.512, 0.5, scan_hz=5.0, beams=120, seed=62)
+    log = write(tmp_path / "log.mcap", vehicle, drive(vehicle), Publishing(forms="none"))
+    options = ["--robot", "husky_a200", "--estimator", "lidar", "--model", "skid_steer", "--out", str(tmp_path / "out")]
+    assert main(["replay", str(log), *options]) == 0
+    shown = capsys.readouterr()
+    assert re.findall(f"{WHEELS}|{REFERENCE}", shown.out + shown.err) == []
+    for command in ("check", "calibrate", "diagnose", "weigh"):
+        text = texts(command, log, tmp_path / command, capsys)
+        assert "no wheels" in text
+        assert re.findall(f"{WHEELS}|{REFERENCE}", text) == []

@@ -1,0 +1,269 @@
+"""Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
+
+`python -m tests.studies.entrance_commands [KIND | part of a NAME ...] [-v]` prints kind, name and outcome (of `tests.studies.entrances`);
+with `-v` also the errors of trajectories [m], of wheels alone and of the EKF, with those of the same drive with nothing wrong in brackets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from localization.cli import main as skidloc
+from localization.evaluation.metrics import align
+from motion_models import se2
+from motion_models.errors import SkidlocError
+from motion_models.robot_file import load_robot, robot_toml
+from tests.helpers import bags
+from tests.helpers.bags import START, Record, S
+from tests.helpers.entrance_drives import Motion, Publishing, Vehicle, cast, drive, records_of
+from tests.studies.entrances import AS_THEY_ARE, Found, Outcome, print_shares
+
+Edit = Callable[[list[Record]], list[Record]]
+Times = Callable[[np.ndarray, float, int], np.ndarray]
+"""Times of points from parts of the sweep (n,), its period [s] and its stamp [ns]."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One input of one command."""
+
+    kind: str
+    name: str
+    judge: Callable[[Path], Found]
+
+
+def run_command(*arguments: str) -> tuple[int, str]:
+    """Exit code and all that a command prints."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        code = skidloc(arguments)
+    return code, out.getvalue()
+
+
+def write_log(folder: Path, vehicle: Vehicle, how: Publishing, edit: Edit) -> tuple[Path, Path, Motion]:
+    """Log and robot file of a drive."""
+    motion = drive(vehicle)
+    log = bags.write_mcap(folder / "log.mcap", sorted(edit(records_of(vehicle, motion, how)), key=lambda record: record[2]))
+    (folder / "robot.toml").write_text(robot_toml(vehicle.robot(), {}, ""))
+    return log, folder / "robot.toml", motion
+
+
+def replayed(folder: Path, log: Path, robot: Path, *options: str) -> tuple[int, str]:
+    """`skidloc replay` of odometry and EKF."""
+    model = "diff_drive" if "diff_drive" in robot.read_text() else "skid_steer"
+    given = ["--model", model, "--estimator", "odometry,ekf", "--out", str(folder / "out"), *options]
+    return run_command("replay", str(log), "--robot", str(robot), *given)
+
+
+def errors_of(folder: Path, motion: Motion) -> tuple[float, float]:
+    """Absolute trajectory errors [m] of odometry and EKF."""
+    found = []
+    for estimator in ("odometry", "ekf"):
+        (path,) = folder.glob(f"*_{estimator}.tum")
+        table = np.array([[float(v) for v in line.split()] for line in path.read_text().splitlines() if line[:1] not in "#"])
+        t, poses = table[:, 0], np.column_stack([table[:, 1:3], 2.0 * np.arctan2(table[:, 6], table[:, 7])])
+        truth = motion.trajectory()
+        stamps = np.round(t * S).astype(np.int64)
+        inside = (stamps >= truth.stamps_ns[0]) & (stamps <= truth.stamps_ns[-1])
+        if inside.mean() < 0.9:
+            return math.inf, math.inf
+        true, ours = truth.at(stamps[inside]), poses[inside]
+        moved = se2.compose(align(ours, true[:, :2], true[:, 2]), ours)
+        found.append(float(np.sqrt(np.mean(np.sum((moved - true)[:, :2] ** 2, axis=1)))))
+    return found[0], found[1]
+
+
+@cache
+def healthy_errors(vehicle: Vehicle) -> tuple[float, float]:
+    """`errors_of` the drive with nothing wrong."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        log, robot, motion = write_log(folder, vehicle, Publishing(), lambda records: records)
+        code, text = replayed(folder, log, robot)
+        assert code == 0, text
+        return errors_of(folder / "out", motion)
+
+
+def _warnings(text: str) -> str:
+    return "\n".join(
+        line for line in text.splitlines() if (line.startswith("!") and "has no k_0" not in line) or line.startswith("skidloc:")
+    )
+
+
+def driven(
+    kind: str,
+    name: str,
+    vehicle: Vehicle,
+    how: Publishing = AS_THEY_ARE,
+    words: Sequence[str] = (),
+    edit: Edit = lambda records: records,
+    refused: bool = False,
+) -> Case:
+    """A log: right where `replay` is as good as with nothing wrong and a warning has one of ``words``; what `check` contradicts is printed.
+
+    ``refused``: that it ends with exit 2 and one of ``words`` is right.
+    """
+
+    def judge(folder: Path) -> Found:
+        log, robot, motion = write_log(folder, vehicle, how, edit)
+        code, text = replayed(folder, log, robot)
+        said = _warnings(text)
+        is_named = not words or any(word in said for word in words)
+        if code:
+            outcome: Outcome = "right" if refused and is_named else "named" if words and is_named else "misnamed"
+            return Found(outcome, f"[exit {code}] {said or text}")
+        ours, best = errors_of(folder / "out", motion), healthy_errors(vehicle)
+        state = f"[odometry {ours[0]:.3f} ({best[0]:.3f}), EKF {ours[1]:.3f} ({best[1]:.3f}) m]"
+        is_right = all(a < 1.5 * b + 0.03 for a, b in zip(ours, best, strict=True))
+        code, text = run_command("check", str(log), "--robot", str(robot), "--json", str(folder / "check.json"))
+        checked = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []
+        wrong = [row for row in checked if row["verdict"] == "contradiction"]
+        state += f" check: {[row['quantity'] + ': ' + row['advice'] for row in wrong] or code or 'no contradiction'}\n"
+        if is_right:
+            return Found("right" if is_named else "misnamed" if said else "silent", state + said)
+        return Found("named" if words and is_named else "misnamed" if said else "silent", state + said)
+
+    return Case(kind, name, judge)
+
+
+def scored(
+    name: str, vehicle: Vehicle, content: Callable[[Motion], str], suffix: str = "tum", words: Sequence[str] = (), noise: float = 0.0
+) -> Case:
+    """A reference file: right where the runs have the errors of the healthy drive against it, or where a sentence has all of ``words``."""
+
+    def judge(folder: Path) -> Found:
+        log, robot, motion = write_log(folder, vehicle, Publishing(), lambda records: records)
+        path = folder / f"reference.{suffix}"
+        path.write_text(content(motion))
+        code, text = replayed(folder, log, robot, "--reference", str(path), "--json", str(folder / "m.json"))
+        flat = " ".join(text.split())
+        if words:
+            is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
+            return Found(
+                "right"
+                if is_named and not is_judged
+                else "misnamed"
+                if code or "reference" in _warnings(text) or "until that" in flat.lower()
+                else "silent",
+                f"[exit {code}] {text}",
+            )
+        if code:
+            return Found("misnamed", f"[exit {code}] {text}")
+        found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
+        best = dict(zip(("odometry", "ekf"), healthy_errors(vehicle), strict=True))
+        is_right = all(abs(found[k] - best[k]) < 0.3 * best[k] + 0.03 + noise for k in best)
+        return Found(
+            "right" if is_right and "Until that" not in text else "silent" if is_right is False and not _warnings(text) else "misnamed",
+            f"[{found}, {best}] {_warnings(text)}",
+        )
+
+    return Case("references", name, judge)
+
+
+def clouded(name: str, vehicle: Vehicle, field_name: str, dtype: str, times: Times, words: Sequence[str] = ()) -> Case:
+    """Sweeps of 0.1 s: right where the EKF is as good as with times in seconds, or where one of ``words`` names what is wrong."""
+
+    def judge(folder: Path) -> Found:
+        found = _cloud_error(folder, vehicle, field_name, dtype, times)
+        (folder / "healthy").mkdir()
+        best = _cloud_error(folder / "healthy", vehicle, "time", "f4", lambda u, period, stamp: u * period)
+        said, state = _warnings(found[1]), f"[EKF {found[0]:.3f} ({best[0]:.3f}) m] "
+        is_named = bool(words) and any(word in said for word in words)
+        if words:
+            return Found("right" if is_named else "misnamed" if said else "silent", state + said)
+        is_right = found[0] < 1.5 * best[0] + 0.01
+        return Found("right" if is_right and not said else "misnamed" if said else "silent", state + said)
+
+    return Case("point times", name, judge)
+
+
+def _cloud_error(folder: Path, vehicle: Vehicle, field_name: str, dtype: str, times: Times) -> tuple[float, str]:
+    period = 0.1
+    motion, part = drive(vehicle), np.linspace(0.0, 0.9975, 400)
+    rng = np.random.default_rng(4)
+
+    def edit(records: list[Record]) -> list[Record]:
+        more = [("/tf_static", bags.tf(START, [("base_link", "lidar", (0.15, 0.0, 0.3), bags.quaternion())]), START)]
+        for t in np.arange(0.0, 25.0, period):
+            stamp = START + round(t * S)
+            poses = motion.poses[np.minimum(np.round((t + part * period) / 0.01).astype(int), len(motion.t) - 1)]
+            bearings = 0.001 - math.pi + math.tau * part
+            x, y = poses[:, 0] + 0.15 * np.cos(poses[:, 2]), poses[:, 1] + 0.15 * np.sin(poses[:, 2])
+            r = np.array([cast(a, b, np.array([c]), vehicle.room)[0] for a, b, c in zip(x, y, poses[:, 2] + bearings, strict=True)])
+            r += 0.008 * rng.normal(size=len(r))
+            table = np.zeros((6, len(part)), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), (field_name, dtype)])
+            table["x"], table["y"], table[field_name] = r * np.cos(bearings), r * np.sin(bearings), times(part, period, stamp)
+            table["z"] = np.linspace(-0.15, 0.6, 6)[:, None]
+            more.append(("/points", bags.cloud(stamp, table), stamp + round(1.2 * period * S)))
+        return [record for record in [*records, *more] if record[2] < START + 25 * S]
+
+    log, robot, motion = write_log(folder, vehicle, Publishing(), edit)
+    code, text = replayed(folder, log, robot)
+    return (math.inf if code else errors_of(folder / "out", motion)[1]), text
+
+
+def initialized(
+    name: str,
+    vehicle: Vehicle,
+    urdf: str,
+    how: Publishing = AS_THEY_ARE,
+    words: Sequence[str] = (),
+    asked: Sequence[str] = (),
+    refused: bool = False,
+) -> Case:
+    """A URDF beside a log: right where the file has radius, track and sides of the vehicle, and the output has all of ``words``."""
+
+    def judge(folder: Path) -> Found:
+        log, _, _ = write_log(folder, vehicle, how, lambda records: records)
+        (folder / "robot.urdf").write_text(urdf)
+        code, text = run_command("init", str(log), "--urdf", str(folder / "robot.urdf"), "--out", str(folder / "new.toml"))
+        flat = " ".join(text.split())
+        is_named = all(word in flat for word in words)
+        if code or not (folder / "new.toml").exists():
+            return Found("right" if refused and is_named else "named" if is_named else "misnamed", f"[exit {code}] {text}")
+        try:
+            robot = load_robot(folder / "new.toml")
+        except SkidlocError as error:
+            is_right = bool(asked) and all(name in str(error) + text for name in asked)
+            return Found("right" if is_right and is_named else "named" if is_named else "misnamed", f"{error}\n{text}")
+        pairs = ((robot.geometry.wheel_radius_m, vehicle.radius), (robot.geometry.track_width_m, vehicle.track))
+        is_right = all(abs(math.log(a / b)) < 0.05 for a, b in pairs) and not refused
+        state = f"[{pairs}, CG {robot.center_of_gravity}] "
+        return Found(("right" if is_named else "misnamed") if is_right else "named" if is_named and words else "silent", state + text)
+
+    return Case("descriptions", name, judge)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Judge those that are named, by default all."""
+    from tests.studies.entrance_command_cases import CASES
+
+    wanted = [a for a in arguments if not a.startswith("-")]
+    found = []
+    for case in (c for c in CASES if not wanted or any(w == c.kind or w in c.name for w in wanted)):
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                one = case.judge(Path(folder))
+            except Exception:
+                one = Found("silent", traceback.format_exc())
+        found.append((case, one))
+        print(f"{case.kind:13s} {case.name:50s} {one.outcome}", flush=True)
+        if "-v" in arguments or one.outcome in ("silent", "misnamed"):
+            print("      " + one.text[:1500].replace("\n", "\n      "), flush=True)
+    print_shares(found)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
