@@ -22,7 +22,7 @@ from localization.lidar.frames import LidarFrames
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
-from motion_models.extended_model import Series, in_series, needs_series
+from motion_models.extended_model import SampleSeries, in_series, needs_series
 from motion_models.friction.model import BoolArray
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.preintegration import integrate_twists
@@ -294,7 +294,7 @@ class Synchronizer:
         model = self.model
         if self._needs_series:
             since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self._first_wheel_ns or start_ns)) * 1e-9
-            model = in_series(model, Series(np.r_[np.zeros(n), dt], since))
+            model = in_series(model, SampleSeries(np.r_[np.zeros(n), dt], since))
         if tilt is None or self._slope_effect is None:
             twist = model.twist(rates, cg, self.params)
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])

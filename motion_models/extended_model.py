@@ -24,7 +24,7 @@ _LAST = 90
 _OWN, _SERIES = ("v", "wz"), ("dv", "dwz", "t")
 
 
-class Series(NamedTuple):
+class SampleSeries(NamedTuple):
     """When samples were taken, for terms of accelerations and of time."""
 
     dt: FloatArray
@@ -42,7 +42,7 @@ class ExtendedModel(ModelWrapper):
     """
 
     terms: tuple[Term, ...]
-    series: Series | None = None
+    series: SampleSeries | None = None
     """Time, place and wheel angle of the samples that `twist` gets next, in the same order; None for steady motion at the drive's start."""
 
     @property
@@ -153,7 +153,7 @@ def needs_series(model: object) -> bool:
     return any(name in _SERIES for term in terms_of(model) for name in term.expression.variables)
 
 
-def in_series(model: Any, series: Series) -> Any:
+def in_series(model: Any, series: SampleSeries) -> Any:
     """``model`` for samples taken as ``series`` has it, where its terms depend on accelerations or time; else the same."""
     if isinstance(model, ExtendedModel):
         return dataclasses.replace(model, series=series) if needs_series(model) else model

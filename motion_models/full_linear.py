@@ -17,7 +17,7 @@ import numpy as np
 from motion_models.base import ModelBase, Twist
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
-from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Direction, Free, Param, Traits
+from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, JointCorrection, Param, Traits
 from motion_models.prior import slip_at_speed
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
@@ -30,12 +30,12 @@ _LATERAL_SLIP_S, _ROTATION_SLIP_S_PER_M = 0.05, 0.01
 """Prior sigmas where there is none of the robot's own (`motion_models.prior.slip_at_speed`: 0.02 to 0.09 s, and under 0.01 s/m)."""
 _DIRECTIONS = (
     # both columns by one factor: separate ones would turn a robot that drives straight, as a gyro bias does
-    Direction(
+    JointCorrection(
         "rotation_scale",
         *("1", "yaw rate of given wheel rates, relative", TURNING_SIGMA),
         {"wz_left": ("wz_left", 1.0), "wz_right": ("wz_right", 1.0)},
     ),
-    Direction(
+    JointCorrection(
         "x_cr",
         *("m", "centre of rotation ahead of the middle", CENTRE_X_SIGMA_M),
         {"vy_left": ("wz_left", -1.0), "vy_right": ("wz_right", -1.0)},

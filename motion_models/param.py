@@ -58,7 +58,7 @@ class Param:
 
 
 @dataclass(frozen=True)
-class Direction:
+class JointCorrection:
     """A correction that changes several parameters together, by a number without a parameter of its own."""
 
     name: str
@@ -81,7 +81,7 @@ class Traits:
     """Its coefficients are those of a skidding robot on level ground: on slopes the friction model's difference is added."""
     min_track_over_radius: float = 0.0
     """Track over turning radius below which a motion does not excite its corrections."""
-    directions: tuple[Direction, ...] = ()
+    directions: tuple[JointCorrection, ...] = ()
     """Corrections that change several parameters together."""
     correction_params: tuple[Param, ...] = ()
     """Parameters that `MotionModel.with_correction_params` adds."""

@@ -39,7 +39,7 @@ _CALIBRATION_TURN_S, _TURN_RAD_PER_S = 20.0, 0.5
 
 
 @dataclass(frozen=True)
-class Evidence:
+class MeasuredK:
     """A robot whose k was measured, or is in its manufacturer's driver."""
 
     robot: str
@@ -51,23 +51,23 @@ class Evidence:
 
 
 EVIDENCE = (
-    Evidence("vaultbot", 0.9541 / 1.875, 0.5263, "68 rotations in place, Ebersole 2016, 4.21"),
-    Evidence("husky_a200", 1.0 / 1.875, 0.5433, "Clearpath's wheel_separation_multiplier"),
-    Evidence("drive_husky", 0.43 / 0.928, 0.5433, "DRIVE windows: k 0.43 by the wheels, over their effectiveness of 0.928 straight ahead"),
-    Evidence("borealtc_husky", 0.6764, 0.5433, "BorealTC, 75 runs: geometric mean of 0.768 (floor), 0.722, 0.722, 0.599, 0.590 (snow)"),
-    Evidence("upenn_4wd", 0.525, 0.576, "a four-wheeled rover whose log is not shipped"),
-    Evidence("jackal", 1.0 / 1.5, 0.6614, "Clearpath's wheel_separation_multiplier"),
-    Evidence("husky_a300", 1.0 / 1.75, 0.5357, "Clearpath's wheel_separation_multiplier"),
-    Evidence("leo", 1.0 / 1.76, 0.5681, "firmware's robot_angular_velocity_multiplier"),
-    Evidence("rosbot", 0.192 / (0.186 * 1.36), 0.7555, "Husarion's wheel_separation_multiplier, at radii that it measured"),
-    Evidence("rosbot_xl", 1.0 / 1.3, 0.6690, "Husarion's wheel_separation_multiplier, an office floor"),
-    Evidence("warthog", 0.61, 0.5957, "middle of 0.59 to 0.63 by logs that are not shipped"),
+    MeasuredK("vaultbot", 0.9541 / 1.875, 0.5263, "68 rotations in place, Ebersole 2016, 4.21"),
+    MeasuredK("husky_a200", 1.0 / 1.875, 0.5433, "Clearpath's wheel_separation_multiplier"),
+    MeasuredK("drive_husky", 0.43 / 0.928, 0.5433, "DRIVE windows: k 0.43 by the wheels, over their effectiveness of 0.928 straight ahead"),
+    MeasuredK("borealtc_husky", 0.6764, 0.5433, "BorealTC, 75 runs: geometric mean of 0.768 (floor), 0.722, 0.722, 0.599, 0.590 (snow)"),
+    MeasuredK("upenn_4wd", 0.525, 0.576, "a four-wheeled rover whose log is not shipped"),
+    MeasuredK("jackal", 1.0 / 1.5, 0.6614, "Clearpath's wheel_separation_multiplier"),
+    MeasuredK("husky_a300", 1.0 / 1.75, 0.5357, "Clearpath's wheel_separation_multiplier"),
+    MeasuredK("leo", 1.0 / 1.76, 0.5681, "firmware's robot_angular_velocity_multiplier"),
+    MeasuredK("rosbot", 0.192 / (0.186 * 1.36), 0.7555, "Husarion's wheel_separation_multiplier, at radii that it measured"),
+    MeasuredK("rosbot_xl", 1.0 / 1.3, 0.6690, "Husarion's wheel_separation_multiplier, an office floor"),
+    MeasuredK("warthog", 0.61, 0.5957, "middle of 0.59 to 0.63 by logs that are not shipped"),
 )
 """Grounds from floor to snow are averaged for each robot; they differ by 12 % (BorealTC). The last three were added as a test of the first
 eight, with a standard deviation of 0.105: all are inside its 90 % interval."""
 
 
-def scaling_sigma(evidence: tuple[Evidence, ...] = EVIDENCE) -> float:
+def scaling_sigma(evidence: tuple[MeasuredK, ...] = EVIDENCE) -> float:
     """Relative standard deviation of a predicted k: root mean square of log(measured / predicted) over robots.
 
     The mean of the logarithms (0.014) is well inside its standard error (0.03), so no bias is subtracted.

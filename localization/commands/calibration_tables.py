@@ -18,7 +18,7 @@ from motion_models.calibration.cross_validation import Interval, LearnedNoise, r
 from motion_models.calibration.plan import CLOCK, text_of
 from motion_models.calibration.regressions import (
     COMMANDED_RAD_PER_S,
-    Regression,
+    LinearRegression,
     RotationTable,
     SkidSteerFit,
     cor_x,
@@ -251,7 +251,7 @@ def print_regressions(console: Console, table: RotationTable, found: SkidSteerFi
     print_table(console, free)
 
 
-def _print_plane(console: Console, plane: Regression) -> None:
+def _print_plane(console: Console, plane: LinearRegression) -> None:
     print_line(console, "Table 4-4  regression of y_CR on x_G and y_G")
     for what, value in (
         ("multiple R", math.sqrt(plane.r_squared)),
@@ -321,7 +321,7 @@ def regression_numbers(
     x, slope, intercept = cor_y_lines(table)
     by_slope, by_intercept = cor_y_full(x, slope, intercept)
 
-    def numbers(r: Regression) -> dict[str, Any]:
+    def numbers(r: LinearRegression) -> dict[str, Any]:
         return {"terms": list(r.names), "coefficients": r.coefficients.tolist(), "sigma": r.sigma.tolist(), "r_squared": r.r_squared}
 
     return {

@@ -18,11 +18,11 @@ from rich.table import Table as Grid
 
 from localization.commands.common import names, write_json
 from localization.comparison.comparison_page import CompareHead, check_report, write_comparison_report
-from localization.comparison.jobs import OK, Job, Place, Row, job_key, run_job, run_local, run_on_cluster, trials
+from localization.comparison.jobs import OK, Job, LogOrigin, Row, job_key, run_job, run_local, run_on_cluster, trials
 from localization.comparison.manifest import Entry, read_manifest
 from localization.comparison.remote import is_url
 from localization.comparison.result_table import ResultFolder, ResultTable
-from localization.comparison.statistics import Findings, against_best, closing, find, headline
+from localization.comparison.statistics import ComparisonFindings, against_best, closing, find, headline
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
@@ -128,7 +128,7 @@ class Compare:
         if self.manifest is None:
             if self.robot is None:
                 raise RobotError("--robot is missing: name a shipped robot (`skidloc robots`) or the path of a robot file.")
-            return [Entry(str(log), self.robot, self.reference, Place()) for log in self.logs]
+            return [Entry(str(log), self.robot, self.reference, LogOrigin()) for log in self.logs]
         if self.logs:
             raise LogError(f"logs are named on the command line and by --manifest {self.manifest}. Leave one of them out.")
         return read_manifest(self.manifest, self.robot, self.reference)
@@ -181,7 +181,7 @@ def places(out: Path) -> tuple[Path, Path]:
     return out, out.with_suffix(".html")
 
 
-def _content(found: Findings) -> dict[str, Any]:
+def _content(found: ComparisonFindings) -> dict[str, Any]:
     return {
         "metric": found.metric,
         "verdict": " ".join([headline(found), *closing(found)]),

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 from localization.comparison.jobs import OK, Row
-from localization.comparison.statistics import Findings, by_combination, combination, measure_of
-from localization.report.charts import Chart, Series
+from localization.comparison.statistics import ComparisonFindings, by_combination, combination, measure_of
+from localization.report.charts import Chart, ChartSeries
 from localization.report.page import Cell, Table
 from localization.report.replay_page import number, unit_of
 from localization.report.runs import capitalize
@@ -30,14 +30,14 @@ def is_wide(values: Sequence[float]) -> bool:
     return min(values) > 0.0 and max(values) > _LOG_SCALE_RATIO * min(values)
 
 
-def run_charts(found: Findings, styles: Mapping[str, tuple[str, int]], short: Mapping[str, str]) -> list[Chart]:
+def run_charts(found: ComparisonFindings, styles: Mapping[str, tuple[str, int]], short: Mapping[str, str]) -> list[Chart]:
     """``styles``: colour's name and number of the motion model by combination; ``short``: name of each log in a table."""
     shown = [mean.name for mean in found.means]
     charts = [_by_number(found, shown, styles, short)]
     return charts if len(shown) < 2 else [*charts, _by_pair(found, shown, short)]
 
 
-def run_table(found: Findings, short: Mapping[str, str], styles: Mapping[str, tuple[str, int]]) -> Table:
+def run_table(found: ComparisonFindings, short: Mapping[str, str], styles: Mapping[str, tuple[str, int]]) -> Table:
     """A row for each run, to be sorted and filtered."""
     names = _numbers(found)
     rows = []
@@ -51,7 +51,7 @@ def run_table(found: Findings, short: Mapping[str, str], styles: Mapping[str, tu
     return Table([Cell("Log"), Cell("Run", is_words=True), Cell("Status"), *titles], rows, is_sortable=True)
 
 
-def _by_number(found: Findings, shown: Sequence[str], styles: Mapping[str, tuple[str, int]], short: Mapping[str, str]) -> Chart:
+def _by_number(found: ComparisonFindings, shown: Sequence[str], styles: Mapping[str, tuple[str, int]], short: Mapping[str, str]) -> Chart:
     names, columns, series = _numbers(found), {}, []
     for k, name in enumerate(shown):
         rows = [row for row in found.rows if combination(row) == name and row["status"] == OK]
@@ -61,7 +61,7 @@ def _by_number(found: Findings, shown: Sequence[str], styles: Mapping[str, tuple
             columns[group + column] = [_value(row, column) for row in rows]
         colour, model = styles[name]
         texts = [f"{short[row['log']]}, {found.words[name]}" for row in rows]
-        series.append(Series("", colour, y="row", texts=texts, symbol=_SYMBOLS[model % len(_SYMBOLS)], size=8.0, group=group))
+        series.append(ChartSeries("", colour, y="row", texts=texts, symbol=_SYMBOLS[model % len(_SYMBOLS)], size=8.0, group=group))
     values = [v for table in by_combination(found.rows, found.metric).values() for v in table.values()]
     return Chart(
         "Every run",
@@ -76,7 +76,7 @@ def _by_number(found: Findings, shown: Sequence[str], styles: Mapping[str, tuple
     )
 
 
-def _by_pair(found: Findings, shown: Sequence[str], short: Mapping[str, str]) -> Chart:
+def _by_pair(found: ComparisonFindings, shown: Sequence[str], short: Mapping[str, str]) -> Chart:
     numbers = by_combination(found.rows, found.metric)
     logs = list(dict.fromkeys(row["log"] for row in found.rows))
     columns = {name: [numbers[name].get(log, math.nan) for log in logs] for name in shown}
@@ -86,7 +86,7 @@ def _by_pair(found: Findings, shown: Sequence[str], short: Mapping[str, str]) ->
         "Two of them, log by log",
         x=axes,
         y=[axes[1], axes[0], *axes[2:]],
-        series=[Series("", "blue", texts=[short[log] for log in logs], size=9.0)],
+        series=[ChartSeries("", "blue", texts=[short[log] for log in logs], size=9.0)],
         columns=columns,
         is_y_chosen=True,
         has_diagonal=True,
@@ -95,7 +95,7 @@ def _by_pair(found: Findings, shown: Sequence[str], short: Mapping[str, str]) ->
     )
 
 
-def _numbers(found: Findings) -> list[str]:
+def _numbers(found: ComparisonFindings) -> list[str]:
     """The metric first."""
     return [name for name in dict.fromkeys((found.metric, *_NUMBERS)) if any(math.isfinite(_value(row, name)) for row in found.rows)]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from localization.comparison.comparison_charts import is_wide, run_charts, run_table
 from localization.comparison.statistics import (
+    ComparisonFindings,
     Difference,
-    Findings,
     Mean,
     against_best,
     by_combination,
@@ -59,7 +59,7 @@ class CompareHead:
     """On the robot, in sentences."""
 
 
-def write_comparison_report(path: Path, head: CompareHead, found: Findings, is_interactive: bool = True) -> None:
+def write_comparison_report(path: Path, head: CompareHead, found: ComparisonFindings, is_interactive: bool = True) -> None:
     """Write the page, over the report of an earlier state of the same table, but over nothing else. Raises `OutputError`."""
     check_report(path)
     write_text_file(path, comparison_page(head, found, is_interactive), replace=True)
@@ -74,7 +74,7 @@ def check_report(path: Path) -> None:
         raise OutputError(f"'{path}' cannot be read: {error.strerror}.") from error
 
 
-def comparison_page(head: CompareHead, found: Findings, is_interactive: bool = True) -> str:
+def comparison_page(head: CompareHead, found: ComparisonFindings, is_interactive: bool = True) -> str:
     """HTML of the whole page; ``found`` has means. Unless it ``is_interactive``, without scripts."""
     n = len(_logs(found))
     title = f"{_TITLE} {n} log{'s' * (n != 1)}"
@@ -100,12 +100,12 @@ def _unbroken(sentence: str) -> str:
     return sentence.replace(" %", "\N{NO-BREAK SPACE}%").replace("p = ", "p\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}")
 
 
-def _means_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> html.Figure:
+def _means_figure(found: ComparisonFindings, styles: Mapping[str, tuple[str, int]]) -> html.Figure:
     caption = "Large: mean over logs, the line its 95 % interval. Small: each log. Colours are estimators, shapes are motion models."
     return html.Figure(_means_svg(found, styles), f"Mean {found.measure} by combination", caption)
 
 
-def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
+def _gains_figure(found: ComparisonFindings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
     differences = [(mean, found.against_best(mean.name)) for mean in found.means[1:]]
     others: list[Mean] = [mean for mean, d in differences if d is not None and not math.isnan(d.relative)]
     if not others:
@@ -117,7 +117,7 @@ def _gains_figure(found: Findings, styles: Mapping[str, tuple[str, int]]) -> lis
     return [html.Figure(_gains_svg(found, others, styles), f"By how much the {found.measure} of the best is smaller", caption)]
 
 
-def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
+def _tests(found: ComparisonFindings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
     digits = _digits(found)
     rows = []
     for mean in found.means:
@@ -145,12 +145,12 @@ def _tests(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.
     return [html.Table(header, rows), *sentences, *_all_pairs(found)]
 
 
-def _cells(d: Difference, found: Findings) -> tuple[str, str, str]:
+def _cells(d: Difference, found: ComparisonFindings) -> tuple[str, str, str]:
     reverse = "" if d.better == found.best.name else "the other: "
     return f"{reverse}{percent(d, found.unit)}", f"{d.wins} of {d.n}", p_words(d.p_value)
 
 
-def _all_pairs(found: Findings) -> list[html.Block]:
+def _all_pairs(found: ComparisonFindings) -> list[html.Block]:
     if len(found.means) < 3:
         return []
     rows = [
@@ -165,7 +165,7 @@ def _all_pairs(found: Findings) -> list[html.Block]:
     return [html.Table([html.Cell(title) for title in ("Pair", "Smaller by", "on", "p")], rows, "All pairs")]
 
 
-def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
+def _by_log(found: ComparisonFindings, styles: Mapping[str, tuple[str, int]]) -> list[html.Block]:
     numbers = by_combination(found.rows, found.metric)
     shown = [mean.name for mean in found.means]
     failed = {(r["log"], combination(r)) for r in found.failed}
@@ -183,7 +183,7 @@ def _by_log(found: Findings, styles: Mapping[str, tuple[str, int]]) -> list[html
     return [html.Table(header, rows), html.Paragraph(f"{found.measure}{unit}. Bold: the smallest on its log.", is_small=True)]
 
 
-def _failures(found: Findings) -> list[html.Block]:
+def _failures(found: ComparisonFindings) -> list[html.Block]:
     reasons: dict[tuple[str, str], list[str]] = {}
     for r in found.failed:
         reasons.setdefault((r["log"], r["error"]), []).append(found.words[combination(r)])
@@ -194,48 +194,48 @@ def _failures(found: Findings) -> list[html.Block]:
     return [html.Bullets(items)] if items else []
 
 
-def _problems(found: Findings) -> list[html.Block]:
+def _problems(found: ComparisonFindings) -> list[html.Block]:
     notes = {r["log"]: r["notes"] for r in found.rows if r.get("notes")}
     return [html.Bullets([html.ListItem(note, _short(log, found)) for log, note in notes.items()])] if notes else []
 
 
-def _name(name: str, found: Findings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> html.Cell:
+def _name(name: str, found: ComparisonFindings, styles: Mapping[str, tuple[str, int]], badge: str = "") -> html.Cell:
     estimator, _, model = found.words[name].partition(" with ")
     return html.Cell(estimator, model, is_bold=True, badge=badge, mark=styles[name][0])
 
 
-def _digits(found: Findings) -> int:
+def _digits(found: ComparisonFindings) -> int:
     """After the point, so that the smallest mean has three that count."""
     least = min(abs(mean.mean) for mean in found.means)
     return min(max(2 - math.floor(math.log10(least)), 0), 6) if least else 3
 
 
-def _styles(found: Findings) -> dict[str, tuple[str, int]]:
+def _styles(found: ComparisonFindings) -> dict[str, tuple[str, int]]:
     """Colour's name, by estimator as in all reports, and number of the motion model, by name of the combination."""
     colours = estimator_colours(r["estimator"] for r in found.rows)
     models = list(dict.fromkeys(r["model"] for r in found.rows))
     return {combination(r): (colours[r["estimator"]], models.index(r["model"])) for r in found.rows}
 
 
-def _logs(found: Findings) -> list[str]:
+def _logs(found: ComparisonFindings) -> list[str]:
     return list(dict.fromkeys(r["log"] for r in found.rows))
 
 
-def _names(found: Findings) -> dict[str, str]:
+def _names(found: ComparisonFindings) -> dict[str, str]:
     return {log: _short(log, found) for log in _logs(found)}
 
 
-def _short(log: str, found: Findings) -> str:
+def _short(log: str, found: ComparisonFindings) -> str:
     """The log's name alone, where no other log has the same."""
     name = Path(log).name
     return name if sum(Path(other).name == name for other in _logs(found)) == 1 else log
 
 
-def _provenance(head: CompareHead, found: Findings) -> dict[str, str]:
+def _provenance(head: CompareHead, found: ComparisonFindings) -> dict[str, str]:
     return {"robot": head.robot, "metric": found.metric, "reference": head.reference, "all numbers": head.table, **head.versions}
 
 
-def _means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
+def _means_svg(found: ComparisonFindings, styles: Mapping[str, tuple[str, int]]) -> str:
     """A row for each combination, the best on top: a dot for each log, the mean and its 95 % interval. ``styles``: colour's name and
     number of the motion model, by name of the combination."""
     values = {name: np.array(list(table.values())) for name, table in by_combination(found.rows, found.metric).items()}
@@ -259,7 +259,7 @@ def _means_svg(found: Findings, styles: Mapping[str, tuple[str, int]]) -> str:
     return svg("means", html.WIDTH_IN, _ROW_HEIGHT_IN * len(found.means) + 0.75, draw)
 
 
-def _gains_svg(found: Findings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]]) -> str:
+def _gains_svg(found: ComparisonFindings, others: Sequence[Mean], styles: Mapping[str, tuple[str, int]]) -> str:
     """By how much the best is smaller than each of ``others``, with 95 % intervals: those that reach 0 show nothing."""
 
     def draw(figure: Canvas) -> None:
@@ -298,5 +298,5 @@ def _spread(row: int, n: int) -> np.ndarray:
     return row + 0.24 * (np.arange(n) % 3 - 1.0)
 
 
-def _with_unit(found: Findings) -> str:
+def _with_unit(found: ComparisonFindings) -> str:
     return f"{found.measure} [{found.unit}]" if found.unit else found.measure

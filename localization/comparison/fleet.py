@@ -35,7 +35,7 @@ _NUMBER = re.compile(r"[-+]?\d+(\.\d+)?")
 
 
 @dataclass(frozen=True)
-class Change:
+class DayChange:
     """k of a day against the days before."""
 
     relative: float
@@ -63,7 +63,7 @@ class Day:
     """Centre of gravity by robot file, arms and topic, x and y."""
     with_faults: int
     """Logs with faults."""
-    change: Change | None = None
+    change: DayChange | None = None
     """None on a first day, and where fewer than three logs are compared."""
     is_alarm: bool = False
 
@@ -103,7 +103,7 @@ def fleet_table(rows: Sequence[Row], pair: str | None = None) -> FleetTable:
     return FleetTable(pair, days, tests, len(failed), [(*key, n) for key, n in counts.most_common()])
 
 
-def compare_k(before: FloatArray, after: FloatArray) -> Change | None:
+def compare_k(before: FloatArray, after: FloatArray) -> DayChange | None:
     """Change from k ``before`` (n,) to ``after`` (m,); None for n < 2."""
     n, m = len(before), len(after)
     if n < 2 or m < 1:
@@ -111,7 +111,7 @@ def compare_k(before: FloatArray, after: FloatArray) -> Change | None:
     variance = float(n * np.var(before) + m * np.var(after)) / (n + m - 2)
     change = float(after.mean() - before.mean())
     statistic = abs(change) / math.sqrt(variance * (1.0 / n + 1.0 / m)) if variance else (math.inf if change else 0.0)
-    return Change(change / float(before.mean()), float(2.0 * student_t.sf(statistic, n + m - 2)))
+    return DayChange(change / float(before.mean()), float(2.0 * student_t.sf(statistic, n + m - 2)))
 
 
 def _rows_of(rows: Sequence[Row], pair: str | None) -> tuple[str, list[Row]]:

@@ -78,7 +78,7 @@ class TrialSpec:
 
 
 @dataclass(frozen=True)
-class Place:
+class LogOrigin:
     """Where and when a log was recorded."""
 
     floor: str = ""
@@ -101,7 +101,7 @@ class Job:
     config: ReplayConfig = field(default_factory=ReplayConfig)
     folder: Path = field(default_factory=Path.cwd)
     """Where relative paths start; a worker of a cluster runs in another one."""
-    place: Place = field(default_factory=Place)
+    place: LogOrigin = field(default_factory=LogOrigin)
     trajectories: Path | None = None
     """New folder for the trajectories, one file MODEL_ESTIMATOR.tum for each trial; None: they are not kept."""
 

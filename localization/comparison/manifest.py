@@ -6,7 +6,7 @@ import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-from localization.comparison.jobs import Place
+from localization.comparison.jobs import LogOrigin
 from localization.errors import LogError
 
 COLUMNS = ("log", "robot", "reference", "floor", "day")
@@ -22,7 +22,7 @@ class Entry:
     """Name of a shipped robot, or path of a robot file, with its folder."""
     reference: str | None
     """Topic, file or URL; None: the robot file's topic."""
-    place: Place
+    place: LogOrigin
 
 
 def read_manifest(path: Path, robot: str | None, reference: str | None) -> list[Entry]:
@@ -54,4 +54,4 @@ def _entry(path: Path, line: int, row: dict[str, str], robot: str | None, refere
         raise LogError(f"manifest '{path}', line {line}: no {missing}.")
     if row["robot"].endswith(".toml"):
         name = str(path.parent / name)
-    return Entry(row["log"], name, row["reference"] or reference, Place(row["floor"], row["day"]))
+    return Entry(row["log"], name, row["reference"] or reference, LogOrigin(row["floor"], row["day"]))

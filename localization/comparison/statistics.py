@@ -229,7 +229,7 @@ def _accepted(flips: _Flips, estimate: float, level: float) -> tuple[float, floa
 
 
 @dataclass(frozen=True, eq=False)
-class Findings:
+class ComparisonFindings:
     """Results of a comparison; made by `find`."""
 
     metric: str
@@ -285,7 +285,7 @@ class Findings:
         return min(1.0, len(self.tested) * 2.0 ** (1 - n))
 
 
-def find(rows: Sequence[Row], metric: str) -> Findings:
+def find(rows: Sequence[Row], metric: str) -> ComparisonFindings:
     """Means, differences and words of ``rows``. ``means`` is empty where none has a number ``metric``."""
     found = sorted(means(rows, metric), key=lambda mean: mean.mean)
     forms = {row["corrections"] for row in rows if row["corrections"]}
@@ -293,10 +293,10 @@ def find(rows: Sequence[Row], metric: str) -> Findings:
     for row in rows:
         form = f" ({row['corrections']})" if row["corrections"] and len(forms) > 1 else ""
         words[combination(row)] = describe_run(row["estimator"], row["model"]) + form
-    return Findings(metric, rows, found, differences(rows, metric), words)
+    return ComparisonFindings(metric, rows, found, differences(rows, metric), words)
 
 
-def headline(found: Findings) -> str:
+def headline(found: ComparisonFindings) -> str:
     """The best against the next one."""
     best, others = found.best, found.means[1:]
     return (
@@ -304,7 +304,7 @@ def headline(found: Findings) -> str:
     )
 
 
-def against_best(other: Mean, found: Findings) -> str:
+def against_best(other: Mean, found: ComparisonFindings) -> str:
     """Sentence that compares the best with another one."""
     difference = found.against_best(other.name)
     if difference is None:
@@ -313,12 +313,12 @@ def against_best(other: Mean, found: Findings) -> str:
     return _of(difference, found)
 
 
-def closing(found: Findings) -> list[str]:
+def closing(found: ComparisonFindings) -> list[str]:
     """What is missing, and what to do."""
     return [*_incomplete(found), *_losses(found), _advice(found)]
 
 
-def _of(d: Difference, found: Findings) -> str:
+def _of(d: Difference, found: ComparisonFindings) -> str:
     better, worse = found.words[d.better], found.words[d.worse]
     gap = f"by {percent(d, found.unit)} of {found.measure}, p = {p_words(d.p_value)}"
     if found.is_shown(d):
@@ -348,12 +348,12 @@ def _part(value: float) -> str:
     return f"{per_cent:.1f}" if 99.0 <= per_cent < 100.0 else f"{per_cent:z.0f}"
 
 
-def _amount(mean: Mean, found: Findings) -> str:
+def _amount(mean: Mean, found: ComparisonFindings) -> str:
     between = f" [{mean.low:.3g}, {mean.high:.3g}]" if mean.n > 1 else ""
     return f"mean {found.measure} {mean.mean:.3g}{between} {found.unit}".rstrip()
 
 
-def _incomplete(found: Findings) -> list[str]:
+def _incomplete(found: ComparisonFindings) -> list[str]:
     sentences = []
     if len({mean.n for mean in found.means}) > 1:
         sentences.append(
@@ -367,7 +367,7 @@ def _incomplete(found: Findings) -> list[str]:
     return sentences
 
 
-def _losses(found: Findings) -> list[str]:
+def _losses(found: ComparisonFindings) -> list[str]:
     """Combinations that lost the LiDAR for long, and where it was the longest."""
     sentences = []
     for mean in found.means:
@@ -384,7 +384,7 @@ def _losses(found: Findings) -> list[str]:
     return sentences
 
 
-def _advice(found: Findings) -> str:
+def _advice(found: ComparisonFindings) -> str:
     best, pairs = found.best, [(mean, found.against_best(mean.name)) for mean in found.means[1:]]
     equal = [found.words[mean.name] for mean, d in pairs if d is None or not found.is_shown(d)]
     if not pairs:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, with_sizes
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Hypothesis, with_sizes
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Finding
 from motion_models.base import MotionModel
@@ -43,7 +43,7 @@ def correct_robot(predictor: DrivePredictor, sizes: Mapping[Cause, float]) -> Co
     friction = FrictionModel.from_robot(robot)
     own = dict(zip(friction.param_names, (float(v) for v in friction.nominal), strict=True))
     start = dataclasses.replace(robot, models={**robot.models, friction.name: own})
-    draft = Draft(start, drive, np.zeros((len(predictor.batch.dt), 2)))
+    draft = CorrectionDraft(start, drive, np.zeros((len(predictor.batch.dt), 2)))
     for cause, size in sizes.items():
         draft = draft if cause.correct is None else cause.correct(draft, size)
     lasting = with_sizes(sizes).without_passing()

@@ -38,7 +38,7 @@ from localization.diagnosis.linearization import (
     linearize,
     make_predictor,
 )
-from localization.diagnosis.model_error import ModelError, find_model_error, size_error, unmodelled_by
+from localization.diagnosis.model_error import MissingSlips, find_model_error, size_error, unmodelled_by
 from localization.diagnosis.noise import slip_sigmas, slow_turn_sigmas
 from localization.diagnosis.selection import (
     aliases_of,
@@ -99,7 +99,7 @@ class DiagnosisConfig(Settings):
 
 
 @dataclass(frozen=True)
-class Residuals:
+class DriveDiscrepancies:
     """Discrepancies, for pictures."""
 
     rows: FloatArray
@@ -117,7 +117,7 @@ class DiagnosisResult:
     diagnosis: Diagnosis
     predictor: DrivePredictor | None
     """None where too little was measured."""
-    residuals: Residuals | None
+    residuals: DriveDiscrepancies | None
     linearization: Linearization | None = None
     """The last linearization of the drive: its signatures, and its noise."""
 
@@ -157,16 +157,16 @@ class _Searched(NamedTuple):
     """About the robot file."""
     linearization: Linearization
     """About the best causes."""
-    error: ModelError
+    error: MissingSlips
 
 
-def _linearize_with_model_error(predictor: DrivePredictor, config: DiagnosisConfig) -> tuple[DrivePredictor, Linearization, ModelError]:
+def _linearize_with_model_error(predictor: DrivePredictor, config: DiagnosisConfig) -> tuple[DrivePredictor, Linearization, MissingSlips]:
     """The drive about the robot file, beside what the friction model is off on other contacts; a healthy drive shows that, so that nothing
     is added to its baseline."""
     drive = predictor.drive
     is_searched = predictor.model.name == FrictionModel.name and is_skid_steer(drive.robot) and drive.kind in ("log", "windows")
     if not is_searched or predictor.has_baseline:
-        return predictor, linearize(predictor, candidate_causes(predictor, config.moments), {}, TOLERANCE), ModelError(0.0, 0.0)
+        return predictor, linearize(predictor, candidate_causes(predictor, config.moments), {}, TOLERANCE), MissingSlips(0.0, 0.0)
     predictor = dataclasses.replace(predictor, unmodelled=Unmodelled(has_stiffness=True))
     causes = candidate_causes(predictor, config.moments)
     first = linearize(predictor, causes, {}, TOLERANCE)
@@ -311,7 +311,7 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
     named = [f.definition.key for f in correctable_findings(result)] or [causes[i].key for i in chosen]
     result = dataclasses.replace(result, handover=check_findings(predictor, linearization, named))
     result = _with_data_errors(result, drive)
-    residuals = Residuals(first.rows, left, linearization.noise.sigmas)
+    residuals = DriveDiscrepancies(first.rows, left, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)
 
 

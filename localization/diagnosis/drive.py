@@ -431,7 +431,7 @@ def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postur
 
 
 @dataclass(frozen=True)
-class Run:
+class TableRun:
     """One line of the table."""
 
     trajectory: str
@@ -440,7 +440,7 @@ class Run:
     vision_error_m: float
 
 
-def read_runs(path: Path) -> list[Run]:
+def read_runs(path: Path) -> list[TableRun]:
     """The table's runs. Raises `CalibrationError`, naming line and column."""
     columns, rows = read_rows(path)
     missing = [name for name in COLUMNS if name not in columns]
@@ -460,13 +460,13 @@ def read_runs(path: Path) -> list[Run]:
             raise CalibrationError(
                 f"table '{path}', line {line}: vision_error_m must be a distance in metres, found {cells['vision_error_m']!r}."
             )
-        found.append(Run(cells["trajectory"], cells["arm_configuration"], cells["controller"], error))
+        found.append(TableRun(cells["trajectory"], cells["arm_configuration"], cells["controller"], error))
     if not found:
         raise CalibrationError(f"table '{path}' has no rows below its header.")
     return found
 
 
-def drive_of_runs(name: str, robot: Robot, runs: list[Run]) -> Drive:
+def drive_of_runs(name: str, robot: Robot, runs: list[TableRun]) -> Drive:
     """Each run as a maneuver that ends with the odometry's path."""
     maneuvers, paths = [], []
     for run in runs:

@@ -11,7 +11,7 @@ from typing import get_args
 
 import numpy as np
 
-from localization.diagnosis.causes.cause import Cause, Hypothesis, Motion, Spell, Stage, changed
+from localization.diagnosis.causes.cause import Cause, DriveMotion, Hypothesis, Spell, Stage, changed
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
@@ -469,7 +469,7 @@ class _HypothesisModel:
         if b.encoder_loss:
             rates = rates * (1.0 + b.encoder_loss / max(p._lost_time, 1e-9) * p._lost)
         if b.changed_rates:
-            rates = changed(b.changed_rates, Motion(rates, np.zeros((len(rates), 3)), p.batch.dt, p.times_s), "rates")
+            rates = changed(b.changed_rates, DriveMotion(rates, np.zeros((len(rates), 3)), p.batch.dt, p.times_s), "rates")
         value = self._of_model(rates, cg, params) + self._floor(rates, cg)
         if p.drive.robot.drive == DIFF_DRIVE:
             track = p.drive.robot.geometry.track_width_m
@@ -491,7 +491,7 @@ class _HypothesisModel:
             lateral, rotation, forward = b.slip_coefficients
             value = np.stack([vx * (1.0 - forward * np.abs(wz)), vy + lateral * vx * wz, wz * (1.0 - rotation * np.abs(vx))], axis=-1)
         if b.changed_twists:
-            value = changed(b.changed_twists, Motion(rates, value, p.batch.dt, p.times_s), "twist")
+            value = changed(b.changed_twists, DriveMotion(rates, value, p.batch.dt, p.times_s), "twist")
         n, k = len(value), len(params)
         return Twist(np.ascontiguousarray(value), np.zeros((n, 3, 2)), np.zeros((n, 3, 2)), np.zeros((n, 3, k)))
 

@@ -20,7 +20,7 @@ from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, ex
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Attribution, HandoverCheck
-from localization.diagnosis.handover import Candidate, Reader, check_written
+from localization.diagnosis.handover import CandidateRobot, Reader, check_written
 from localization.diagnosis.missing_terms import (
     SEARCHED,
     FoundEffect,
@@ -185,7 +185,7 @@ def _check(predictor: DrivePredictor, search: Search, reader: Reader | None) -> 
         return None
     used, held = halves(len(predictor.drive.maneuvers))
     by_half, sizes = _robot_by(predictor, search, used[predictor.batch.owner])
-    return check_written(predictor, search.state.noise, Candidate(by_half, sizes, held), reader)
+    return check_written(predictor, search.state.noise, CandidateRobot(by_half, sizes, held), reader)
 
 
 def _with_effects(

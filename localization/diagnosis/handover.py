@@ -79,7 +79,7 @@ class Reader:
 
 
 @dataclasses.dataclass(frozen=True)
-class Candidate:
+class CandidateRobot:
     """A robot that was corrected by a part of a drive alone, and the rest, on which its file is checked."""
 
     corrected: CorrectedRobot
@@ -103,7 +103,7 @@ def check_findings(
         sizes = _first_half_sizes(predictor, linearization, named[:count])
         if sizes is None:
             break
-        found = check_written(predictor, linearization.noise, Candidate(correct_robot(predictor, sizes), sizes, held), reader)
+        found = check_written(predictor, linearization.noise, CandidateRobot(correct_robot(predictor, sizes), sizes, held), reader)
         if found is None:
             break
         found = dataclasses.replace(found, corrected=tuple(named[:count]))
@@ -113,7 +113,7 @@ def check_findings(
     return first
 
 
-def check_written(predictor: DrivePredictor, noise: Noise, candidate: Candidate, reader: Reader | None) -> HandoverCheck | None:
+def check_written(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader | None) -> HandoverCheck | None:
     """Write the robot file of the ``candidate``, read it again, and predict and replay the windows that are held out with it.
 
     With a ``reader`` the log is read with the file, so that units, clocks, ranges and mounts act as they do in other commands, and is
@@ -132,7 +132,7 @@ def check_written(predictor: DrivePredictor, noise: Noise, candidate: Candidate,
         return _check_replayed(predictor, noise, candidate, reader)
 
 
-def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: Candidate) -> HandoverCheck | None:
+def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot) -> HandoverCheck | None:
     """Windows held out, as the file predicts them."""
     drive, hypothesis = predictor.drive, with_sizes(candidate.sizes)
     after = predictor_after(predictor, candidate.corrected, predictor.model.name)
@@ -147,7 +147,7 @@ def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: Candida
     return found if odometry is None else dataclasses.replace(found, replays={"odometry": odometry})
 
 
-def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidate, reader: Reader) -> HandoverCheck | None:
+def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader) -> HandoverCheck | None:
     """Windows held out, of the log as it is read and replayed with the file."""
     old, new, name = predictor.drive.robot, candidate.corrected.robot, predictor.model.name
     drive = reader.drive(new)

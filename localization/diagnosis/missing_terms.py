@@ -83,7 +83,7 @@ _LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True)
-class Candidate:
+class CandidateTerm:
     """A term without its coefficient, and its price in twice the log-odds."""
 
     component: str
@@ -131,7 +131,7 @@ class Search(NamedTuple):
     """(M, 6) what these add to the discrepancies."""
 
 
-def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[Candidate, ...]:
+def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[CandidateTerm, ...]:
     """Candidates for a drive in which ``count`` numbers were measured, beside so many ``others``; CG products only where the CG moves."""
     powers = list(itertools.product(_POWERS, _POWERS))[1:]
     texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
@@ -145,7 +145,7 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
             found.setdefault((component, parse_expression(text)))
     base = 2.0 * math.log(len(found) + others) + math.log(max(count, 2))
     more = {(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
-    return tuple(Candidate(c, e, base + _complexity(Term(c, e, 0.0)) + more.get((c, e), 0.0)) for c, e in found)
+    return tuple(CandidateTerm(c, e, base + _complexity(Term(c, e, 0.0)) + more.get((c, e), 0.0)) for c, e in found)
 
 
 def _complexity(term: Term) -> float:
@@ -154,7 +154,7 @@ def _complexity(term: Term) -> float:
 
 
 def term_columns(
-    predictor: DrivePredictor, hypothesis: Hypothesis, candidates: Sequence[Candidate], path: FloatArray | None = None
+    predictor: DrivePredictor, hypothesis: Hypothesis, candidates: Sequence[CandidateTerm], path: FloatArray | None = None
 ) -> FloatArray:
     """(M, 6, K) change of the discrepancies per unit of each candidate's coefficient, with the sign of what the term removes, about the
     motion of the twists ``path`` (N, 3), by default the predicted ones."""
@@ -324,7 +324,7 @@ def _describe(
     state: Linearization,
     noise: Noise,
     chosen: tuple[int, ...],
-    known: tuple[Sequence[Candidate], Sequence[BoundShape]],
+    known: tuple[Sequence[CandidateTerm], Sequence[BoundShape]],
     stability: Mapping[int, float],
 ) -> Search:
     """The ``chosen`` columns of causes, then candidates, then bound shapes, with sizes by Gauss-Newton steps."""
@@ -357,7 +357,7 @@ def _make_design(
     state: Linearization,
     hypothesis: Hypothesis,
     causes: Sequence[int],
-    candidates: Sequence[Candidate],
+    candidates: Sequence[CandidateTerm],
     bound: FloatArray,
 ) -> _Design:
     """Rows, what is tolerated, and columns of ``causes``, of ``candidates`` about ``hypothesis``, and the ``bound`` ones (M, 6, k)."""
@@ -389,7 +389,7 @@ def refine(
     if not terms:
         return sizes, terms
     causes = [state.causes[i] for i in kept]
-    candidates = [Candidate(t.component, t.expression, 0.0) for t in terms]
+    candidates = [CandidateTerm(t.component, t.expression, 0.0) for t in terms]
     for _ in range(_NEWTON_STEPS):
         hypothesis = with_sizes({cause: float(s) for cause, s in zip(causes, sizes, strict=True)})
         extended = dataclasses.replace(predictor, model=extended_model(predictor, terms))

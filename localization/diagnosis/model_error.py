@@ -39,7 +39,7 @@ _SHARES = np.geomspace(1e-3, 0.2, 20)
 """Sigmas of the slips that are tried."""
 
 
-class ModelError(NamedTuple):
+class MissingSlips(NamedTuple):
     """Slips by kind of motion that the model does not have."""
 
     log_odds: float
@@ -65,7 +65,7 @@ class ModelError(NamedTuple):
         return f"log-likelihood +{0.5 * self.log_odds:.0f}"
 
 
-def find_model_error(predictor: DrivePredictor, linearization: Linearization) -> ModelError:
+def find_model_error(predictor: DrivePredictor, linearization: Linearization) -> MissingSlips:
     """Errors of the model on the drive of ``predictor``: of the contacts' stiffness, where the ``linearization`` has it, and slips by kind
     of motion, of which it has none."""
     columns = np.where(np.isfinite(linearization.rows)[..., None], slip_columns(predictor), np.nan)
@@ -78,10 +78,10 @@ def find_model_error(predictor: DrivePredictor, linearization: Linearization) ->
     shares = np.r_[0.0, _SHARES] if N.shape[1] > LEVELS else _SHARES
     gains = [_twice_log_evidence(y, np.hstack([S, N, share * E])) - nothing for share in shares]
     best = int(np.argmax(gains))
-    return ModelError(gains[best], float(shares[best])) if gains[best] > 0.0 else ModelError(0.0, 0.0)
+    return MissingSlips(gains[best], float(shares[best])) if gains[best] > 0.0 else MissingSlips(0.0, 0.0)
 
 
-def unmodelled_by(predictor: DrivePredictor, error: ModelError) -> Unmodelled:
+def unmodelled_by(predictor: DrivePredictor, error: MissingSlips) -> Unmodelled:
     """What the model's ``error`` adds to the nuisances of a diagnosis: slips as large as other contacts make, and no larger."""
     return dataclasses.replace(predictor.unmodelled, slip_share=_SLIP_SHARE if error.is_shown else 0.0)
 

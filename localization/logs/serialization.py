@@ -221,7 +221,7 @@ class Header(NamedTuple):
     frame_id: str
 
 
-class Vector(NamedTuple):
+class Vector3(NamedTuple):
     """geometry_msgs/Vector3."""
 
     x: float
@@ -233,8 +233,8 @@ class ImuMessage(NamedTuple):
     """What is used of sensor_msgs/Imu."""
 
     header: Header
-    angular_velocity: Vector
-    linear_acceleration: Vector
+    angular_velocity: Vector3
+    linear_acceleration: Vector3
 
 
 class JointStateMessage(NamedTuple):
@@ -279,7 +279,7 @@ def _imu(data: bytes) -> ImuMessage | None:
     if not data.startswith(_CDR) or not 0 <= len(data) - at - _IMU.size < 4 or not length or data[end - 1]:
         return None
     wx, wy, wz, ax, ay, az = _IMU.unpack_from(data, at)
-    return ImuMessage(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector(wx, wy, wz), Vector(ax, ay, az))
+    return ImuMessage(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector3(wx, wy, wz), Vector3(ax, ay, az))
 
 
 def _laser_scan(data: bytes) -> LaserScanMessage | None:

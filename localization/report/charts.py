@@ -22,7 +22,7 @@ Axis = Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class ChartSeries:
     """Points or a line; of a series without a column of its own for y, it is what the chart's y axis shows."""
 
     name: str
@@ -60,7 +60,7 @@ class Chart:
     x: Axis
     y: Axis
     """One entry for each panel; with ``is_y_chosen`` the columns to choose from in the only panel."""
-    series: Sequence[Series]
+    series: Sequence[ChartSeries]
     columns: Mapping[str, ArrayLike]
     is_y_chosen: bool = False
     height_px: int = 340

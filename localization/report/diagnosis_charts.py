@@ -8,7 +8,7 @@ import numpy as np
 
 from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS, DrivePredictor
-from localization.report.charts import Axis, Chart, Series
+from localization.report.charts import Axis, Chart, ChartSeries
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -73,10 +73,12 @@ def _discrepancies(found: DiagnosisResult, columns: dict[str, FloatArray], along
     series = []
     for panel, c in enumerate(shown):
         name = CHANNELS[c]
-        series.append(Series("as found", "red", y=f"found {name}", panel=panel, size=6.0, texts=[f"{t}, as found" for t in texts]))
-        series.append(Series("corrected", "blue", y=f"corrected {name}", panel=panel, size=5.0, texts=[f"{t}, corrected" for t in texts]))
+        series.append(ChartSeries("as found", "red", y=f"found {name}", panel=panel, size=6.0, texts=[f"{t}, as found" for t in texts]))
         series.append(
-            Series(
+            ChartSeries("corrected", "blue", y=f"corrected {name}", panel=panel, size=5.0, texts=[f"{t}, corrected" for t in texts])
+        )
+        series.append(
+            ChartSeries(
                 "sigma of the noise", "grey", y=f"sigma {name}", panel=panel, size=3.0, texts=[f"{t}, sigma" for t in texts], is_hidden=True
             )
         )
@@ -97,7 +99,7 @@ def _place_chart(columns: dict[str, FloatArray], shown: list[int]) -> Chart:
             texts = [f"{label}: {v:.4g}" for v in columns[f"{kind} {name}"]]
             is_hidden = kind == "corrected" or c != shown[0]
             series.append(
-                Series(label, "red", x="place x", y="place y", size=8.0, colour_by=f"{kind} {name}", texts=texts, is_hidden=is_hidden)
+                ChartSeries(label, "red", x="place x", y="place y", size=8.0, colour_by=f"{kind} {name}", texts=texts, is_hidden=is_hidden)
             )
     note = "Windows put end to end by their measured motion: the place drifts as the motion reference does."
     return Chart(
@@ -146,7 +148,7 @@ def _odds(found: DiagnosisResult) -> list[Chart]:
         rows = np.arange(len(names), dtype=float)
         texts = [f"{name}: {value:.2g} times as likely" for name, value in zip(names, odds, strict=True)]
         columns = {"odds": np.maximum(odds, _LEAST_ODDS), "row": rows}
-        series = [Series("", "green", y="row", size=11.0, texts=texts, symbol="diamond")]
+        series = [ChartSeries("", "green", y="row", size=11.0, texts=texts, symbol="diamond")]
         charts.append(
             Chart(
                 f"In place of {f.definition.label}",

@@ -19,7 +19,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from localization.evaluation.consistency import mean_band
 from localization.report.page import COLOURS, WIDTH_IN, for_page
-from localization.report.runs import MapView, NisMeans, PlottedRun, RelationBins, Timeline, raster, thin_path, thin_series
+from localization.report.runs import MapPlane, NisMeans, PlottedRun, RelationBins, Timeline, raster, thin_path, thin_series
 
 __all__ = [
     "Axes",
@@ -73,7 +73,7 @@ _ASPECT = (0.35, 0.9)
 """Height by width of a map at least and at most: a narrower one is a ribbon, a taller one leaves the screen."""
 
 
-def map_svg(lines: Sequence[PlottedRun], view: MapView) -> str:
+def map_svg(lines: Sequence[PlottedRun], view: MapPlane) -> str:
     """Trajectories, reference and ellipses over the map, in metres of one length along both axes."""
     low, high = view.low, view.high
     extent = np.maximum(high - low, 1e-6)
@@ -141,7 +141,7 @@ def nis_svg(lines: Sequence[PlottedRun], means: Sequence[NisMeans]) -> str:
     return svg("nis", WIDTH_IN, 2.6, draw)
 
 
-def overview(lines: Sequence[PlottedRun], view: MapView, measure: str, title: str) -> bytes:
+def overview(lines: Sequence[PlottedRun], view: MapPlane, measure: str, title: str) -> bytes:
     """A PNG: the trajectories over the map, beside one bar for each run with its headline error."""
 
     def draw(figure: Figure) -> None:
@@ -163,7 +163,7 @@ def picture(width_in: float, height_in: float, draw: Callable[[Figure], None]) -
     return out.getvalue()
 
 
-def _draw_map(axes: Axes, lines: Sequence[PlottedRun], view: MapView, pixels: int) -> None:
+def _draw_map(axes: Axes, lines: Sequence[PlottedRun], view: MapPlane, pixels: int) -> None:
     low, high = view.low, view.high
     resolution = float((high - low).max()) / pixels
     if len(view.points):

@@ -18,7 +18,7 @@ from localization.report import figures
 from localization.report import page as html
 from localization.report.interactive import Scans, explorer
 from localization.report.map_page import change_blocks, grid_figure, picture_grid
-from localization.report.runs import MapView, PlottedRun, best_run, map_view, nis_means, plotted_runs, relation_bins, timeline
+from localization.report.runs import MapPlane, PlottedRun, best_run, map_view, nis_means, plotted_runs, relation_bins, timeline
 from localization.report.space_view import profile_svg, space_tracks, stretch, view_svg
 from localization.report.summary import is_close, metres, verdict, verdict_sentences
 
@@ -165,7 +165,7 @@ def _about_reference(runs: Sequence[PlottedRun], reference: ReferenceTrack | Rel
     return [*sentences, *dict.fromkeys(warning for a in scored for warning in a.warnings)]
 
 
-def _map_figure(runs: Sequence[PlottedRun], view: MapView) -> html.Figure:
+def _map_figure(runs: Sequence[PlottedRun], view: MapPlane) -> html.Figure:
     aligned = "Each run is aligned with the reference as a whole." if view.reference is not None else "All runs start at the same pose."
     sentences = [aligned]
     if view.map_of is not None:

@@ -206,7 +206,7 @@ def thin_series(values: FloatArray, most: int = 700) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class MapView:
+class MapPlane:
     """Map, reference and paths in one plane: the reference's where the runs are aligned to one, else the world of the common start."""
 
     low: FloatArray
@@ -233,7 +233,7 @@ class MapView:
     """Number of lines that leave the picture."""
 
 
-def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> MapView:
+def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None) -> MapPlane:
     """Borders hold the reference, the best run, and the map without its outliers. The others widen them by at most a fifth: a diverged
     run must not make the rest too small.
     """
@@ -253,7 +253,7 @@ def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations 
     margin = 0.03 * max(float((high - low).max()), 1.0)
     low, high = low - margin, high + margin
     order = sorted(lines, key=lambda line: (line.error is None, line.error or 0.0, line.number))
-    return MapView(
+    return MapPlane(
         low=low,
         high=high,
         points=points,
@@ -268,7 +268,7 @@ def map_view(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations 
     )
 
 
-def raster(view: MapView, resolution_m: float) -> tuple[NDArray[np.uint8], tuple[float, float, float, float]]:
+def raster(view: MapPlane, resolution_m: float) -> tuple[NDArray[np.uint8], tuple[float, float, float, float]]:
     """The map's points as grey of more or less alpha (H, W, 4), top row first, and its left, right, bottom and top border [m]."""
     width, height = np.maximum(np.ceil((view.high - view.low) / resolution_m).astype(int), 1)
     column, row = np.floor((view.points - view.low) / resolution_m).astype(int).T

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from localization.diagnosis.weigh import DrivenWeighing, Nuisance
 from localization.report import page as html
-from localization.report.charts import Chart, Series
+from localization.report.charts import Chart, ChartSeries
 from localization.report.figures import Figure as Canvas
 from localization.report.figures import svg
 from motion_models.robot import Geometry
@@ -104,11 +104,11 @@ def _cg_chart(found: DrivenWeighing, ellipse: FloatArray, wheels: FloatArray, at
         ("found", found.position, "blue", "circle"),
         *([] if at is None else [("load", np.array(at), "orange", "triangle-up")]),
     ]
-    series = [Series(f"{100 * _SHOWN:.0f} % ellipse", "blue", x="ellipse x", y="ellipse y", is_line=True, is_filled=True)]
-    series.append(Series("wheels", "ink", x="wheel x", y="wheel y", size=13.0, symbol="square", texts=["wheel"] * 4))
+    series = [ChartSeries(f"{100 * _SHOWN:.0f} % ellipse", "blue", x="ellipse x", y="ellipse y", is_line=True, is_filled=True)]
+    series.append(ChartSeries("wheels", "ink", x="wheel x", y="wheel y", size=13.0, symbol="square", texts=["wheel"] * 4))
     for name, point, colour, symbol in points:
         columns |= {f"{name} x": point[:1], f"{name} y": point[1:]}
-        series.append(Series(name, colour, x=f"{name} x", y=f"{name} y", size=10.0, symbol=symbol, texts=[name]))
+        series.append(ChartSeries(name, colour, x=f"{name} x", y=f"{name} y", size=10.0, symbol=symbol, texts=[name]))
     title = "Centre of gravity between the wheels"
     note = "From above, ahead to the right. Scroll to zoom to the ellipse."
     return Chart(title, [("found x", "x [m]")], [("found y", "y [m]")], series, columns, is_map=True, height_px=420, note=note)

@@ -6,7 +6,7 @@ import numpy as np
 
 from localization.simulation.terrain import cast_at_ground, poses_on
 from localization.simulation.vehicle import POSE, TrueMotion
-from localization.simulation.world import Grid, cast_rays
+from localization.simulation.world import WallGrid, cast_rays
 from motion_models import se3
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -35,7 +35,7 @@ def imu_motion(track: TrueMotion, times: FloatArray, period: float, mount: Mount
 
 
 def ring_ranges(
-    rows: FloatArray, mount: Mount, angles: tuple[FloatArray, FloatArray], longest_m: float, grid: Grid, waves: FloatArray
+    rows: FloatArray, mount: Mount, angles: tuple[FloatArray, FloatArray], longest_m: float, grid: WallGrid, waves: FloatArray
 ) -> FloatArray:
     """(rings, columns) true ranges from the body's poses at ``rows`` (columns, 13); inf where nothing is hit.
 

@@ -14,7 +14,7 @@ from localization.logs import message_templates
 from localization.logs.message_templates import Message
 from localization.simulation.hill_sensors import BODY_ABOVE_FLOOR_M, ring_ranges
 from localization.simulation.vehicle import SampleClock, TrueMotion, pose_at, seconds
-from localization.simulation.world import Grid, World, cast, cast_at_people, make_grid
+from localization.simulation.world import WallGrid, World, cast, cast_at_people, make_grid
 from motion_models.compiled import kernel
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -147,7 +147,7 @@ class BeamPattern(NamedTuple):
 class Scene(NamedTuple):
     """What beams can hit, and the motion of the scanner through it."""
 
-    grid: Grid
+    grid: WallGrid
     people: FloatArray
     rows: FloatArray
     """(n, 13) records of the true motion, ``step_s`` apart from ``start_s`` on."""

@@ -174,7 +174,7 @@ _GLASS_MIRRORS = 0.985  # glass returns a beam that hits it within 10 degrees of
 _FAR = 1e9
 
 
-class Grid(NamedTuple):
+class WallGrid(NamedTuple):
     """Wall segments, and which of them touch each cell."""
 
     x0: float
@@ -189,10 +189,10 @@ class Grid(NamedTuple):
     """(n, 5) as `World.walls`."""
 
 
-def make_grid(walls: FloatArray, cell: float = 0.5) -> Grid:
+def make_grid(walls: FloatArray, cell: float = 0.5) -> WallGrid:
     """The grid of ``walls`` (n, 5), with cells of ``cell`` [m]."""
     if len(walls) == 0:
-        return Grid(0.0, 0.0, 1.0, 1, 1, np.zeros(2, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 5)))
+        return WallGrid(0.0, 0.0, 1.0, 1, 1, np.zeros(2, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 5)))
     ends = walls[:, :4].reshape(-1, 2)
     low, high = ends.min(axis=0) - 0.5 * cell, ends.max(axis=0) + 0.5 * cell
     columns, rows = (math.ceil(span / cell) for span in high - low)
@@ -206,11 +206,11 @@ def make_grid(walls: FloatArray, cell: float = 0.5) -> Grid:
                 lists[j * columns + i].append(k)
     first = np.concatenate([[0], np.cumsum([len(one) for one in lists])]).astype(np.int64)
     items = np.array([k for one in lists for k in one], dtype=np.int64)
-    return Grid(float(low[0]), float(low[1]), cell, columns, rows, first, items, np.ascontiguousarray(walls))
+    return WallGrid(float(low[0]), float(low[1]), cell, columns, rows, first, items, np.ascontiguousarray(walls))
 
 
 @kernel
-def cast(x: float, y: float, angle: float, longest: float, grid: Grid) -> float:
+def cast(x: float, y: float, angle: float, longest: float, grid: WallGrid) -> float:
     """Distance to the first wall that returns the beam from ``x, y`` along ``angle``; inf if none does within ``longest`` [m]."""
     ux, uy = math.cos(angle), math.sin(angle)
     # Enter the grid.
@@ -309,7 +309,7 @@ def _distance(x: float, y: float, xa: float, ya: float, xb: float, yb: float) ->
 
 
 @kernel
-def cast_rays(origins: FloatArray, directions: FloatArray, longest: float, grid: Grid, ranges: FloatArray) -> None:
+def cast_rays(origins: FloatArray, directions: FloatArray, longest: float, grid: WallGrid, ranges: FloatArray) -> None:
     """Fill ``ranges`` (n, r) of rays from ``origins`` (n, 3) along unit ``directions`` (n, r, 3): to the first wall, of any height."""
     for n in range(directions.shape[0]):
         for r in range(directions.shape[1]):

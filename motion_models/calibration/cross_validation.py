@@ -29,14 +29,14 @@ matches. Of fr079's positions by scan matching a tenth is beyond four sigma, and
 _BISECTIONS = 40
 
 
-class Predictor(Protocol):
+class TrainedPredictor(Protocol):
     """What training returns; `motion_models.calibration.fit.Fit` is one."""
 
     def residuals(self, maneuvers: Sequence[Maneuver]) -> FloatArray:
         """(M, 3) predicted poses relative to the measured ones."""
 
 
-Train = Callable[[Sequence[Maneuver]], Predictor]
+Train = Callable[[Sequence[Maneuver]], TrainedPredictor]
 """The whole procedure, choices included: a choice made outside it would have used the held-out maneuvers."""
 
 
@@ -60,7 +60,7 @@ class HeldOut:
     """(M, 3) predicted poses relative to the measured ones [m, m, rad], in the order of the maneuvers."""
     group: NDArray[np.int64]
     """(M,) group of each."""
-    predictors: tuple[Predictor, ...]
+    predictors: tuple[TrainedPredictor, ...]
     """One a fold."""
 
     @property

@@ -15,7 +15,7 @@ from motion_models.base import Twist
 from motion_models.calibration.chords import chord_jacobians, chord_poses
 from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.compiled import kernel
-from motion_models.extended_model import Series, in_series
+from motion_models.extended_model import SampleSeries, in_series
 from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
@@ -155,11 +155,11 @@ def _turn(yaws: FloatArray) -> FloatArray:
     return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
-def series_of(batch: Batch) -> Series:
+def series_of(batch: Batch) -> SampleSeries:
     """When the intervals of ``batch`` were driven; nothing accelerates at the first of a maneuver."""
     dt = batch.dt.copy()
     dt[batch.first[:-1]] = 0.0
-    return Series(dt, batch.t)
+    return SampleSeries(dt, batch.t)
 
 
 def _track(poses: FloatArray, d: FloatArray, body_T_lidar: FloatArray, columns: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -90,7 +90,7 @@ def _cell(text: str | None, column: str, line: int, path: str | Path) -> float:
 
 
 @dataclass(frozen=True)
-class Regression:
+class LinearRegression:
     """A linear least squares fit, with its statistics."""
 
     names: tuple[str, ...]
@@ -165,7 +165,7 @@ class Regression:
         return np.stack([self.coefficients - half, self.coefficients + half], axis=-1)
 
 
-def regress(y: FloatArray, terms: dict[str, FloatArray]) -> Regression:
+def regress(y: FloatArray, terms: dict[str, FloatArray]) -> LinearRegression:
     """``y`` (n,) by least squares as a sum of ``terms`` (n,) by name.
 
     Raises `CalibrationError` for fewer than p + 1 rows, and for terms that the rows do not separate.
@@ -185,28 +185,28 @@ def regress(y: FloatArray, terms: dict[str, FloatArray]) -> Regression:
     residual_ss = float(np.sum((y - design @ coefficients) ** 2))
     total_ss = float(np.sum((y - (y.mean() if "1" in names else 0.0)) ** 2))
     cov: FloatArray = np.asarray(np.linalg.inv(design.T @ design) * (residual_ss / (n - p)), dtype=np.float64)
-    return Regression(names, coefficients, cov, n, residual_ss, total_ss)
+    return LinearRegression(names, coefficients, cov, n, residual_ss, total_ss)
 
 
-def polynomial(y: FloatArray, x: FloatArray, degree: int, name: str = "x_G") -> Regression:
+def polynomial(y: FloatArray, x: FloatArray, degree: int, name: str = "x_G") -> LinearRegression:
     """``y`` (n,) as a polynomial in ``x`` (n,), from the constant up."""
     powers = ["1", name, *(f"{name}^{i}" for i in range(2, degree + 1))]
     return regress(y, {power: x**i for i, power in enumerate(powers)})
 
 
-def rotation_ratio(table: RotationTable) -> Regression:
+def rotation_ratio(table: RotationTable) -> LinearRegression:
     """4.21 before its division by the multiplier: the means of the ratio over y_G as a parabola in x_G."""
     x, mean = table.means_over_y(table.ratio)
     return polynomial(mean, x, 2)
 
 
-def cor_x(table: RotationTable) -> Regression:
+def cor_x(table: RotationTable) -> LinearRegression:
     """4.22: the means of x_CR over y_G as a line in x_G."""
     x, mean = table.means_over_y(table.cor[:, 0])
     return polynomial(mean, x, 1)
 
 
-def cor_y_multivariate(table: RotationTable) -> Regression:
+def cor_y_multivariate(table: RotationTable) -> LinearRegression:
     """4.23 and Tables 4-4 to 4-6: y_CR as a plane over x_G and y_G, all rows."""
     x, y = table.cg.T
     return regress(table.cor[:, 1], {"1": np.ones_like(x), "x_G": x, "y_G": y})
@@ -223,7 +223,7 @@ def cor_y_lines(table: RotationTable) -> tuple[FloatArray, FloatArray, FloatArra
     return x, slope, intercept
 
 
-def cor_y_full(x: FloatArray, slope: FloatArray, intercept: FloatArray) -> tuple[Regression, Regression]:
+def cor_y_full(x: FloatArray, slope: FloatArray, intercept: FloatArray) -> tuple[LinearRegression, LinearRegression]:
     """4.24, the thesis's second step: slopes and intercepts of `cor_y_lines` (m,) as parabolas in x_G. 4.25 is the first alone."""
     return polynomial(slope, x, 2), polynomial(intercept, x, 2)
 
@@ -236,9 +236,9 @@ class SkidSteerFit:
     """(11,) in the order of `SkidSteer.param_names`."""
     cov: FloatArray
     """(11, 11); k, x_CR and y_CR are taken as independent."""
-    k: Regression
-    x_cr: Regression
-    y_cr: Regression
+    k: LinearRegression
+    x_cr: LinearRegression
+    y_cr: LinearRegression
 
 
 def skid_steer_fit(table: RotationTable, multiplier: float = CONTROLLER_MULTIPLIER) -> SkidSteerFit:

@@ -15,7 +15,7 @@ from localization.events import Event, Scan, WheelSample
 from localization.lidar import Sweep
 from localization.log_replay import Run, replay
 from localization.pipeline import ReplayConfig, Trial
-from localization.simulation.world import Grid, cast, make_grid
+from localization.simulation.world import WallGrid, cast, make_grid
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import Mount, WheelNoise
@@ -229,7 +229,7 @@ def _integrate(start: np.ndarray, twists: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True)
-def _cast(eyes: np.ndarray, aims: np.ndarray, longest: float, grid: Grid, ranges: np.ndarray) -> None:
+def _cast(eyes: np.ndarray, aims: np.ndarray, longest: float, grid: WallGrid, ranges: np.ndarray) -> None:
     for i in range(eyes.shape[0]):
         ranges[i] = cast(eyes[i, 0], eyes[i, 1], eyes[i, 2] + aims[i], longest, grid)
 

@@ -8,7 +8,7 @@ import pytest
 from motion_models.calibration.fit import FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import RobotError
-from motion_models.extended_model import ExtendedModel, Series, in_series
+from motion_models.extended_model import ExtendedModel, SampleSeries, in_series
 from motion_models.online_calibration import add_correction_parameters, make_corrections
 from motion_models.preintegration import preintegrate
 from motion_models.prior import prior_notes
@@ -101,7 +101,7 @@ def test_acceleration_term_moves_by_the_change_of_speed() -> None:
     plain = make_model("diff_drive", HUSKY)
     rates = np.array([[1.0, 1.0], [2.0, 2.0], [5.0, 5.0], [4.0, 4.0]])
     dt = np.array([0.1, 0.3, 0.2, 0.1])
-    series = Series(np.r_[0.0, dt[1:]], np.zeros(4))
+    series = SampleSeries(np.r_[0.0, dt[1:]], np.zeros(4))
     moved = preintegrate(in_series(model, series), dt, rates, CG, model.nominal, WheelNoise()).delta
     alone = preintegrate(plain, dt, rates, CG, plain.nominal, WheelNoise()).delta
     assert moved[0] - alone[0] == pytest.approx(0.2 * 3.0 * HUSKY.geometry.wheel_radius_m)
@@ -115,7 +115,7 @@ def test_fit_recovers_a_term_with_its_sigma() -> None:
     noise, n, maneuvers = 2e-3, 20, []
     for i in range(40):
         rates, start = np.tile(rng.uniform(-4.0, 4.0, 2), (n, 1)), 2.0 * i
-        series = Series(np.full(n, 0.1), start + 0.1 * np.arange(n))
+        series = SampleSeries(np.full(n, 0.1), start + 0.1 * np.arange(n))
         delta = preintegrate(in_series(model, series), np.full(n, 0.1), rates, CG, true, WheelNoise()).delta
         measured = (delta + noise * rng.normal(size=3))[None]
         maneuvers.append(Maneuver(np.full(n, 0.1), rates, measured, np.array([n]), CG, noise**2 * np.eye(3), str(i), start_s=start))

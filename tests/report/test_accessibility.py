@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from localization.evaluation.scores import score
-from localization.report.charts import Chart, Series
+from localization.report.charts import Chart, ChartSeries
 from localization.report.page import Cell, Page, Section, Table, render
 from localization.report.replay_page import page
 from localization.ros import dashboard
@@ -28,7 +28,7 @@ def replay_page():
 def chart_page():
     """Charts and sortable tables, as in compare, diagnose, check and weigh."""
     columns = {"t": [0.0, 1.0], "v": [2.0, 3.0], "e": [0.1, 0.2]}
-    chart = Chart("Residuals", [("t", "time [s]"), ("v", "speed [m/s]")], [("e", "error [m]")], [Series("before", "red")], columns)
+    chart = Chart("Residuals", [("t", "time [s]"), ("v", "speed [m/s]")], [("e", "error [m]")], [ChartSeries("before", "red")], columns)
     rows = [
         [Cell("ekf", "skid_steer", is_bold=True, badge="best"), Cell("2.0", mark="blue")],
         [Cell("graph", badge="not significant"), Cell("3.0")],

@@ -13,7 +13,7 @@ import pytest
 from localization.comparison.comparison_page import comparison_page
 from localization.comparison.statistics import find
 from localization.diagnosis.weigh import DrivenWeighing, Nuisance
-from localization.report.charts import Chart, Series
+from localization.report.charts import Chart, ChartSeries
 from localization.report.page import Cell, Page, Section, Table, render
 from localization.report.weigh_page import confidence_ellipse, weigh_page
 from motion_models.robot_file import load_robot
@@ -25,7 +25,7 @@ CHART = Chart(
     "Residuals",
     x=[("time", "time [s]"), ("speed", "speed [m/s]")],
     y=[("a", "along [m]"), ("b", "heading [rad]")],
-    series=[Series("before", "red", y="a"), Series("after", "blue", y="b", panel=1, texts=["one", "two", "three"])],
+    series=[ChartSeries("before", "red", y="a"), ChartSeries("after", "blue", y="b", panel=1, texts=["one", "two", "three"])],
     columns={"time": [0.0, 1.0, 2.0], "speed": [3.0, 4.0, math.nan], "a": [1.0, -1.0, 2.0], "b": [0.1, 0.2, 0.3]},
 )
 ROWS = (("one", "2.0"), ("two", "10.0"), ("three", "\N{MINUS SIGN}1.0"))
@@ -54,7 +54,9 @@ def test_chart_content_has_null_for_what_is_no_number():
 
 
 def test_chart_text_cannot_end_its_script():
-    evil = Chart("</script>", [("x", "x")], [("y", "y")], [Series("</script><script>alert(1)", "red", y="y")], {"x": [1.0], "y": [1.0]})
+    evil = Chart(
+        "</script>", [("x", "x")], [("y", "y")], [ChartSeries("</script><script>alert(1)", "red", y="y")], {"x": [1.0], "y": [1.0]}
+    )
     assert "</script" not in str(evil.data)
     PageText(without_scripts(render(Page("A page", "", ["A sentence."], [Section("Chart", [evil])]))))
 

@@ -25,7 +25,7 @@ from localization.simulation.simulator import RunRecord, simulate, write_simulat
 from localization.simulation.vehicle import TWIST, Body, VehicleConfig, VehicleState, advance
 from localization.trajectory import IntArray
 from motion_models import se2
-from motion_models.calibration.regressions import Regression, center_from_end_poses, regress
+from motion_models.calibration.regressions import LinearRegression, center_from_end_poses, regress
 from motion_models.registry import make_model
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
@@ -173,7 +173,7 @@ TERMS = {
 """4.21, 4.22, 4.25."""
 
 
-def fits(found: Sequence[Rotation]) -> dict[str, tuple[Regression, Regression]]:
+def fits(found: Sequence[Rotation]) -> dict[str, tuple[LinearRegression, LinearRegression]]:
     """Regressions 4.21, 4.22 and 4.25 of what was measured, and of what the closed model says at the same CGs."""
     cg = np.array([r.cg for r in found])
     x, y = cg.T

@@ -29,7 +29,7 @@ def _part(stage: Stage, default: Any = 0.0, lasts: bool = True) -> Any:
 
 
 @dataclass(frozen=True)
-class Motion:
+class DriveMotion:
     """Motion in all intervals of a drive, as a change of rates or twists gets it."""
 
     rates: FloatArray
@@ -42,7 +42,7 @@ class Motion:
     """(N,) start of the intervals, from the drive's start [s]."""
 
 
-Change = Callable[[Motion, float], FloatArray]
+Change = Callable[[DriveMotion, float], FloatArray]
 """New rates (N, 2) or twists (N, 3) from the motion and the cause's size; they are the old ones at size 0."""
 Changes = tuple[tuple[Change, float], ...]
 
@@ -176,7 +176,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Draft:
+class CorrectionDraft:
     """A robot file while causes are written into it, one after the other."""
 
     robot: Robot
@@ -187,11 +187,11 @@ class Draft:
     steps: tuple[str, ...] = ()
     """What is to be done elsewhere, one sentence each."""
 
-    def with_step(self, text: str) -> Draft:
+    def with_step(self, text: str) -> CorrectionDraft:
         """The draft with one more thing to do elsewhere."""
         return dataclasses.replace(self, steps=(*self.steps, text))
 
-    def with_robot(self, **sections: Any) -> Draft:
+    def with_robot(self, **sections: Any) -> CorrectionDraft:
         """The draft with other ``sections`` of the robot."""
         return dataclasses.replace(self, robot=dataclasses.replace(self.robot, **sections))
 
@@ -226,7 +226,7 @@ class Cause:
     """What it changes: the hypothesis with a size of this cause added."""
     words: tuple[str, str]
     """What the robot does at a positive and at a negative size; {} stands for the magnitude with its unit."""
-    correct: Callable[[Draft, float], Draft] | None = field(default=None, repr=False)
+    correct: Callable[[CorrectionDraft, float], CorrectionDraft] | None = field(default=None, repr=False)
     """Writes a size into a robot file; None where only the models' coefficients hold it, which are matched to the motion."""
     remedy: str = OTHER_REMEDY
     """What to do; ``{g}`` is the corrected robot's geometry and ``{c}`` its clock."""
@@ -387,7 +387,7 @@ def change_twist(change: Change) -> Callable[[Hypothesis, float], Hypothesis]:
     return lambda b, s: dataclasses.replace(b, changed_twists=(*b.changed_twists, (change, s)))
 
 
-def changed(changes: Changes, motion: Motion, name: str) -> FloatArray:
+def changed(changes: Changes, motion: DriveMotion, name: str) -> FloatArray:
     """``name`` of ``motion``, its rates or its twist, after ``changes`` one after the other."""
     for change, size in changes:
         motion = dataclasses.replace(motion, **{name: np.ascontiguousarray(change(motion, size))})

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, Setting, add, add_item
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Hypothesis, Setting, add, add_item
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import SATURATION
 from motion_models.robot import DIFF_DRIVE, Robot
@@ -23,10 +23,10 @@ def _add_friction(name: str) -> Callable[[Hypothesis, float], Hypothesis]:
     return lambda b, s: dataclasses.replace(b, friction={**b.friction, name: b.friction.get(name, 0.0) + s})
 
 
-def _correct_friction(name: str) -> Callable[[Draft, float], Draft]:
+def _correct_friction(name: str) -> Callable[[CorrectionDraft, float], CorrectionDraft]:
     """Writes a parameter of the friction model; a ratio of frictions is scaled, another one is added to."""
 
-    def correct(draft: Draft, size: float) -> Draft:
+    def correct(draft: CorrectionDraft, size: float) -> CorrectionDraft:
         own = dict(draft.robot.models[FrictionModel.name])
         value = own[name] * (1.0 + size) if name == "mu_ratio" else own[name] + size
         own[name] = max(value, 0.0) if name in _NOT_NEGATIVE else value
@@ -35,7 +35,7 @@ def _correct_friction(name: str) -> Callable[[Draft, float], Draft]:
     return correct
 
 
-def _correct_track(draft: Draft, size: float) -> Draft:
+def _correct_track(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     g = draft.robot.geometry
     draft = draft.with_robot(geometry=dataclasses.replace(g, track_width_m=g.track_width_m + size))
     return _correct_friction("track_width")(draft, size)
@@ -55,7 +55,7 @@ def _track_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
     return (dataclasses.replace(cause, limits=limits),)
 
 
-def _correct_law(draft: Draft, size: float) -> Draft:
+def _correct_law(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     """The contact law nearest to the mixture that was found."""
     robot = draft.robot
     saturation = FrictionModel.from_robot(robot).saturation
@@ -66,7 +66,7 @@ def _correct_law(draft: Draft, size: float) -> Draft:
     return draft.with_step(f"the tyres follow the other law by {100.0 * size:.0f} %; [models.friction] has contact = {law!r}.")
 
 
-def _correct_split(draft: Draft, size: float) -> Draft:
+def _correct_split(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     draft = _correct_friction("split_friction")(draft, size)
     return draft.with_step(f"the left wheels grip {100.0 * size:+.0f} % more than the right ones: compare the tyres' treads.")
 
@@ -96,7 +96,7 @@ def _is_log_with_positions(s: Setting) -> bool:
     return s.kind == "log" and s.has_positions
 
 
-def _level_step(draft: Draft, along: float, across: float) -> Draft:
+def _level_step(draft: CorrectionDraft, along: float, across: float) -> CorrectionDraft:
     return draft.with_step(f"this drive's floor is not level ({along:+.3f}, {across:+.3f} rad); that is not the robot's.")
 
 

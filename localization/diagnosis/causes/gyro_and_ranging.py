@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from localization.diagnosis.causes.cause import Cause, Draft, add
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, add
 
 _GYRO_BIAS_SIGMA = 0.01
 """Zero-rate offset of MEMS gyros that robots carry, after the zeroing at switch-on that drivers do: 0.5 to 1 deg/s at most by the data
@@ -16,17 +16,17 @@ _RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.015, 0.05
 healthy scanner has the 0.03 m that are tolerated (SICK LMS1xx: systematic error 30 mm, 40 mm at most)."""
 
 
-def _correct_gyro_scale(draft: Draft, size: float) -> Draft:
+def _correct_gyro_scale(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     imu = draft.robot.imu
     return draft.with_robot(imu=dataclasses.replace(imu, rate_unit_rad_s=imu.rate_unit_rad_s / (1.0 + size)))
 
 
-def _correct_range_scale(draft: Draft, size: float) -> Draft:
+def _correct_range_scale(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     lidar = draft.robot.lidar
     return draft.with_robot(lidar=dataclasses.replace(lidar, range_scale=lidar.range_scale * (1.0 + size)))
 
 
-def _correct_range_bias(draft: Draft, size: float) -> Draft:
+def _correct_range_bias(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     lidar = draft.robot.lidar
     return draft.with_robot(lidar=dataclasses.replace(lidar, range_offset_m=lidar.range_offset_m + size))
 

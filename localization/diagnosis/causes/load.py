@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.diagnosis.causes.cause import Cause, Draft, Setting, add, add_item
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Setting, add, add_item
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.se2 import FloatArray
@@ -22,7 +22,7 @@ def _payload_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
     return (dataclasses.replace(cause, negligible=_TOLERATED_LOAD * setting.robot.geometry.mass_kg),)
 
 
-def _correct_payload(draft: Draft, size: float) -> Draft:
+def _correct_payload(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     """The robot's mass; a payload in the gripper moves with the arms, ``[arms] payload_kg``, and another is at rest on the robot."""
     drive, arms, g = draft.drive, draft.robot.arms, draft.robot.geometry
     mass = g.mass_kg + size
@@ -34,7 +34,7 @@ def _correct_payload(draft: Draft, size: float) -> Draft:
     return _move_cg(draft, carried.mean(axis=0))
 
 
-def _move_cg(draft: Draft, shift: FloatArray) -> Draft:
+def _move_cg(draft: CorrectionDraft, shift: FloatArray) -> CorrectionDraft:
     """The CG of everything but the arms, so that the whole robot's moves by ``shift`` (2,) [m]; of a table, which has its own, no file
     moves it, and only the models' coefficients hold it."""
     arms, g = draft.robot.arms, draft.robot.geometry

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from localization.diagnosis.causes.cause import Cause, Draft, add, add_item
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, add, add_item
 from motion_models.robot import Mount
 
 _TRANSFORM = "than its transform has it"
@@ -14,10 +14,10 @@ _CLOCK_SIGMA_S = 0.2
 _REMEDY = "measure the LiDAR's mount, and correct its transform"
 
 
-def _move_lidar(name: str, unit: str) -> Callable[[Draft, float], Draft]:
+def _move_lidar(name: str, unit: str) -> Callable[[CorrectionDraft, float], CorrectionDraft]:
     """Moves the mount of the LiDAR along or about one axis; the file's mount then goes before the log's transforms."""
 
-    def correct(draft: Draft, size: float) -> Draft:
+    def correct(draft: CorrectionDraft, size: float) -> CorrectionDraft:
         drive, robot = draft.drive, draft.robot
         if not drive.is_lidar_reference:
             return draft.with_step(
@@ -34,10 +34,10 @@ def _move_lidar(name: str, unit: str) -> Callable[[Draft, float], Draft]:
     return correct
 
 
-def _shift_clock(sensor: str, entry: str) -> Callable[[Draft, float], Draft]:
+def _shift_clock(sensor: str, entry: str) -> Callable[[CorrectionDraft, float], CorrectionDraft]:
     """Writes the offset of a sensor's clock."""
 
-    def correct(draft: Draft, size: float) -> Draft:
+    def correct(draft: CorrectionDraft, size: float) -> CorrectionDraft:
         if entry == "lidar_time_offset_s" and not draft.drive.is_lidar_reference:
             return draft.with_step(f"shift the reference's stamps by {-1e3 * size:+.0f} ms, or synchronize its clock.")
         clock = draft.robot.clock

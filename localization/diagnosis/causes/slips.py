@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from localization.diagnosis.causes.cause import Cause, Draft, Setting, add, add_item
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Setting, add, add_item
 from motion_models.friction import FrictionModel
 from motion_models.registry import MODELS, params_of
 from motion_models.terms import Term, parse_expression
@@ -15,17 +15,17 @@ def _shows_rotation(s: Setting) -> bool:
     return s.skids and s.kind != "runs" and (s.is_of_windows or not s.is_friction_model)
 
 
-def _add_term(cause: str, component: str, expression: str, sign: float) -> Callable[[Draft, float], Draft]:
+def _add_term(cause: str, component: str, expression: str, sign: float) -> Callable[[CorrectionDraft, float], CorrectionDraft]:
     """Adds the slip as a term to every model that has no parameter of its name; those with one are matched to the motion."""
 
-    def correct(draft: Draft, size: float) -> Draft:
+    def correct(draft: CorrectionDraft, size: float) -> CorrectionDraft:
         models = [name for name in MODELS if cause not in {p.name for p in params_of(name)}]
         return _with_term(draft, models, Term(component, parse_expression(expression), sign * size))
 
     return correct
 
 
-def _with_term(draft: Draft, models: list[str], term: Term) -> Draft:
+def _with_term(draft: CorrectionDraft, models: list[str], term: Term) -> CorrectionDraft:
     """The draft with ``term`` in each of the ``models``, on top of the same term of the file."""
     terms = dict(draft.robot.terms)
     for model in models:

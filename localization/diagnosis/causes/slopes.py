@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, Setting, add
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Hypothesis, Setting, add
 from motion_models.friction import FrictionModel
 
 _LEAST_HEIGHT = 0.2
@@ -25,7 +25,7 @@ def _height_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
     return (dataclasses.replace(cause, limits=(-(1.0 - _LEAST_HEIGHT) * height, math.inf)),)
 
 
-def _correct_height(draft: Draft, size: float) -> Draft:
+def _correct_height(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     g = draft.robot.geometry
     return draft.with_robot(geometry=dataclasses.replace(g, cg_height_m=g.cg_height_m + size))
 
@@ -41,7 +41,7 @@ def _grip_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
     return (dataclasses.replace(cause, inject=inject),)
 
 
-def _correct_grip(draft: Draft, size: float) -> Draft:
+def _correct_grip(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     own = dict(draft.robot.models[FrictionModel.name])
     own["mu"] *= math.exp(size)
     return draft.with_robot(models={**draft.robot.models, FrictionModel.name: own})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from localization.diagnosis.causes.cause import Cause, Draft, Hypothesis, add
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Hypothesis, add
 from motion_models.friction import FrictionModel
 
 _FILE = "than the robot file has it"
@@ -17,7 +17,7 @@ def _add_radii(left: float, right: float) -> Callable[[Hypothesis, float], Hypot
     )
 
 
-def _correct_radius(draft: Draft, size: float) -> Draft:
+def _correct_radius(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     """Radius of all wheels."""
     g, models = draft.robot.geometry, draft.robot.models
     own = {name: v * (1.0 + size) if name == "wheel_radius" else v for name, v in models.get(FrictionModel.name, {}).items()}
@@ -25,7 +25,7 @@ def _correct_radius(draft: Draft, size: float) -> Draft:
     return draft.with_robot(geometry=dataclasses.replace(g, wheel_radius_m=g.wheel_radius_m * (1.0 + size)), models=models)
 
 
-def _correct_difference(draft: Draft, size: float) -> Draft:
+def _correct_difference(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     """Multipliers of both sides, whose mean is kept."""
     g = draft.robot.geometry
     left, right = g.left_wheel_radius_multiplier * (1.0 + 0.5 * size), g.right_wheel_radius_multiplier * (1.0 - 0.5 * size)
