@@ -26,8 +26,9 @@ KERNELS := $(shell grep -rlE '^@(threaded_kernel|kernel|subroutine)' --include='
 	touch $@
 
 # A minute: real rotations held out, then a drive whose arms move the centre of gravity, and beside both one with a hidden load.
-demo: .venv/kernels
+demo: .venv/installed
 	rm -rf $(DEMO) && mkdir $(DEMO)
+	@echo "Numba compiles what is used, the first time (half a minute)."
 	@{ $(BIN)/skidloc simulate laps --config.experiment.laps 2 --seed 1 --effect payload=8 --out $(DEMO)/load.mcap && \
 		$(BIN)/skidloc weigh $(DEMO)/load.mcap --robot vaultbot --page $(DEMO)/weigh.html && \
 		$(BIN)/skidloc diagnose $(DEMO)/load.mcap --robot vaultbot --out $(DEMO)/load; } > $(DEMO)/load.txt 2>&1 & load=$$!; \

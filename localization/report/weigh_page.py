@@ -86,7 +86,7 @@ def weigh_page(sentence: str, found: DrivenWeighing, geometry: Geometry, at: tup
         html.glossary(_TERMS),
     ]
     about = f"{found.windows} windows · {found.turned_rad:.0f} rad of turning by the wheels · motion by {found.motion_reference}"
-    return html.render(html.Page(f"Weighing by {found.log}", f"{found.robot} · {about}", [sentence], sections))
+    return html.render(html.Page(f"Weighing by {found.log}", f"{found.robot} · {about}", [sentence[:1].upper() + sentence[1:]], sections))
 
 
 def confidence_ellipse(centre: FloatArray, covariance: FloatArray, probability: float = _SHOWN) -> FloatArray:
