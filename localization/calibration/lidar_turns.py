@@ -1,10 +1,10 @@
-"""Turns by scans against those by wheels and gyro: a LiDAR upside down, or with another clock than both."""
+"""Turns by scans, wheels and gyro against each other: a LiDAR upside down, or one of the three with another clock than both others."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +20,34 @@ _SURE_LIKENESS = 0.95
 _MAX_LATE_S, _MIN_LATE_S, _STEP_S = 1.5, 0.15, 0.01
 """Largest offset that is searched, the smallest that is named (drivers have latencies of up to 0.1 s, which the filter estimates), and the
 step [s]. Clocks that are further apart are set by the times of recording."""
+_SAME_CLOCK_S = 0.1
+"""Largest offset between two sensors that agree."""
 _CLEARER = 3.0
 """How many times nearer to 1 the correlation with an offset is than that without."""
 
 
+Sensor = Literal["lidar", "gyro", "wheel"]
+
+
 class LidarTurns(NamedTuple):
-    """What the turns of a LiDAR show against wheels and gyro, which agree."""
+    """What the turns of a LiDAR show against those of wheels and gyro."""
 
     is_opposite: bool = False
-    """It turns the other way."""
+    """It turns the other way than both."""
+    sensor: Sensor = "lidar"
+    """Whose clock is another than that of both others."""
     late_s: float = 0.0
     """By how much its stamps are late [s]; 0 where no offset is clear."""
+
+
+class _Offset(NamedTuple):
+    """Offset of a sensor's stamps against the gyro's, at which their turns are most alike."""
+
+    late_s: float
+    likeness: float
+    """Correlation about zero there, of the larger size of all offsets."""
+    is_clear: bool
+    """Whether it is clearly larger than without an offset."""
 
 
 class GyroHeading:
@@ -73,16 +90,32 @@ def compare_turns(
     known = np.isfinite(by_wheels) & np.isfinite(by_gyro)
     if known.sum() < _MIN_INTERVALS or np.abs(by_gyro[known]).sum() < _MIN_TURN_RAD:
         return None
-    if _likeness(by_wheels, by_gyro) < _SURE_LIKENESS:
+    wheels_offset, scans_offset = (_offset(turns, gyro, edges, origin_ns) for turns in (by_wheels, scans))
+    if wheels_offset.likeness < _SURE_LIKENESS or abs(scans_offset.likeness) < _SURE_LIKENESS:
         return LidarTurns()
+    return LidarTurns(scans_offset.likeness < 0.0, *_odd_clock(wheels_offset, scans_offset))
+
+
+def _odd_clock(wheels: _Offset, scans: _Offset) -> tuple[Sensor, float]:
+    """The sensor whose clock is another than that of the two others, and by how much its stamps are late [s]; 0 where none is clear.
+
+    Both offsets are against the gyro's clock."""
+    apart = {"lidar": wheels.late_s, "gyro": scans.late_s - wheels.late_s, "wheel": scans.late_s}
+    late: dict[Sensor, float] = {"lidar": scans.late_s, "gyro": -0.5 * (scans.late_s + wheels.late_s), "wheel": wheels.late_s}
+    is_clear = {"lidar": scans.is_clear, "gyro": scans.is_clear and wheels.is_clear, "wheel": wheels.is_clear}
+    for sensor, late_s in late.items():
+        if abs(apart[sensor]) < _SAME_CLOCK_S and abs(late_s) >= _MIN_LATE_S and is_clear[sensor]:
+            return sensor, round(late_s, 2)
+    return "lidar", 0.0
+
+
+def _offset(turns: FloatArray, gyro: GyroHeading, edges: NDArray[np.float64], origin_ns: int) -> _Offset:
+    """Of ``turns`` (N,) over ``edges`` (N, 2) of stamps [s] that are late."""
     offsets = np.arange(-round(_MAX_LATE_S / _STEP_S), round(_MAX_LATE_S / _STEP_S) + 1) * _STEP_S
-    found = np.array([_likeness(_turns(gyro, edges, late, origin_ns), scans) for late in offsets])
+    found = np.array([_likeness(_turns(gyro, edges, late, origin_ns), turns) for late in offsets])
     best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])
     is_clear = 1.0 - abs(at_zero) > _CLEARER * (1.0 - abs(found[best]))
-    late = float(offsets[best])
-    if abs(found[best]) < _SURE_LIKENESS or not is_clear or abs(late) < _MIN_LATE_S:
-        return LidarTurns(at_zero < -_SURE_LIKENESS)
-    return LidarTurns(bool(found[best] < 0.0), round(late, 2))
+    return _Offset(float(offsets[best]), float(found[best]), is_clear)
 
 
 def _turns(gyro: GyroHeading, edges: NDArray[np.float64], late_s: float, origin_ns: int) -> FloatArray:

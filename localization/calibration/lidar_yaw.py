@@ -1,8 +1,8 @@
 """Mount and clock of a LiDAR against wheels and gyro, before a log is replayed.
 
 A turned LiDAR travels in another direction than the wheels, and turns alike; wheels that count backwards turn the other way as well. That
-decides between the two. Healthy mounts are recognised after a metre of driving. One that turns opposite to wheels and gyro is upside down,
-and one that turns as they do, but later, has another clock; with a gyro the drive is read until it has turned.
+decides between the two. Healthy mounts are recognised after a metre of driving. One that turns opposite to wheels and gyro is upside down;
+of the three sensors one may turn later than the two others, by another clock. With a gyro the drive is read until it has turned.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class LidarYaw:
     is_certain: bool = False
     """More driving would not change it."""
     clock: Clock | None = None
-    """The clocks that are used in place of the robot file's, where the LiDAR's is wrong."""
+    """The clocks that are used in place of the robot file's, where that of LiDAR, gyro or wheels is another than the two others'."""
 
 
 @dataclass
@@ -168,7 +168,7 @@ class LidarYawCheck:
         by_wheels, by_scans, turns = self._compare(frame)
         direction = _direction(by_wheels, by_scans)
         if by_turns is not None and by_turns.late_s:
-            return self._other_clock(frame, by_turns.late_s)
+            return self._other_clock(frame, by_turns)
         if by_turns is not None and by_turns.is_opposite:
             return None if direction is None else self._upside_down(frame, direction)
         if direction is None or abs(direction) <= _MAX_SLIDE_RAD:
@@ -205,15 +205,17 @@ class LidarYawCheck:
         )
         return LidarYaw(text, frame, right, is_certain=True)
 
-    def _other_clock(self, frame: str, late_s: float) -> LidarYaw:
-        value = round(self._robot.clock.lidar_time_offset_s + late_s, 2)
-        way = "later" if late_s > 0.0 else "earlier"
+    def _other_clock(self, frame: str, turns: LidarTurns) -> LidarYaw:
+        names = {"lidar": self._topic, "gyro": "the gyro", "wheel": "the wheels"}
+        odd = names.pop(turns.sensor)
+        key = f"{turns.sensor}_time_offset_s"
+        value = round(getattr(self._robot.clock, key) + turns.late_s, 2)
+        way = "later" if turns.late_s > 0.0 else "earlier"
         text = (
-            f"{self._topic} measures the turns of wheels and gyro, which agree, {abs(late_s):.2f} s {way} by its stamps:"
-            f" the clocks of two computers, or stamps of arrival. {CORRECTED} clock.lidar_time_offset_s = {value:g}, or"
-            " synchronize the clocks."
+            f"{odd}: by the stamps its turns are {abs(turns.late_s):.2f} s {way} than those of {' and '.join(names.values())}, which agree:"
+            f" the clocks of two computers, or stamps of arrival. {CORRECTED} clock.{key} = {value:g}, or synchronize the clocks."
         )
-        return LidarYaw(text, frame, None, is_certain=True, clock=replace(self._robot.clock, lidar_time_offset_s=value))
+        return LidarYaw(text, frame, None, is_certain=True, clock=replace(self._robot.clock, **{key: value}))
 
 
 def check_lidar_yaw(log: Log) -> LidarYaw | None:

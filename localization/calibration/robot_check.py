@@ -300,7 +300,9 @@ def _lidar_rows(checked: CheckedLog, signals: WheelSignals, motion: LidarMotion 
         return []
     name, frame = "mount of LiDAR", log.frames.get(log.sources.lidar.topic, "")
     rows = [
-        CheckRow("clock of LiDAR", "as in the robot file", "wheels and gyro", "contradiction", found.text.replace(CORRECTED, _IN_FILE))
+        CheckRow(
+            "clocks", "as in the robot file", "turns by LiDAR, wheels and gyro", "contradiction", found.text.replace(CORRECTED, _IN_FILE)
+        )
         for found in checked.lidar
         if found.clock is not None
     ]

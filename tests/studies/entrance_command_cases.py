@@ -364,6 +364,14 @@ def q(a: float) -> tuple[float, float, float, float]:
     return 0.0, 0.0, math.sin(a / 2), math.cos(a / 2)
 
 
+def geodetic(t: float, x: float, y: float, a: float) -> tuple[float, ...]:
+    return t, 48.0 + math.degrees(y / 6.3662e6), 9.0 + math.degrees(x / (6.39e6 * math.cos(math.radians(48.0))))
+
+
+def slower(t: float, x: float, y: float, a: float) -> tuple[float, ...]:
+    return START / S + 1.05 * (t - START / S), x, y, 0.0, *q(a)
+
+
 EUROC = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],"
     "v_x,v_y,v_z,b_w_x,b_w_y,b_w_z,b_a_x,b_a_y,b_a_z"
@@ -501,4 +509,22 @@ DESCRIPTIONS = (
     ),
 )
 
-CASES = (*CLOCKS, *WHEELS, *MOUNTS, *TOPICS, *REFERENCES, *POINTS, *DESCRIPTIONS)
+LATER = (  # made after what the others showed was corrected
+    driven("later", "LiDAR 0.5 s ahead, no IMU", NO_IMU, Publishing(offsets_s={"/scan": 0.5}), ["LiDAR", "/scan"]),
+    driven("later", "IMU 0.35 s behind, LiDAR", SCANS, Publishing(offsets_s={"/imu/data": -0.35}), ["/imu/data", "gyro"]),
+    driven("later", "IMU 0.35 s behind", WARTHOG, Publishing(offsets_s={"/imu/data": -0.35}), ["/imu/data", "gyro"]),
+    driven("later", "left reversed and LiDAR upside down", SCANS, Publishing(signed(-1, -1, 1, 1), lidar_flip=True), ["joints.reversed"]),
+    driven("later", "gear of 3", SCANS, Publishing(scaled(3.0, 3.0)), ["gear"]),
+    driven("later", "velocities in m/s, positions in rad", WARTHOG, Publishing(scaled(1.0, 0.3)), ["metres"]),
+    driven("later", "LiDAR at 120 deg", ROSBOT, Publishing(lidar_yaw=math.radians(120.0)), ["120 deg"]),
+    driven("later", "LiDAR upside down at 90 deg", SCANS, Publishing(lidar_flip=True, lidar_yaw=math.pi / 2), ["upside"]),
+    driven("later", "LiDAR 1 s late and backwards", SCANS, Publishing(offsets_s={"/scan": 1.0}, lidar_yaw=math.pi), ["180 deg"]),
+    driven("later", "rates constant, angles right", JACKAL, Publishing(lambda a, r: (a, 0.0 * r))),
+    driven("later", "a message per wheel, angles constant", ROSBOT, Publishing(lambda a, r: (0.0 * a, r), forms="wheel")),
+    driven("later", "driver with the gyro's sign reversed, LiDAR", SCANS, Publishing(forms="odometry", gyro=-1.0), ["rate_unit_rad_s"]),
+    scored("y up, 18 s", WARTHOG, lambda m: rows(m, "", lambda t, *p: y_up_mm(t + 18.0, *p), " "), words=["18.0 s", "1000"]),
+    scored("latitude and longitude", WARTHOG, lambda m: rows(m, "time,latitude,longitude", geodetic), "csv", noise=0.1),
+    scored("half of the drive", JACKAL, lambda m: "\n".join(tum(m).splitlines()[:220]) + "\n", noise=0.3),
+    scored("the same maneuvers, 5 % slower", JACKAL, lambda m: rows(m, "", slower, " "), words=["clock"]),
+)
+CASES = (*LATER, *CLOCKS, *WHEELS, *MOUNTS, *TOPICS, *REFERENCES, *POINTS, *DESCRIPTIONS)
