@@ -208,3 +208,17 @@ def test_localizer_back_at_the_border_of_the_map_takes_its_pose_at_once() -> Non
     localizer.add(floor_plan.scan(OFFICE, way[-1], seed=1), np.zeros(3), COV)
     assert localizer.state == "localized"
     assert math.hypot(*(localizer.pose[:2] - way[-1, :2])) < 0.03
+
+
+def test_localizer_with_scans_beyond_walls_and_in_free_space_doubts(office: PlaceMap) -> None:
+    """As after it was carried unnoticed: 75 % of the points are where the map has nothing, 10 % in free space."""
+    localizer = Localizer(office)
+    assert drive(localizer, OFFICE, WAY[:8])[-1][0] == "localized"
+    points = floor_plan.scan(OFFICE, WAY[7], seed=1)
+    index = np.arange(len(points)) % 20
+    points = points * np.where(index < 2, 0.5, np.where(index < 17, 20.0, 1.0))[:, None]
+    localizer.add(points, np.zeros(3), COV)
+    assert localizer.probability <= LIKELY
+    for _ in range(8):
+        localizer.add(points, np.zeros(3), COV)
+    assert localizer.state == "lost"
