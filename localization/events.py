@@ -125,6 +125,8 @@ class PositionSample:
     """(2, 2) [m^2]."""
     origin: tuple[float, float, float] | None = None
     """Latitude and longitude [deg] and height [m] of the plane's origin; None for a plane that is nowhere on the earth."""
+    height: tuple[float, float] | None = None
+    """Above the plane [m], and its variance [m^2]; None where it is not measured."""
 
     def __post_init__(self) -> None:
         _check_finite(self, "position", (2,))
@@ -144,6 +146,8 @@ class Reference:
     """(3, 3) of x, y, yaw [m, m, rad]; NaN where unknown."""
     origin: tuple[float, float, float] | None = None
     """Latitude and longitude [deg] and height [m] of the plane's origin; None for a plane that is nowhere on the earth."""
+    height: tuple[float, float] | None = None
+    """Above the plane [m], and its variance [m^2]; None where one of both is not known."""
 
 
 Event = WheelSample | CgSample | Scan | ImuSample | PositionSample | Reference

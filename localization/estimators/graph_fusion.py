@@ -20,6 +20,7 @@ from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
 from localization.estimators.fusion import EkfFusion, FilteredOdometry
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, through_nodes
+from localization.estimators.position_queue import PositionQueue, align_map
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS, LidarConfig
 from localization.lidar.loop_detection import Keyframe, LoopDetector
@@ -32,9 +33,6 @@ from motion_models.online_calibration import Corrections
 from motion_models.preintegration import MotionPreintegration, PreintegratedMotion
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
-_MIN_POSITIONS, _MIN_BASELINE_M = 3, 5.0
-"""Positions, and the distance between them [m], from which they give the heading of the map."""
-_ALIGNMENT_ITERATIONS = 30
 _CONSTANT_SHARE = 1e-3
 """By which corrections that do not change may do so a minute, over the sigma of their prior: less than 1 % of it in an hour. With 1e-6
 GTSAM's Cholesky factors lose positive definiteness."""
@@ -89,10 +87,10 @@ class GraphFusion(FilteredOdometry):
         self._smoothed_covs: FloatArray | None = None
         self._grid = GrowingGrid(_CELL_M, _MAX_CELLS)
         self._positions: list[tuple[int, FloatArray, FloatArray, FloatArray]] = []  # keyframe, offset, position, cov: not aligned yet
-        self._waiting: list[PositionSample] = []
+        self._queue = PositionQueue()
         self._is_aligned, self._failure = False, ""
         self._origin: tuple[float, float, float] | None = None  # of the positions' plane
-        self.n_loops = self.n_positions = self._n_late = 0
+        self.n_loops = self.n_positions = 0
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""
@@ -135,7 +133,7 @@ class GraphFusion(FilteredOdometry):
 
     def add_position(self, sample: PositionSample) -> None:
         """A position by GPS. It is placed once the odometry has come to its stamp."""
-        self._waiting.append(sample)
+        self._queue.add(sample)
         self._origin = sample.origin
 
     def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
@@ -214,14 +212,7 @@ class GraphFusion(FilteredOdometry):
     def _place_positions(self, step: Step) -> None:
         """Positions up to the end of ``step`` are taken from the newest keyframe."""
         state = self.odometry.state
-        while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
-            sample = self._waiting.pop(0)
-            if not self.graph.count:
-                continue
-            if sample.stamp_ns < step.start_ns:
-                self._n_late += 1
-                continue
-            part = (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
+        for sample, part in self._queue.take(step, has_keyframe=self.graph.count > 0):
             pose = se2.interpolate(state["start"], state["pose"], np.array(part))
             offset = se2.between(self._loops.keyframes[-1].odometry, pose)
             moved_cov = 0.5 * np.trace(self._moved[1][:2, :2]) * np.eye(2)  # any heading: that of the map may not be known
@@ -236,9 +227,10 @@ class GraphFusion(FilteredOdometry):
             ours = np.array([se2.compose(self.graph.pose(k), offset)[:2] for k, offset, _, _ in self._positions])
             theirs = np.array([position for _, _, position, _ in self._positions])
             sigmas = np.sqrt([0.5 * np.trace(cov) for _, _, _, cov in self._positions])
-            if len(ours) < _MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < _MIN_BASELINE_M:
+            alignment = align_map(ours, theirs, sigmas)
+            if alignment is None:
                 return
-            alignment, self._is_aligned = _align(ours, theirs, sigmas), True
+            self._is_aligned = True
         found = tuple(PositionMeasurement(*row) for row in self._positions)
         self.n_positions += len(found)
         self.graph.apply(GraphUpdate(positions=found, alignment=alignment))
@@ -288,14 +280,8 @@ class GraphFusion(FilteredOdometry):
     def warnings(self) -> list[str]:
         """Problems of the measurements so far: those of the filter, and positions that could not be used, or contradict the other
         sensors."""
-        found, n = [*self.odometry.warnings(), *([self._failure] if self._failure else [])], len(self._positions) + len(self._waiting)
-        if n and not self.n_positions:
-            found.append(
-                f"{n} positions could not be used: it takes {_MIN_POSITIONS} over {_MIN_BASELINE_M:g} m to give the map its heading."
-            )
-        if self._n_late:
-            late = "1 position" if self._n_late == 1 else f"{self._n_late} positions"
-            found.append(f"{late} came after the estimate of a later stamp and had to be left out. Check the stamps.")
+        found = [*self.odometry.warnings(), *([self._failure] if self._failure else [])]
+        found += self._queue.warnings(self.n_positions, len(self._positions))
         n = int((self.graph.position_errors() > OUTLIER_SIGMAS).sum()) if self.n_positions else 0
         if n:
             contradicted = f"{n} of {self.n_positions} positions are more than {OUTLIER_SIGMAS:g} sigma off wheels, gyro and LiDAR"
@@ -353,16 +339,3 @@ def subtract_information(
     off = to_axes @ group.local(prior, delta)
     shift = np.linalg.solve(to_axes, off / np.maximum(gained, 1.0))
     return group.retract(delta, shift), (to_axes.T * gained) @ to_axes
-
-
-def _align(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2:
-    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) [m].
-
-    The sum of distances is minimised, not of their squares, by iterated weights 1 / distance: outliers among ``theirs`` do not pull.
-    Distances below ``sigmas`` (N,) [m] count alike.
-    """
-    distances, pose = sigmas, np.zeros(3)
-    for _ in range(_ALIGNMENT_ITERATIONS):
-        pose = se2.align_points(ours, theirs, 1.0 / distances)
-        distances = np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
-    return pose

@@ -34,7 +34,7 @@ _CAUCHY = 1.0
 """Scale of the robust loss of loop closures [sigma]."""
 _HUBER = 1.345
 """Scale of the robust loss of wheels and positions [sigma]: 95 % efficiency on Gaussian noise (Huber 1981)."""
-_LEVER_SIGMA_M = 0.5
+LEVER_SIGMA_M = 0.5
 """Where the antenna may be, away from the given lever arm [m]."""
 _ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
 _RELINEARIZE = 0.01
@@ -143,7 +143,7 @@ class PoseGraph:
     def lever_arm(self) -> tuple[FloatArray, FloatArray]:
         """Mean (2,) and covariance (2, 2) of where the positions' antenna is in the body frame [m]."""
         if not self._values.exists(_LEVER):
-            return self.lever, _LEVER_SIGMA_M**2 * np.eye(2)
+            return self.lever, LEVER_SIGMA_M**2 * np.eye(2)
         return np.asarray(self._values.atPoint2(_LEVER)), np.asarray(self._isam.marginalCovariance(_LEVER))
 
     def alignment(self) -> tuple[Pose2, Cov3] | None:
@@ -200,7 +200,7 @@ class PoseGraph:
         if update.alignment is not None:
             sigma = gtsam.noiseModel.Diagonal.Sigmas
             factors.add(gtsam.PriorFactorPose2(_ALIGNMENT, gtsam.Pose2(*update.alignment), sigma(_ALIGNMENT_SIGMA)))
-            factors.add(gtsam.PriorFactorPoint2(_LEVER, self.lever, sigma(np.full(2, _LEVER_SIGMA_M))))
+            factors.add(gtsam.PriorFactorPoint2(_LEVER, self.lever, sigma(np.full(2, LEVER_SIGMA_M))))
             values.insert(_ALIGNMENT, gtsam.Pose2(*update.alignment))
             values.insert(_LEVER, self.lever)
         for position in update.positions:

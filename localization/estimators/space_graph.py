@@ -1,8 +1,10 @@
-"""Pose graph in space in GTSAM: keyframes, tied by wheels, scans and gravity, with corrections of the motion model and the accelerometer.
+"""Pose graph in space in GTSAM: keyframes, tied by wheels, scans, gravity and positions, with corrections of the motion model and the
+accelerometer.
 
     x_k          keyframe poses ``odom_T_body`` on SE(3)
     c            corrections of the motion model (k, centre of rotation, ... by name)
     a            bias of the accelerometer, with what its mount is off
+    t, l         ``enu_T_map`` (x, y, z, yaw) and the lever arm of the positions' antenna, if there are positions
 
 Measurements are collected on the way and solved once, by Levenberg-Marquardt. Perturbations act on the right. Tangents are in the order of
 `motion_models.se3`, those of GTSAM have the rotation first.
@@ -15,8 +17,9 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from localization.core.measurements.position import predict_position_in_space
 from localization.core.space import lift
-from localization.estimators.pose_graph import check_solvable, levenberg_marquardt, robust_factor
+from localization.estimators.pose_graph import LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor
 from motion_models import se2, se3
 from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import FloatArray
@@ -28,7 +31,9 @@ _SWAP = [3, 4, 5, 0, 1, 2]
 _PLANAR = [0, 1, 5]
 _FIRST_POSITION_M, _FIRST_HEADING, _FIRST_TILT = 1e-3, 1e-4, 0.2
 """Sigmas of the first keyframe, which is the origin of the map [m, rad]; gravity measures its roll and pitch."""
-_CORRECTIONS, _BIAS = gtsam.symbol("c", 0), gtsam.symbol("a", 0)
+_CORRECTIONS, _BIAS, _ALIGNMENT, _LEVER = (gtsam.symbol(name, 0) for name in "catl")
+_ALIGNMENT_SIGMA, _ANTENNA_HEIGHT_SIGMA_M = 1e3, 1.0
+"""Of x, y, z and yaw of the map among the positions [m, rad]; and of the antenna's height above the ground, around zero."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,18 @@ class GravityMeasurement:
     """[m^2/s^4]"""
 
 
+@dataclass(frozen=True)
+class SpacePosition:
+    """A position, as by GPS, of the antenna of a body at ``offset`` (4, 4) from keyframe ``k``."""
+
+    k: int
+    offset: Transform3
+    position: FloatArray
+    """East and north, and up where that is measured, (2,) or (3,) [m]."""
+    cov: FloatArray
+    """(2, 2) or (3, 3)"""
+
+
 @dataclass
 class SpaceGraph:
     """`add` keyframes with what was measured since the last one; `smooth` gives their poses by all of it."""
@@ -65,6 +82,11 @@ class SpaceGraph:
     wheels: list[PreintegratedMotion] = field(default_factory=list)
     betweens: list[Between] = field(default_factory=list)
     gravities: list[GravityMeasurement] = field(default_factory=list)
+    positions: list[SpacePosition] = field(default_factory=list)
+    alignment: FloatArray | None = None
+    """(4,) initial value of ``enu_T_map``, x, y, z and yaw; without it positions are left out."""
+    lever: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the positions' antenna in the body frame [m]."""
 
     def smooth(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Poses (K, 4, 4), their covariances (K, 6, 6) and the corrections (c,). Raises `EstimatorError` where there is no solution."""
@@ -95,7 +117,19 @@ class SpaceGraph:
             graph.add(gtsam.BetweenFactorPose3(*ends, gtsam.Pose3(between.delta), noise))
         for gravity in self.gravities:
             graph.add(gravity_factor(gravity))
+        if self.alignment is not None:
+            self._add_positions(self.alignment, graph, values)
         return graph, values
+
+    def _add_positions(self, alignment: FloatArray, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        for key, mean, sigmas in (
+            (_ALIGNMENT, alignment, np.full(4, _ALIGNMENT_SIGMA)),
+            (_LEVER, self.lever, np.array([LEVER_SIGMA_M, LEVER_SIGMA_M, _ANTENNA_HEIGHT_SIGMA_M])),
+        ):
+            values.insert(key, mean)
+            graph.add(gtsam.PriorFactorVector(key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        for position in self.positions:
+            graph.add(position_factor(position))
 
 
 def _first_information(pose: Transform3) -> FloatArray:
@@ -143,3 +177,18 @@ def gravity_factor(measured: GravityMeasurement) -> gtsam.CustomFactor:
         return np.asarray(GRAVITY * measured.turned.T @ up + values.atVector(_BIAS) - measured.force)
 
     return robust_factor([key, _BIAS], measured.variance * np.eye(3), error)
+
+
+def position_factor(measured: SpacePosition) -> gtsam.CustomFactor:
+    """t x_k (offset l) - p: where the antenna is, against its measured position."""
+    keys, n = [_ALIGNMENT, gtsam.symbol("x", measured.k), _LEVER], len(measured.position)
+
+    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
+        alignment, lever = (np.asarray(values.atVector(key)) for key in (_ALIGNMENT, _LEVER))
+        pose = values.atPose3(keys[1]).matrix()
+        predicted, by_alignment, by_key, by_lever = predict_position_in_space(alignment, pose, measured.offset, lever)
+        if H is not None:
+            H[0], H[1], H[2] = map(np.asfortranarray, (by_alignment[:n], by_key[:n, _SWAP], by_lever[:n]))
+        return np.asarray(predicted[:n] - measured.position)
+
+    return robust_factor(keys, measured.cov, error)

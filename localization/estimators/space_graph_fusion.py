@@ -17,9 +17,10 @@ from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate, Estimator
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
 from localization.estimators.pose_graph import through_nodes
+from localization.estimators.position_queue import PositionQueue, align_map
 from localization.estimators.space_fusion import SpaceFusion
-from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph
-from localization.events import Step
+from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
+from localization.events import PositionSample, Step
 from localization.lidar import LostScans
 from localization.lifting import Pose3, SpaceTable, Trajectory3
 from localization.trajectory import Trajectory
@@ -62,7 +63,9 @@ class SpaceGraphFusion(Estimator):
         self.odometry, self._corrections = odometry, corrections
         self._config, self._is_smoothing = smoothing.config, smoothing.is_smoothing
         self._map_T_odom = map_T_odom
-        self.graph = SpaceGraph(block_diag(corrections.cov, _NO_SIGMA**2), odometry.accelerometer_sigma)
+        lever = np.array([smoothing.config.antenna_x_m, smoothing.config.antenna_y_m, 0.0])
+        self.graph = SpaceGraph(block_diag(corrections.cov, _NO_SIGMA**2), odometry.accelerometer_sigma, lever=lever)
+        self._queue = PositionQueue()
         self._excitation = Excitation(track_m, corrections.min_track_over_radius)
         self._wheels = MotionPreintegration(len(corrections.names))
         self._stamps_ns, self._poses, self._covs_since = array("q"), array("d"), array("d")
@@ -91,10 +94,23 @@ class SpaceGraphFusion(Estimator):
         c, (way, turn) = self._config, (math.hypot(*delta[:3, 3]), math.hypot(*se3.rotation_vector(delta[:3, :3])))
         if not self.graph.poses or way > c.keyframe_distance_m or turn > c.keyframe_angle_rad:
             self._add_keyframe(delta, cov)
-            delta = np.eye(4)
+            delta, cov = np.eye(4), np.zeros((6, 6))
         if step.gravity is not None:
             k, force, variance = len(self.graph.poses) - 1, step.gravity.force, step.gravity.variance
             self.graph.gravities.append(GravityMeasurement(k, force, delta[:3, :3], variance))
+        self._place_positions(step, delta, cov)
+
+    def _place_positions(self, step: Step, delta: FloatArray, cov: FloatArray) -> None:
+        """Positions up to the end of ``step`` are taken from the newest keyframe, which is ``delta`` with ``cov`` behind the pose."""
+        state = self.odometry.state
+        back = se3.log(se3.inverse(state["pose"]) @ state["start"])
+        moved = np.trace(cov[:3, :3]) / 3.0
+        for sample, part in self._queue.take(step, has_keyframe=True):
+            offset = se3.compose(delta, se3.exp((1.0 - part) * back))
+            position, spread = sample.position, sample.covariance
+            if sample.height is not None:
+                position, spread = np.append(position, sample.height[0]), block_diag(spread, sample.height[1])
+            self.graph.positions.append(SpacePosition(len(self.graph.poses) - 1, offset, position, spread + moved * np.eye(len(position))))
 
     def _add_keyframe(self, delta: FloatArray, cov: FloatArray) -> None:
         state, n = self.odometry.state, len(self.graph.poses)
@@ -111,6 +127,11 @@ class SpaceGraphFusion(Estimator):
         self._wheels = MotionPreintegration(len(self._corrections.names))
         self.odometry.start_key()
 
+    def add_position(self, sample: PositionSample) -> None:
+        """A position by GPS, for the smoothed poses; it is placed once the odometry has come to its stamp."""
+        if self._is_smoothing and self.graph.poses:
+            self._queue.add(sample)
+
     def run_deferred(self) -> None:
         """The filter's submap."""
         self.odometry.run_deferred()
@@ -120,6 +141,7 @@ class SpaceGraphFusion(Estimator):
         self.run_deferred()
         if not self._is_smoothing or filtered is None or len(self._nodes) < 2:
             return None
+        self._align()
         try:
             poses, covs, _ = self.graph.smooth()
         except EstimatorError as error:
@@ -142,6 +164,19 @@ class SpaceGraphFusion(Estimator):
         self._smoothed = table.trajectory()
         return Trajectory(filtered.stamps_ns, planar, planar_covs)
 
+    def _align(self) -> None:
+        """The map's place and heading among the positions, where these suffice."""
+        positions = self.graph.positions
+        if not positions:
+            return
+        ours = np.array([(self.graph.poses[p.k] @ p.offset)[:3, 3] for p in positions])
+        theirs = np.array([p.position[:2] for p in positions])
+        found = align_map(ours[:, :2], theirs, np.sqrt([0.5 * np.trace(p.cov[:2, :2]) for p in positions]))
+        if found is None:
+            return
+        rises = [p.position[2] - z for p, z in zip(positions, ours[:, 2].tolist(), strict=True) if len(p.position) == 3]
+        self.graph.alignment = np.array([found[0], found[1], np.median(rises) if rises else 0.0, found[2]])
+
     @property
     def smoothed_in_space(self) -> Trajectory3 | None:
         """Poses in space by all measurements, once `finish` has smoothed them."""
@@ -163,11 +198,18 @@ class SpaceGraphFusion(Estimator):
 
     def counts(self) -> Mapping[str, int]:
         """Those of the filter, and the keyframes."""
-        return {**self.odometry.counts(), "keyframes": len(self.graph.poses)}
+        found = {**self.odometry.counts(), "keyframes": len(self.graph.poses)}
+        return {**found, "positions": self._n_positions} if self._n_positions else found
+
+    @property
+    def _n_positions(self) -> int:
+        """Positions in the graph."""
+        return 0 if self.graph.alignment is None else len(self.graph.positions)
 
     def warnings(self) -> list[str]:
-        """Those of the filter, and whether smoothing failed."""
-        return [*self.odometry.warnings(), *([self._failure] if self._failure else [])]
+        """Those of the filter, whether smoothing failed, and positions that could not be used."""
+        found = [*self.odometry.warnings(), *([self._failure] if self._failure else [])]
+        return found + self._queue.warnings(self._n_positions, len(self.graph.positions) - self._n_positions)
 
     def map_points(self) -> Points2:
         """See `SpaceFusion.map_points`."""

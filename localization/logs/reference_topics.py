@@ -39,13 +39,15 @@ def _reference(stamp: int, position: Any, orientation: Any, covariance: Any) -> 
     yaw = yaw_of(orientation)
     if not (np.isfinite(where).all() and math.isfinite(yaw)):
         raise UnusableError(Oddity.NOT_FINITE)
-    cov = np.full((3, 3), np.nan)
+    cov, height = np.full((3, 3), np.nan), None
     if covariance is not None:
-        planar = np.asarray(covariance, dtype=float).reshape(6, 6)[_PLANAR]
+        given = np.asarray(covariance, dtype=float).reshape(6, 6)
+        planar = given[_PLANAR]
+        height = None if position.z == 0.0 else _height(float(position.z), float(given[2, 2]))  # filters in the plane give 0 and 1e-6 m^2
         # Drivers without a covariance fill in zeros.
         if np.isfinite(planar).all() and (np.diag(planar) >= 0).all() and planar.any():
             cov = planar
-    return Reference(stamp, where, yaw, cov)
+    return Reference(stamp, where, yaw, cov, height=height)
 
 
 def _fix_decoder(datum: FloatArray | None) -> Callable[[Any, int], Reference]:
@@ -66,12 +68,19 @@ def _fix_decoder(datum: FloatArray | None) -> Callable[[Any, int], Reference]:
         if origin is None:
             origin = float(degrees[0]), float(degrees[1]), height
             centre, axes = _plane(origin)
-        cov = np.full((3, 3), np.nan)
+        cov, variance = np.full((3, 3), np.nan), _UNKNOWN_HEIGHT_SIGMA_M**2
         if int(message.position_covariance_type) > 0:
-            cov[:2, :2] = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)[:2, :2]
-        return Reference(stamp, axes @ (position - centre), None, cov, origin)
+            given = np.asarray(message.position_covariance, dtype=float).reshape(3, 3)
+            cov[:2, :2], variance = given[:2, :2], float(given[2, 2])
+        above = _height(height - origin[2], variance) if math.isfinite(message.altitude) else None
+        return Reference(stamp, axes @ (position - centre), None, cov, origin, above)
 
     return decode
+
+
+def _height(height: float, variance: float) -> tuple[float, float] | None:
+    """Height and its variance; None where one is not known."""
+    return (height, variance) if math.isfinite(height) and math.isfinite(variance) and variance > 0.0 else None
 
 
 def _plane(origin: tuple[float, float, float]) -> tuple[FloatArray, FloatArray]:
@@ -102,6 +111,8 @@ def east_north(latitude: float, longitude: float) -> FloatArray:
 _UNKNOWN_SIGMA_M = 2.5
 """Sigma of a position by a source without covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 %
 within 8 m)."""
+_UNKNOWN_HEIGHT_SIGMA_M = 6.6
+"""The same of the height (95 % within 13 m) [m]."""
 _MIN_SIGMA_M = 0.01
 """Smallest sigma of a receiver, whatever its covariance [m]."""
 
@@ -124,7 +135,8 @@ def position_sample(reference: Reference) -> PositionSample | None:
     cov = reference.covariance[:2, :2]
     if not np.isfinite(cov).all() or (np.linalg.eigvalsh(cov) <= 0.0).any():
         cov = _UNKNOWN_SIGMA_M**2 * np.eye(2)
-    return PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2), reference.origin)
+    height = None if reference.height is None else (reference.height[0], reference.height[1] + _MIN_SIGMA_M**2)
+    return PositionSample(reference.stamp_ns, reference.position, cov + _MIN_SIGMA_M**2 * np.eye(2), reference.origin, height)
 
 
 def in_plane(sample: PositionSample, origin: tuple[float, float, float] | None) -> FloatArray | None:

@@ -8,7 +8,10 @@ import math
 import numpy as np
 import pytest
 
+from localization.core.measurements.position import predict_position_in_space
+from localization.events import PositionSample, WheelSample
 from localization.log_replay import replay
+from localization.logs.reference_topics import merge_positions
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.state_serialization import deserialize, serialize
 from localization.synchronizer import StepConfig
@@ -128,6 +131,28 @@ def test_replay_of_clouds_on_level_ground_stays_in_the_plane_to_the_last_bit():
     np.testing.assert_array_equal(run.trajectory.covariances, flat.trajectory.covariances)
     assert run.left_plane_ns is None
     assert run.in_space is None
+
+
+@pytest.mark.extended
+def test_graph_in_space_with_positions_corrects_wrong_wheels():
+    """Wheels 4 % too large, without a LiDAR: positions of 1 cm with their heights, in a plane of their own, at 2 Hz."""
+    drive = rolling_drive(12.0, turn_rate=0.0, seed=5)  # on an arc the antenna may be farther aside instead
+    enu_T_map, rng, lever = np.array([50.0, 20.0, 9.0, 1.0]), np.random.default_rng(6), np.array([0.1, 0.0, 0.5])
+    wheels = [
+        dataclasses.replace(e, velocity=0.96 * e.velocity, position=0.96 * e.position) if isinstance(e, WheelSample) else e
+        for e in drive.events
+    ]
+    fixes = []
+    for stamp, pose in zip(drive.stamps_ns[50::50], true_poses(drive, drive.stamps_ns[50::50]), strict=True):
+        at = predict_position_in_space(enu_T_map, pose, np.eye(4), lever)[0] + 0.01 * rng.normal(size=3)
+        fixes.append(PositionSample(int(stamp), at[:2], 1e-4 * np.eye(2), None, (float(at[2]), 1e-4)))
+    trial, errors = Trial(make_model("diff_drive", drive.robot), "graph"), []
+    for events in (wheels, list(merge_positions(wheels, fixes))):
+        (run,) = replay(events, [trial], drive.robot, drive.mounts, True, IN_SPACE)
+        errors.append(aligned_rms(run.in_space.positions, true_poses(drive, run.in_space.stamps_ns)[:, :3, 3]))
+    assert run.counts["positions"] > 18
+    assert errors[0] > 0.04
+    assert errors[1] < 0.4 * errors[0]
 
 
 def test_space_fusion_of_planar_scans_is_named(rolled, among_trees):

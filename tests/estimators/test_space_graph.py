@@ -1,14 +1,16 @@
-"""The graph in space: the covariance of what it smooths, and keyframes that carry the poses between them."""
+"""The graph in space: the covariance of what it smooths, positions, and keyframes that carry the poses between them."""
 
 from __future__ import annotations
 
 import itertools
 
 import numpy as np
+import pytest
 
+from localization.core.measurements.position import predict_position_in_space
 from localization.core.space import SE3
 from localization.estimators.pose_graph import through_nodes
-from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph
+from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from motion_models import se2, se3
 from motion_models.preintegration import PreintegratedMotion
 from motion_models.slope import GRAVITY
@@ -44,15 +46,47 @@ def _drawn(rng: np.random.Generator) -> tuple[SpaceGraph, np.ndarray]:
     return graph, np.array(true)
 
 
-def test_smoothed_poses_in_space_err_as_their_covariances_have_it():
+_ENU_T_MAP, _POSITION_SIGMA, _LEVER_SIGMAS = np.array([300.0, -200.0, 40.0, 2.0]), 0.03, np.array([0.5, 0.5, 1.0])
+
+
+def _with_positions(graph: SpaceGraph, true: np.ndarray, rng: np.random.Generator) -> None:
+    """Positions near each keyframe, of every second one without the height."""
+    lever = _LEVER_SIGMAS * rng.normal(size=3)
+    for k, pose in enumerate(true):
+        offset, n = se3.exp(0.1 * rng.normal(size=6)), 3 - k % 2
+        at = predict_position_in_space(_ENU_T_MAP, pose, offset, lever)[0] + _POSITION_SIGMA * rng.normal(size=3)
+        graph.positions.append(SpacePosition(k, offset, at[:n], _POSITION_SIGMA**2 * np.eye(n)))
+    graph.alignment = _ENU_T_MAP + np.array([0.5, -0.5, 0.5, 0.1])
+
+
+@pytest.mark.parametrize("has_positions", [False, True])
+def test_smoothed_poses_in_space_err_as_their_covariances_have_it(has_positions):
     """Mean NEES of 15 drives: chi-square with 90 degrees of freedom is within 3.9 to 8.3 times 15 in 99 %."""
-    rng, nees = np.random.default_rng(4), []
+    rng, nees, sigmas = np.random.default_rng(4), [], []
     for _ in range(15):
         graph, true = _drawn(rng)
+        if has_positions:
+            _with_positions(graph, true, rng)
         poses, covs, _ = graph.smooth()
         error = se3.local(poses[-1], true[-1])
         nees.append(error @ np.linalg.solve(covs[-1], error))
+        sigmas.append(np.sqrt(covs[-1][2, 2]))
     assert 3.9 < np.mean(nees) < 8.3
+    assert (np.mean(sigmas) < 0.05) == has_positions  # of the height: 0.04 for 0.06 m
+
+
+def test_position_in_space_has_the_derivatives_of_differences():
+    rng = np.random.default_rng(2)
+    pose, offset, lever = se3.exp(rng.normal(size=6)), se3.exp(rng.normal(size=6)), rng.normal(size=3)
+    _, *jacobians = predict_position_in_space(_ENU_T_MAP, pose, offset, lever)
+    moves = (
+        lambda d: predict_position_in_space(_ENU_T_MAP + d, pose, offset, lever)[0],
+        lambda d: predict_position_in_space(_ENU_T_MAP, se3.retract(pose, d), offset, lever)[0],
+        lambda d: predict_position_in_space(_ENU_T_MAP, pose, offset, lever + d)[0],
+    )
+    for move, jacobian in zip(moves, jacobians, strict=True):
+        differences = [(move(1e-5 * row) - move(-1e-5 * row)) / 2e-5 for row in np.eye(jacobian.shape[1])]
+        np.testing.assert_allclose(jacobian, np.transpose(differences), atol=1e-6)
 
 
 def test_smoothed_poses_in_space_go_through_the_keyframes():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from localization.errors import LogError
 from localization.events import PositionSample, Reference, WheelSample
-from localization.logs.reference_topics import merge_positions, read_positions
+from localization.logs.reference_topics import merge_positions, position_sample, read_positions, reference_decoder
 
 KNOWN = np.diag([0.5, 0.2, 0.1]) ** 2
 
@@ -35,6 +37,28 @@ def test_positions_not_finite_are_dropped(position: tuple[float, float]) -> None
 def test_position_without_covariance_has_that_of_a_plain_receiver(cov: np.ndarray) -> None:
     (sample,) = read_positions([reference(1, cov=cov)], "/fix")
     assert np.sqrt(np.diag(sample.covariance)) == pytest.approx([2.5, 2.5], rel=1e-3)
+
+
+def fix(altitude: float, variance: float, covariance_type: int = 2) -> SimpleNamespace:
+    covariance = np.diag([1.0, 1.0, variance]).ravel()
+    status = SimpleNamespace(status=0)
+    place = {"latitude": 48.0, "longitude": 11.0, "altitude": altitude}
+    return SimpleNamespace(**place, status=status, position_covariance=covariance, position_covariance_type=covariance_type)
+
+
+def test_fixes_have_heights_above_the_first_where_these_are_known() -> None:
+    decode = reference_decoder("sensor_msgs/msg/NavSatFix")
+    first, second, without, unknown, zero = (
+        position_sample(decode(message, k))
+        for k, message in enumerate(
+            [fix(500.0, 4.0), fix(507.0, 9.0), fix(np.nan, 4.0), fix(503.0, 4.0, covariance_type=0), fix(503.0, 0.0)]
+        )
+    )
+    assert first.height == pytest.approx((0.0, 4.0), abs=1e-3)
+    assert second.height == pytest.approx((7.0, 9.0), abs=1e-3)
+    assert without.height is None
+    assert unknown.height == pytest.approx((3.0, 6.6**2), abs=1e-3)
+    assert zero.height is None
 
 
 def test_position_far_off_is_kept() -> None:

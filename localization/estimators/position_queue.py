@@ -1,0 +1,66 @@
+"""Positions, as by GPS, on their way into a graph: they wait for the odometry, and give the map its heading."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from localization.events import PositionSample, Step
+from motion_models import se2
+from motion_models.se2 import FloatArray, Points2, Pose2
+
+MIN_POSITIONS, MIN_BASELINE_M = 3, 5.0
+"""Positions, and the distance between them [m], from which they give the heading of the map."""
+_ALIGNMENT_ITERATIONS = 30
+
+
+@dataclass
+class PositionQueue:
+    """Positions that wait until the odometry has come to their stamps."""
+
+    n_late: int = 0
+    """Those of before the step in which they came."""
+    _waiting: list[PositionSample] = field(default_factory=list)
+
+    def add(self, sample: PositionSample) -> None:
+        """Let ``sample`` wait."""
+        self._waiting.append(sample)
+
+    def take(self, step: Step, has_keyframe: bool) -> Iterator[tuple[PositionSample, float]]:
+        """Those in ``step``, with the share of it until their stamp; what is older is left out, and all before there is a keyframe."""
+        while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
+            sample = self._waiting.pop(0)
+            if not has_keyframe:
+                continue
+            if sample.stamp_ns < step.start_ns:
+                self.n_late += 1
+                continue
+            yield sample, (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
+
+    def warnings(self, n_used: int, n_unused: int) -> list[str]:
+        """What could not be used: all, with ``n_unused`` taken in vain and ``n_used`` in the graph, and late ones."""
+        found, n = [], n_unused + len(self._waiting)
+        if n and not n_used:
+            needed = f"it takes {MIN_POSITIONS} over {MIN_BASELINE_M:g} m to give the map its heading"
+            found.append(f"{n} positions could not be used: {needed}.")
+        if self.n_late:
+            late = "1 position" if self.n_late == 1 else f"{self.n_late} positions"
+            found.append(f"{late} came after the estimate of a later stamp and had to be left out. Check the stamps.")
+        return found
+
+
+def align_map(ours: Points2, theirs: Points2, sigmas: FloatArray) -> Pose2 | None:
+    """Pose (3,) that moves points ``ours`` (N, 2) onto ``theirs`` (N, 2) [m]; None where they are too few or too near to one another.
+
+    The sum of distances is minimised, not of their squares, by iterated weights 1 / distance: outliers among ``theirs`` do not pull.
+    Distances below ``sigmas`` (N,) [m] count alike.
+    """
+    if len(ours) < MIN_POSITIONS or np.hypot(*np.ptp(ours, axis=0)) < MIN_BASELINE_M:
+        return None
+    distances, pose = sigmas, np.zeros(3)
+    for _ in range(_ALIGNMENT_ITERATIONS):
+        pose = se2.align_points(ours, theirs, 1.0 / distances)
+        distances = np.maximum(np.hypot(*(se2.transform(pose, ours) - theirs).T), sigmas)
+    return pose
