@@ -412,6 +412,8 @@ def _alternatives(signals: WheelSignals, base: Wiring) -> list[Wiring]:
         found += [w._replace(gyro=-1.0, changes=w.changes + 1, text=f"{w.text}, and {opposite}") for w in found[:3]]
         found.append(base._replace(gyro=-1.0, changes=1, text=f"{opposite} (an IMU upside down)"))
     if "LiDAR" in signals.turns:
+        if "gyro" in signals.turns and signals.is_gyro_upright:  # which the wheels then agree with
+            found += [w._replace(lidar=(1.0, -1.0), changes=2, text=w.text) for w in found[:3]]
         found.append(base._replace(lidar=(1.0, -1.0), changes=1, text="the LiDAR is upside down"))
         found.append(base._replace(lidar=(-1.0, 1.0), changes=1, text="the LiDAR is turned by 180 deg"))
     return found
@@ -451,8 +453,8 @@ def _ambiguous(log: Log | LiveSensors, ways: Sequence[str], measured: Mapping[st
 
 
 def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
-    """Report with the robot corrected. A LiDAR's mount is left to the sensor checks, which measure its angle."""
-    if wiring.lidar != (1.0, 1.0):
+    """Report with the robot corrected. A LiDAR's mount is left to its own check, which measures its angle."""
+    if wiring.lidar != (1.0, 1.0) and not wiring.reversed:
         return WiringReport(log.robot, correlations=measured)
     robot, keys = log.robot, {}
     names = signals.joints

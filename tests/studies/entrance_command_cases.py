@@ -516,7 +516,7 @@ LATER = (  # made after what the others showed was corrected
     driven("later", "left reversed and LiDAR upside down", SCANS, Publishing(signed(-1, -1, 1, 1), lidar_flip=True), ["joints.reversed"]),
     driven("later", "gear of 3", SCANS, Publishing(scaled(3.0, 3.0)), ["gear"]),
     driven("later", "velocities in m/s, positions in rad", WARTHOG, Publishing(scaled(1.0, 0.3)), ["metres"]),
-    driven("later", "LiDAR at 120 deg", ROSBOT, Publishing(lidar_yaw=math.radians(120.0)), ["120 deg"]),
+    driven("later", "LiDAR at 120 deg", ROSBOT, Publishing(lidar_yaw=math.radians(120.0)), ["the yaw of 'laser'"]),
     driven("later", "LiDAR upside down at 90 deg", SCANS, Publishing(lidar_flip=True, lidar_yaw=math.pi / 2), ["upside"]),
     driven("later", "LiDAR 1 s late and backwards", SCANS, Publishing(offsets_s={"/scan": 1.0}, lidar_yaw=math.pi), ["180 deg"]),
     driven("later", "rates constant, angles right", JACKAL, Publishing(lambda a, r: (a, 0.0 * r))),
