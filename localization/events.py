@@ -236,6 +236,8 @@ class Step:
     """A scan came, and a sensor check left it out."""
     is_scan_partial: bool = False
     """A sensor check left out points of ``scan`` that move."""
+    restarts_calibration: bool = False
+    """A sensor check found that what was learned so far is by a faulty sensor."""
     rested_s: float = 0.0
     """For how long wheels, gyro and accelerometer have all measured what they do on a robot at rest [s]."""
 

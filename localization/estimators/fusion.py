@@ -83,6 +83,8 @@ class EkfFusion(Estimator):
         motion, unseen = replace(step.predicted, cov=self._wheel_noise.cov(step)), self._open_way.cov(step)
         self._excitation.start_step(motion)
         self._outlier.start_step()
+        if step.restarts_calibration:
+            self._restart_calibration()
         state = clone(self.state, "pose", "start")
         state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
         if unseen.any():  # the submap moves along
@@ -115,6 +117,12 @@ class EkfFusion(Estimator):
         """Take the corrections from an estimator that has used this filter's measurements and others: mean (k,), covariance (k, k)."""
         self.state = set_marginal(self.state, "corrections", mean, cov)
 
+    def _restart_calibration(self) -> None:
+        """What was learned is as before the first step."""
+        prior, self._wheel_noise = initial_state(self._gyro, self.corrections, self._config), WheelNoiseScale()
+        for name in ("gyro_bias", "gyro_scale", "clock", "radius", "corrections"):
+            self.state = set_marginal(self.state, name, prior[name], prior.cov(name))
+
     def _update_turn(self, state: State, step: Step) -> tuple[State, Innovation | None]:
         """Update by the gyro's turn, if there is one. With its first there is a second clock, from which the wheels' may be off."""
         if step.turn is None:
@@ -136,8 +144,11 @@ class EkfFusion(Estimator):
             return state, None
         self.counts_by_name["scans"] += 1
         self._is_scan_pending = True
-        prior_cov = state.difference_cov("pose", "map")
-        match = sensor.measure(step, state["pose"], prior_cov, self._slip.offset(step))
+        if self._outlier.has_scene_moved and not step.rested_s:
+            sensor.begin_submap()
+            self._outlier.has_scene_moved = False
+        swept, offset = self._slip.start_step(step)
+        match = sensor.measure(swept, state["pose"], state.difference_cov("pose", "map"), offset)
         state, match = self._outlier.apply(state, step, match, sensor.moved.cov(step))
         if match is None:
             return state, None

@@ -134,7 +134,7 @@ class ScanMatcher:
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
         convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier.
-        ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search.
+        ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search, and is tried beside it.
         """
         assert self._grid is not None
         fit = align_points(self._grid, points, prior, cov, prior if guess is None else guess)
@@ -148,7 +148,12 @@ class ScanMatcher:
             if start is not None and not converges and mahalanobis(prior, start, cov) < 2.0 * OUTLIER_COST:
                 added = np.zeros((3, 3))  # within a prior that is wide itself
             found = None if start is None else align_points(self._grid, points, prior, cov + added, start, self.cell)
-            least = self._config.lost_below if is_narrow(cov) else MIN_PLACE_OVERLAP  # the place may not be mapped
+            least = MIN_PLACE_OVERLAP  # the place may not be mapped
+            if is_narrow(cov):
+                least, ahead = self._config.lost_below, se2.retract(prior, offset)
+                goes_on = align_points(self._grid, points, prior, cov + added, ahead, self.cell)
+                if goes_on.overlap >= self._config.search_below and (found is None or _is_better(goes_on, found, prior, cov)):
+                    found = goes_on
             if found is not None and found.overlap >= least and (not converges or _is_better(found, fit, prior, cov)):
                 return self._result(found, added)
         return self._result(fit, np.zeros((3, 3))) if converges and fit.overlap >= self._config.lost_below else None

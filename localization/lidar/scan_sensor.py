@@ -128,6 +128,11 @@ class ScanMatchingSensor:
             self._kiss.insert(self._scan.points, pose)
         return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
 
+    def begin_submap(self) -> None:
+        """Drop the submap: the next scan begins another one."""
+        self._matcher, self._kiss, self._last_key = None, None, None
+        self._place.restart()
+
     def scan_points(self) -> Points2:
         """(M, 2) the scan at hand in the body frame, or (0, 2)."""
         return np.empty((0, 2)) if self._scan is None else self._scan.planar
@@ -172,7 +177,6 @@ class ScanMatchingSensor:
         """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""
         mount = self._mounts.get(frame)
         if mount is not None and not self._is_placed:
-            self._matcher, self._kiss, self._last_key = None, None, None
-            self._place.restart()
+            self.begin_submap()
         self._is_placed = mount is not None
         return mount or Mount()

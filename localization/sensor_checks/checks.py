@@ -81,6 +81,8 @@ class SensorChecks:
                 self._inflation.restart()
         for check in self._applying if self._faults.declared else self._watching:
             step = check.apply(step)
+        if self._faults.has_left_scans_out:
+            step = self._inflation.lead_back(step)
         self._step = step
         return step
 

@@ -27,6 +27,8 @@ class Fault(NamedTuple):
     """What is wrong, and what to do, with places for numbers."""
     reference: DeadReckoning | None = None
     """Its sensors are right: the estimate's distance from it inflates the covariance when the fault is found."""
+    is_of_scans: bool = False
+    """Its scans have led the estimate, which is led back to ``reference``."""
     explains: Fault | None = None
     """A fault that is no longer reported where this one is."""
 
@@ -51,13 +53,15 @@ class FaultLog:
         self.declared: dict[Fault, DetectedFault] = {}
         """Faults that were declared, and are not explained by later ones."""
         self._start_ns: int | None = None
+        self.has_left_scans_out = False
+        """A fault of scans was found in this step."""
         self._revised: dict[Fault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
         """What is declared from now on is of ``step``."""
         if self._start_ns is None:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
-        self.now_s = (step.end_ns - self._start_ns) * _NS
+        self.now_s, self.has_left_scans_out = (step.end_ns - self._start_ns) * _NS, False
 
     def declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
@@ -66,6 +70,7 @@ class FaultLog:
         self.declared[fault] = DetectedFault(fault, max(at_s, 0.0), fault.message.format(**numbers))
         if fault.explains is not None:
             self.declared.pop(fault.explains, None)
+        self.has_left_scans_out |= fault.is_of_scans
         if fault.reference is not None:
             self.inflation.add_distance_from(fault.reference)
 

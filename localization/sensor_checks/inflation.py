@@ -51,6 +51,13 @@ class CovarianceInflation:
             delta = np.array([delta[0], delta[1], step.turn.angle])
         self._by_gyro = se2.compose(self._by_gyro, delta)
 
+    def lead_back(self, step: Step) -> Step:
+        """``step`` at whose end the estimate is where wheels and gyro lead, with the distance to there as its covariance; what was learned
+        until then is dropped."""
+        off = se2.local(se2.compose(self._estimated, step.predicted.delta), self._by_gyro)
+        motion = replace(step.predicted, delta=se2.retract(step.predicted.delta, off), cov=step.predicted.cov + np.outer(off, off))
+        return replace(step, predicted=motion, turn=None, restarts_calibration=True)
+
     def add_distance_from(self, reference: DeadReckoning) -> None:
         """Inflate by how far the estimate is from ``reference``."""
         if self.are_wheels_outvoted:

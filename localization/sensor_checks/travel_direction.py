@@ -19,6 +19,7 @@ LIDAR_DIRECTION = Fault(
     "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used while that lasts."
     " Correct the yaw of its frame by {correction:+.0f} deg in /tf_static or in the robot file's [mounts].",
     reference="wheels and gyro",
+    is_of_scans=True,
 )
 
 _MEMORY_S = 120.0

@@ -42,6 +42,7 @@ LIDAR_OPPOSITE = Fault(
     "the LiDAR turns opposite to {others}. Its scans are not used while that lasts. It is mounted upside down, or left and right wheels"
     " are swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints].",
     reference="wheels and gyro",
+    is_of_scans=True,
 )
 
 _MAX_BIAS_RAD_S = 0.05

@@ -62,6 +62,9 @@ def test_prior_outlier_at_rest_takes_no_match_that_needs_it():
     match = ScanMatch(np.zeros(3), np.zeros(3), 1e-4 * np.eye(3), 1.0, cov)
     driven, resting = step_of([0.1, 0.0, 0.0]), replace(step_of([0.0, 0.0, 0.0], is_standing=True), rested_s=1.0)
     assert outlier.apply(STATE, resting, match, None) == (STATE, None)
+    assert outlier.has_scene_moved
+    assert outlier.apply(STATE, resting, replace(match, outlier_cov=np.zeros((3, 3))), None)[1] is not None
+    assert not outlier.has_scene_moved
     state, used = outlier.apply(STATE, driven, match, None)
     assert used is match
     assert outlier.count == 1

@@ -30,7 +30,7 @@ WAIT = rooms.path((STANDING_S, 0, 0), (8, 0.4, 0.35), (4, 0, -0.7), (4, 0, 0))
 """Stands, drives a curve, turns in place, stands."""
 TOUR = rooms.path((3, 0, 0), (10, 0.4, 0.4), (4, 0.4, -0.9), (3, 0, 0.7), (4, 0, 0), (8, 0.5, 0.35), (6, 0.45, -0.6), (3, 0, 0))
 STREET = rooms.path((6, 0, 0), (20, 0.5, 0), (10, 0, 0), (14, 0.5, 0), (3, 0, 0))
-_PERSON_M, _SWAY_M = 0.22, 0.03
+_PERSON_M, _SWAY_M, _NEAREST_M = 0.22, 0.03, 0.6
 _FORCE_NOISE_M_S2, _DRIVING_M_S2 = 0.03, 0.7
 """Standard deviation of an accelerometer's noise at rest, and of the shaking while the robot drives (Husky outdoors .51 to 1.6)."""
 _CENTERED = rooms.Beams(beams=721, view=2.0 * math.pi * 720 / 721, rate_hz=10.0, noise=0.02)
@@ -67,10 +67,20 @@ def _cut(drive: FaultDrive, scan: Scan, scene: Scene, begin_ns: int) -> Scan:
     aims = eyes[:, 2] + np.arctan2(scan.points[:, 1], scan.points[:, 0])
     directions = np.column_stack([np.cos(aims), np.sin(aims)])
     objects = scene((stamps - begin_ns) * 1e-9, poses)
-    to_object = np.minimum(_to_circles(eyes, directions, objects.circles), _to_segments(eyes, directions, objects.segments))
+    to_object = np.minimum(
+        _to_circles(eyes, directions, _step_aside(objects.circles, poses)), _to_segments(eyes, directions, objects.segments)
+    )
     noise = 0.02 * np.random.default_rng(scan.stamp_ns % 2**32).normal(size=len(ranges))
     nearest = np.where(to_object < ranges, np.maximum(to_object + noise, 0.05), ranges)
     return replace(scan, points=scan.points * (nearest / ranges)[:, None])
+
+
+def _step_aside(circles: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """``circles`` (n, k, 3) that no robot drives through: nobody stays nearer to its middle."""
+    off = circles[:, :, :2] - poses[:, None, :2]
+    distance = np.hypot(off[..., 0], off[..., 1])
+    aside = poses[:, None, :2] + off * np.maximum(_NEAREST_M / np.maximum(distance, 1e-9), 1.0)[..., None]
+    return np.concatenate([aside, circles[:, :, 2:]], axis=2)
 
 
 def _to_circles(eyes: np.ndarray, directions: np.ndarray, circles: np.ndarray) -> np.ndarray:

@@ -10,6 +10,9 @@ from localization.events import Step
 from localization.lidar import ScanMatch
 from motion_models.se2 import Cov3
 
+_MIN_OVERLAP = 0.7
+"""Share of a scan's points on the submap, from which on it fits: below it the matcher searches another pose (`LidarConfig`)."""
+
 
 class PriorOutlier:
     """`apply` with each scan's match. Nothing is rejected: the prior is off by an independent error more, as wide as the search."""
@@ -19,6 +22,8 @@ class PriorOutlier:
         """Matches for which the prior was an outlier."""
         self.cov: Cov3 = np.zeros((3, 3))
         """(3, 3) of what the wheels missed in the last step besides their noise."""
+        self.has_scene_moved = False
+        """The last scan of the robot at rest fitted elsewhere, or hardly: what the submap has there has moved."""
 
     def start_step(self) -> None:
         """No outlier yet."""
@@ -32,6 +37,8 @@ class PriorOutlier:
         """
         is_outlier = match is not None and bool(match.outlier_cov.any())
         if step.rested_s:
+            if match is not None:
+                self.has_scene_moved = is_outlier or match.overlap < _MIN_OVERLAP
             return state, None if is_outlier else match
         if is_outlier and match is not None:
             self.count += 1

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 
 from localization.events import Step
@@ -13,31 +16,43 @@ _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
 
+_MAX_CHANGE_M, _MAX_CHANGE_RAD = 0.1, 0.1
+"""Motion in a step and that with the twist before it differ by no more where the robot goes on as before [m, rad]."""
+
 
 class SweepSlip:
-    """A sweep is deskewed with the wheels' twist first, and with the slip that its match shows then; slip that is white bends it."""
+    """A sweep is deskewed with the wheels' twist first, and with the slip that its match shows then; slip that is white bends it.
+
+    Where the wheels were an outlier of the last match, and the robot went on as before, the last twist is taken for theirs."""
 
     def __init__(self) -> None:
         self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step, and less that of the wheels
-        self._is_measured = False
+        self._is_measured = self._goes_on = False
         self._changes = SlipChanges()
 
-    def offset(self, step: Step) -> Tangent2:
-        """(3,) from the wheels' motion to that with the last twist: where wheels stall and catch up, the robot goes on as before."""
-        return se2.local(step.predicted.delta, se2.exp(step.duration * self._twist))
+    def start_step(self, step: Step) -> tuple[Step, Tangent2]:
+        """``step`` with the twist that its sweep is deskewed with first, and (3,) from the wheels' motion to that with the last twist:
+        where wheels stall and catch up, the robot goes on as before."""
+        offset = se2.local(step.predicted.delta, se2.exp(step.duration * self._twist))
+        return (replace(step, twist=self._twist) if self._goes_on else step), offset
 
     def refine(self, sensor: ScanMatchingSensor, step: Step, start: Pose2, match: ScanMatch) -> tuple[ScanMatch, Cov3]:
         """``match`` of the scan deskewed anew, with the slip since the pose ``start`` (3,), and its covariance (3, 3) with white slip."""
         if step.duration == 0.0:
             return match, match.cov
+        motion = se2.local(start, match.pose)
+        off = motion - step.duration * self._twist
+        is_near = math.hypot(off[0], off[1]) < _MAX_CHANGE_M and abs(off[2]) < _MAX_CHANGE_RAD
+        self._goes_on = is_near and bool(match.outlier_cov.any())
         if self._is_measured:  # else the pose at the start was not measured: its error would look like motion
-            slip = se2.local(start, match.pose) / step.duration - step.mean_twist
+            slip = motion / step.duration - step.mean_twist
             match = sensor.refine(match, step.twist + slip)
             self._changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
         return match, match.cov + sensor.intra_scan_slip_cov(match, self._changes.rate(step))
 
     def end_step(self, step: Step, twist: Twist2, is_measured: bool) -> None:
         """The estimated mean ``twist`` (3,) of ``step``; ``is_measured``: by a scan."""
+        self._goes_on &= is_measured
         self._twist, self._slip, self._is_measured = twist, twist - step.mean_twist, is_measured
 
 
