@@ -394,7 +394,7 @@ def _gyro_scale(
 
 
 @dataclass(frozen=True)
-class Turning:
+class TurningInPlace:
     """Turning in place by a calibration at the robot's nominal CG, and of driving straight on; each with its sigma."""
 
     effective_track_m: tuple[float, float]
@@ -405,8 +405,8 @@ class Turning:
     """Metres driven straight on for each metre that the wheels roll by the robot file's radius."""
 
 
-def turning(found: Calibrated, robot: Robot) -> Turning:
-    """See `Turning`. Sigmas to first order."""
+def turning(found: Calibrated, robot: Robot) -> TurningInPlace:
+    """See `TurningInPlace`. Sigmas to first order."""
     model, result = found.model, found.fit
 
     def numbers(params: FloatArray) -> FloatArray:
@@ -433,4 +433,4 @@ def turning(found: Calibrated, robot: Robot) -> Turning:
     systematic = np.array([found.systematic.get(name, 0.0) for name in free])
     cov = result.cov[np.ix_(index, index)] + np.outer(systematic, systematic)
     sigma = np.sqrt(np.maximum(np.diagonal(J @ cov @ J.T), 0.0))
-    return Turning(*((float(v), float(s)) for v, s in zip(value, sigma, strict=True)))
+    return TurningInPlace(*((float(v), float(s)) for v, s in zip(value, sigma, strict=True)))

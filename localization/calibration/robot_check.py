@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from localization.calibration.dead_reckoning import dead_reckon, forward_rate
-from localization.calibration.lidar_yaw import CheckedLog, open_log_checked
+from localization.calibration.lidar_check import CheckedLog, open_log_checked
 from localization.calibration.log_survey import survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
 from localization.calibration.robot_setup import draft_robot, finish_robot
@@ -36,7 +36,7 @@ from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE, Mount, Robot
 from motion_models.se2 import FloatArray
 
-Verdict = Literal["ok", "contradiction", "cannot be seen"]
+CheckVerdict = Literal["ok", "contradiction", "cannot be seen"]
 
 _STANDING_S = 3.0
 """Before the first motion, for the gyro's bias [s]."""
@@ -72,7 +72,7 @@ class CheckRow:
     """Value of the quantity, as robot file or log have it."""
     second_source: str
     """What it was compared with, and what that measured."""
-    verdict: Verdict
+    verdict: CheckVerdict
     advice: str = ""
     """What to correct, or to drive."""
 
@@ -91,7 +91,7 @@ class RobotCheck:
     """By parameter."""
     scan_topic: str = ""
 
-    def count(self, verdict: Verdict) -> int:
+    def count(self, verdict: CheckVerdict) -> int:
         """Rows of this verdict."""
         return sum(row.verdict == verdict for row in self.rows)
 
@@ -289,7 +289,7 @@ def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: L
         if is_same
         else f"write {'geometry' if signals.joints else 'driver'}.wheel_radius_m = {radius * ratio:.4g}, or check units and gear."
     )
-    verdict: Verdict = "ok" if is_same else "contradiction"
+    verdict: CheckVerdict = "ok" if is_same else "contradiction"
     return [CheckRow("wheel radius", f"{radius:.4g} m", f"{radius * ratio:.4g} m, {name}", verdict, advice)]
 
 

@@ -20,7 +20,7 @@ from localization.calibration.urdf_checks import KIND_NOTES, Contradiction, chec
 from localization.calibration.wheel_fit import (
     MIN_R2,
     DriverFit,
-    Motion,
+    WheelMotion,
     WheelSides,
     fit_wheels,
     is_moving,
@@ -98,7 +98,7 @@ def _wheel_names(
     return [n for n in names if n in known] or [n for n in names if is_wheel(n)]
 
 
-def _motion(path: Path, draft: Draft, survey: Survey, wheels: list[str]) -> Motion | None:
+def _motion(path: Path, draft: Draft, survey: Survey, wheels: list[str]) -> WheelMotion | None:
     states, topic = draft.topics.get("joint_states"), _motion_topic(draft, survey)
     if states is None or topic is None or not wheels:
         return None

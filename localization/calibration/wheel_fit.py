@@ -37,7 +37,7 @@ _MIN_MOTION = 0.05
 
 
 @dataclass(frozen=True)
-class Motion:
+class WheelMotion:
     """Wheels' rates and the robot's motion at the same instants."""
 
     joints: tuple[str, ...]
@@ -74,7 +74,7 @@ class DriverFit:
     """Root mean square of what remains [m/s, rad/s]."""
 
 
-def read_motion(path: Path, states: str, odometry: str, imu: tuple[str, FloatArray] | None, joints: Sequence[str]) -> Motion | None:
+def read_motion(path: Path, states: str, odometry: str, imu: tuple[str, FloatArray] | None, joints: Sequence[str]) -> WheelMotion | None:
     """Motion of a log by its topics of joint ``states`` and ``odometry``, on the latter's stamps; None with less than ten messages.
 
     ``imu``: topic, and (3,) the body's z axis in its frame. Wheels may come in one message or in one each.
@@ -108,7 +108,7 @@ def read_motion(path: Path, states: str, odometry: str, imu: tuple[str, FloatArr
     at = t[use]
     wheels = np.stack([_at(at, series) for series in moved.values()], axis=-1)
     yaw = _at(at, gyro) if len(gyro) >= _MIN_MESSAGES and np.isfinite(gyro).all() else None
-    return Motion(tuple(moved), wheels, vx[use], wz[use], yaw)
+    return WheelMotion(tuple(moved), wheels, vx[use], wz[use], yaw)
 
 
 def _append_rates(rates: Mapping[str, list[tuple[float, float]]], message: Any, stamp: float) -> None:
@@ -123,7 +123,7 @@ def _at(at: FloatArray, series: Sequence[tuple[float, float]]) -> FloatArray:
     return np.asarray(np.interp(at, t[order], value[order]))
 
 
-def is_moving(motion: Motion) -> bool:
+def is_moving(motion: WheelMotion) -> bool:
     """Whether speed and yaw rate are large enough, and different enough, to fit constants to them."""
     moves = len(motion.vx) >= _MIN_MESSAGES and min(math.sqrt(np.mean(v**2)) for v in (motion.vx, motion.wz)) >= _MIN_MOTION
     return bool(moves and np.linalg.matrix_rank(np.stack([motion.vx, motion.wz])) == 2)
@@ -145,7 +145,7 @@ def is_plausible(radius: float, track: float) -> bool:
     return _RADII_PER_TRACK[0] * track <= radius <= _RADII_PER_TRACK[1] * track
 
 
-def wheel_sides(motion: Motion) -> WheelSides | None:
+def wheel_sides(motion: WheelMotion) -> WheelSides | None:
     """Side and sign of each wheel; None where the robot hardly moves or a wheel does not follow both motions (R^2 below `MIN_R2`)."""
     yaw = motion.wz if motion.gyro is None else motion.gyro
     if not is_moving(motion):
@@ -164,7 +164,7 @@ def wheel_sides(motion: Motion) -> WheelSides | None:
     return WheelSides(tuple(left), tuple(right), tuple(backwards)) if left and right else None
 
 
-def fit_wheels(motion: Motion, left: Sequence[str], right: Sequence[str], backwards: Sequence[str] = ()) -> DriverFit | None:
+def fit_wheels(motion: WheelMotion, left: Sequence[str], right: Sequence[str], backwards: Sequence[str] = ()) -> DriverFit | None:
     """Radius and effective track with the given sides; None where they do not give the motion: R^2 below `MIN_R2`, or a wrong sign.
 
     Speed and yaw rate are regressed on both the mean and the difference of the sides. The share of the other one must be small, too: a

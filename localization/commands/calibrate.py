@@ -13,7 +13,16 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from localization.calibration.calibrate import Calibrated, Cut, MotionReferenceName, Turning, calibrated, cut_log, turning, with_clock
+from localization.calibration.calibrate import (
+    Calibrated,
+    Cut,
+    MotionReferenceName,
+    TurningInPlace,
+    calibrated,
+    cut_log,
+    turning,
+    with_clock,
+)
 from localization.calibration.windows import WindowConfig
 from localization.commands.calibration_tables import (
     calibration_numbers,
@@ -201,9 +210,9 @@ def _postures(robot: Robot) -> FloatArray | None:
     return np.array([model.cg(model.chain.posture(posture)) for posture in postures.values()]) if postures else None
 
 
-def _each(found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> list[tuple[str, Turning | None]]:
+def _each(found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> list[tuple[str, TurningInPlace | None]]:
     """Turning by each log alone: what the floor under it does."""
-    turnings: list[tuple[str, Turning | None]] = []
+    turnings: list[tuple[str, TurningInPlace | None]] = []
     for each in cuts:
         try:
             turnings.append((each.source, turning(calibrated(found.model, [each], robot, found.fit.names), robot)))

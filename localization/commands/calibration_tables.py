@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from localization.calibration.calibrate import Calibrated, Cut, Turning, describe_clocks
+from localization.calibration.calibrate import Calibrated, Cut, TurningInPlace, describe_clocks
 from localization.calibration.windows import driven
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from motion_models.base import MotionModel
@@ -48,7 +48,7 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
             print_line(console, f"  {note}")
 
 
-def print_fit(console: Console, found: Calibrated, about: Turning, cuts: Sequence[Cut], robot: Robot) -> None:
+def print_fit(console: Console, found: Calibrated, about: TurningInPlace, cuts: Sequence[Cut], robot: Robot) -> None:
     """Parameters, what is not revealed, what it means, and the errors that it leaves."""
     fit = found.fit
     table = plain_table(
@@ -152,7 +152,7 @@ def _errors_table(found: Calibrated) -> Table:
     return table
 
 
-def print_by_source(console: Console, by_source: Sequence[tuple[str, Turning | None]]) -> None:
+def print_by_source(console: Console, by_source: Sequence[tuple[str, TurningInPlace | None]]) -> None:
     """The effective track on the floor of each log."""
     if not by_source:
         return
@@ -167,7 +167,7 @@ def print_by_source(console: Console, by_source: Sequence[tuple[str, Turning | N
 
 
 def calibration_numbers(
-    found: Calibrated, about: Turning, cuts: Sequence[Cut], by_source: Sequence[tuple[str, Turning | None]]
+    found: Calibrated, about: TurningInPlace, cuts: Sequence[Cut], by_source: Sequence[tuple[str, TurningInPlace | None]]
 ) -> dict[str, Any]:
     """All of it for JSON."""
     return {
@@ -191,7 +191,7 @@ def calibration_numbers(
     }
 
 
-def _turning(about: Turning) -> dict[str, list[float]]:
+def _turning(about: TurningInPlace) -> dict[str, list[float]]:
     return {
         "effective_track_m": list(about.effective_track_m),
         "x_cr_m": list(about.x_cr_m),

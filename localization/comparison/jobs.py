@@ -19,7 +19,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-from localization.calibration.lidar_yaw import open_log_checked
+from localization.calibration.lidar_check import open_log_checked
 from localization.comparison.remote import AccessError, is_url, local_copy, url_fingerprint
 from localization.comparison.turning import MeanCg, turning
 from localization.errors import EvaluationError, LogError, OutputError, TransportError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
-from localization.calibration.lidar_yaw import LidarYaw, LidarYawCheck
+from localization.calibration.lidar_check import LidarCheck, LidarFinding
 from localization.events import Event, Scan
 
 _STANDING_NS = 5_000_000_000  # kept of a robot that has not moved: the gyro's bias is learned from it
@@ -15,7 +15,7 @@ _MAX_POINTS = 2_000_000  # of the scans that are kept; bounds the memory to 100 
 class LidarEntrance:
     """Keeps the events of the first metres until the LiDAR's mount is known to agree with the wheels."""
 
-    def __init__(self, check: LidarYawCheck) -> None:
+    def __init__(self, check: LidarCheck) -> None:
         self._check = check
         self._events: deque[Event] = deque()
         self._points = 0
@@ -34,7 +34,7 @@ class LidarEntrance:
         """Largest error of the position [m]: twice the way by the wheels, while the LiDAR travels in another direction; else 0."""
         return 2.0 * self._check.contradicted_way_m
 
-    def result(self) -> tuple[LidarYaw | None, Iterable[Event]]:
+    def result(self) -> tuple[LidarFinding | None, Iterable[Event]]:
         """What was found, and the events since the start of the drive."""
         return self._check.result(), self._events
 

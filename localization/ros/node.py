@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.calibration.lidar_yaw import LidarYawCheck, corrected
+from localization.calibration.lidar_check import LidarCheck, corrected
 from localization.calibration.wheel_wiring import LiveSensors
 from localization.errors import CheckpointError
 from localization.estimators import Estimate, GraphFusion, MapFusion, PriorMap
@@ -186,7 +186,7 @@ class Node:
     def _check_lidar(self) -> None:
         """Compare the LiDAR's mount with the wheels on the first metres, where there are both."""
         if self._sources.lidar is not None and self._sources.wheels is not None:
-            check = LidarYawCheck(self.session.pipeline.mounts, self._run.robot, self._sources.lidar.topic)
+            check = LidarCheck(self.session.pipeline.mounts, self._run.robot, self._sources.lidar.topic)
             self._entrance = LidarEntrance(check)
 
     def _has_wiring(self) -> bool:

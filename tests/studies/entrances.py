@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 
 from localization.calibration.dead_reckoning import dead_reckon
-from localization.calibration.lidar_yaw import check_lidar_yaw
+from localization.calibration.lidar_check import check_lidar
 from localization.calibration.log_survey import survey_log
 from localization.calibration.robot_draft import Given
 from localization.calibration.robot_setup import draft_robot, finish_checked
@@ -197,7 +197,7 @@ def mounted(name: str, vehicle: Vehicle, how: Publishing, words: Sequence[str]) 
     def judge(folder: Path) -> Found:
         motion = drive(vehicle)
         log, wiring = open_checked(write(folder / "log.mcap", vehicle, motion, how), vehicle.robot())
-        found = None if wiring.is_ambiguous else check_lidar_yaw(log)
+        found = None if wiring.is_ambiguous else check_lidar(log)
         yaw = 0.0 if found is None or found.mount is None else found.mount.yaw
         text = " ".join([*([] if found is None else [found.text]), *log.warnings()])
         if how.lidar_flip:  # found during the drive

@@ -44,7 +44,7 @@ _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
 
 
 @dataclass(frozen=True)
-class LidarYaw:
+class LidarFinding:
     """A LiDAR whose mount or clock is wrong."""
 
     text: str
@@ -69,7 +69,7 @@ class _Travel:
     rows: list[tuple[int, int, Pose2]] = field(default_factory=list)
 
 
-class LidarYawCheck:
+class LidarCheck:
     """`add` the events of a drive until `is_done`; then `result` is what they show."""
 
     def __init__(self, mounts: Mapping[str, Mount], robot: Robot, topic: str, has_gyro: bool = False) -> None:
@@ -123,7 +123,7 @@ class LidarYawCheck:
             self._way_m += abs(float(steps.mean())) * self._radius_m
         self._wheels.append(sample)
 
-    def result(self) -> LidarYaw | None:
+    def result(self) -> LidarFinding | None:
         """What was found so far; None where the mount agrees, or the drive does not show it."""
         found = (self._judge(frame) for frame in list(self._travels) if frame in self._mounts)
         return next((one for one in found if one is not None), None)
@@ -163,7 +163,7 @@ class LidarYawCheck:
                 by_scans.append(complex(delta[0], delta[1]) + lever)
         return np.array(by_wheels), np.array(by_scans), np.array(turns).reshape(-1, 2)
 
-    def _judge(self, frame: str) -> LidarYaw | None:
+    def _judge(self, frame: str) -> LidarFinding | None:
         mount, by_turns = self._mounts[frame], self._by_turns(frame)
         by_wheels, by_scans, turns = self._compare(frame)
         direction = _direction(by_wheels, by_scans)
@@ -180,7 +180,7 @@ class LidarYawCheck:
         begin = f"{self._topic}: by its scans the robot travels {side} against the wheels over {np.abs(by_wheels).sum():.1f} m"
         likeness = _likeness(turns)
         if likeness is None and side == "backwards":
-            return LidarYaw(
+            return LidarFinding(
                 f"{begin}: the yaw of '{frame}' is wrong by 180 deg, or all wheels count backwards; a turn shows which.", frame, None
             )
         if likeness is not None and likeness < _MIN_TURN_LIKENESS:
@@ -191,9 +191,9 @@ class LidarYawCheck:
             f"{begin}{turned}: the yaw of '{frame}' is wrong by {abs(math.degrees(direction)):.0f} deg. Corrected in this run by"
             f" {-math.degrees(direction):+.0f} deg; write yaw = {yaw:.4f} rad {where}."
         )
-        return LidarYaw(text, frame, replace(mount, yaw=yaw), is_certain=is_quarter and likeness is not None)
+        return LidarFinding(text, frame, replace(mount, yaw=yaw), is_certain=is_quarter and likeness is not None)
 
-    def _upside_down(self, frame: str, direction: float) -> LidarYaw:
+    def _upside_down(self, frame: str, direction: float) -> LidarFinding:
         """``direction``: of its travel, by the mount that is assumed: a mirrored sensor's is the sum of the two yaws."""
         mount, (direction, _) = self._mounts[frame], _snapped(direction)
         yaw = math.remainder(direction - mount.yaw, math.tau)
@@ -203,9 +203,9 @@ class LidarYawCheck:
             f" against its transform. Corrected in this run; write roll = {right.roll:.4f}, yaw = {yaw:.4f} rad in /tf_static, or in"
             f" [mounts.{frame}] where the log has none."
         )
-        return LidarYaw(text, frame, right, is_certain=True)
+        return LidarFinding(text, frame, right, is_certain=True)
 
-    def _other_clock(self, frame: str, turns: LidarTurns) -> LidarYaw:
+    def _other_clock(self, frame: str, turns: LidarTurns) -> LidarFinding:
         names = {"lidar": self._topic, "gyro": "the gyro", "wheel": "the wheels"}
         odd = names.pop(turns.sensor)
         key = f"{turns.sensor}_time_offset_s"
@@ -215,14 +215,14 @@ class LidarYawCheck:
             f"{odd}: by the stamps its turns are {abs(turns.late_s):.2f} s {way} than those of {' and '.join(names.values())}, which agree:"
             f" the clocks of two computers, or stamps of arrival. {CORRECTED} clock.{key} = {value:g}, or synchronize the clocks."
         )
-        return LidarYaw(text, frame, None, is_certain=True, clock=replace(self._robot.clock, **{key: value}))
+        return LidarFinding(text, frame, None, is_certain=True, clock=replace(self._robot.clock, **{key: value}))
 
 
-def check_lidar_yaw(log: Log) -> LidarYaw | None:
+def check_lidar(log: Log) -> LidarFinding | None:
     """Compare the first minute of driving; None where the mount agrees, or the drive does not show it."""
     if log.sources.lidar is None or log.sources.wheels is None or log.wheels_error is not None:
         return None
-    check = LidarYawCheck(log.mounts, log.robot, log.sources.lidar.topic, has_gyro=log.sources.imu is not None)
+    check = LidarCheck(log.mounts, log.robot, log.sources.lidar.topic, has_gyro=log.sources.imu is not None)
     for event in log.events():
         check.add(event)
         if check.is_done:
@@ -238,7 +238,7 @@ class CheckedLog:
     wiring: WiringReport
     mounts: Mapping[str, Mount]
     """By frame."""
-    lidar: tuple[LidarYaw, ...] = ()
+    lidar: tuple[LidarFinding, ...] = ()
     """What is wrong with the LiDAR; the sentences are in `Log.warnings` as well."""
 
 
@@ -247,12 +247,12 @@ def open_log_checked(path: Path | str, robot: Robot, topics: TopicOverrides = To
     log, wiring = open_checked(path, robot, topics)
     if wiring.is_ambiguous:
         return CheckedLog(log, wiring, log.mounts)
-    found = check_lidar_yaw(log)
-    of_clock: tuple[LidarYaw, ...] = ()
+    found = check_lidar(log)
+    of_clock: tuple[LidarFinding, ...] = ()
     if found is not None and found.clock is not None:
         log, of_clock = open_log(path, replace(log.robot, clock=found.clock), topics), (found,)
         log.add_notes(wiring.findings)
-        found = check_lidar_yaw(log)
+        found = check_lidar(log)
     lidar = (*of_clock, *(() if found is None else (found,)))
     log.add_notes(one.text for one in lidar)
     return CheckedLog(log, wiring, corrected(log.mounts, found), lidar)
@@ -309,6 +309,6 @@ def _likeness(turns: FloatArray) -> float | None:
     return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
 
 
-def corrected(mounts: Mapping[str, Mount], found: LidarYaw | None) -> dict[str, Mount]:
+def corrected(mounts: Mapping[str, Mount], found: LidarFinding | None) -> dict[str, Mount]:
     """``mounts`` by frame, with that of ``found``."""
     return dict(mounts) if found is None or found.mount is None else {**mounts, found.frame: found.mount}

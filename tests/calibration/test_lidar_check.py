@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from localization.calibration.lidar_yaw import check_lidar_yaw, corrected
+from localization.calibration.lidar_check import check_lidar, corrected
 from localization.evaluation.references import reference_track
 from localization.evaluation.scores import score
 from localization.events import ImuSample, WheelSample
@@ -39,7 +39,7 @@ def turned(log: Log, degrees: float) -> Log:
 def test_lidar_yaw_of_180_deg_is_named_and_corrected() -> None:
     """Four scans of 80 beams a second."""
     log = opened()
-    found = check_lidar_yaw(log)
+    found = check_lidar(log)
     assert found is not None
     assert found.mount is not None
     assert found.mount.yaw == pytest.approx(math.pi)
@@ -53,7 +53,7 @@ def test_lidar_yaw_of_180_deg_is_named_and_corrected() -> None:
 
 @pytest.mark.parametrize("degrees", cases([90.0, -90.0, 45.0, 30.0, 178.0], ("178.0",)))
 def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
-    found = check_lidar_yaw(turned(opened(), degrees))
+    found = check_lidar(turned(opened(), degrees))
     assert found is not None
     assert found.mount is not None
     assert math.remainder(found.mount.yaw - math.pi, math.tau) == pytest.approx(0.0, abs=math.radians(2.5))
@@ -61,11 +61,11 @@ def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, -10.0])
 def test_lidar_yaw_that_slides_explain_is_kept(degrees: float) -> None:
-    assert check_lidar_yaw(turned(opened(), degrees)) is None
+    assert check_lidar(turned(opened(), degrees)) is None
 
 
 def test_lidar_yaw_of_a_healthy_drive_is_kept() -> None:
-    assert check_lidar_yaw(open_log(drive_log(), ROBOT)) is None
+    assert check_lidar(open_log(drive_log(), ROBOT)) is None
 
 
 def test_lidar_yaw_without_a_turn_names_both_causes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,7 +77,7 @@ def test_lidar_yaw_without_a_turn_names_both_causes(monkeypatch: pytest.MonkeyPa
         if not isinstance(event, ImuSample):
             straight.append(event)
     monkeypatch.setattr(log, "events", lambda: iter(straight))
-    found = check_lidar_yaw(log)
+    found = check_lidar(log)
     assert found is not None
     assert found.mount is None
     assert "or all wheels count backwards" in found.text
