@@ -99,7 +99,8 @@ class MovingObjects(Check):
 
     def __init__(self, faults: FaultLog, window: Window) -> None:
         self._faults, self._window = faults, window
-        self._poses = np.zeros((2, 3))  # by the wheels, and by the estimate
+        self._poses = np.zeros((2, 3))  # by the wheels, and by the estimate, which has the wheels' motion in a step until its end
+        self._estimated = np.zeros(3)  # pose by the estimate at the begin of the step
         self._lidars: dict[str, _Lidar] = {}
         self._compared: _View | None = None
         """With which the last scan was compared."""
@@ -153,7 +154,7 @@ class MovingObjects(Check):
         elif lidar.is_active:
             step = without_scan(step)
         if is_due:
-            view = _View(now_s, self._poses.copy(), profile)
+            view = _View(now_s, self._poses, profile)  # `compare_estimate` corrects them
             lidar.views.append(view)
             if step.is_standing and lidar.standing is None:
                 lidar.standing = view
@@ -161,7 +162,7 @@ class MovingObjects(Check):
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
-        self._poses[1] = se2.compose(self._poses[1], delta)
+        self._poses[1] = se2.compose(self._estimated, delta)
         self._is_by_scans |= nis is not None
         inflation, view = self._faults.inflation, self._compared
         if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
@@ -194,11 +195,11 @@ class MovingObjects(Check):
         """``step`` at whose end the estimate is where the wheels lead from `_since`, with the distance to there as its covariance."""
         assert self._since is not None
         motion, by_wheels = step.predicted, se2.between(self._since[0], self._poses[0])
-        off = se2.local(se2.compose(se2.between(self._since[1], self._poses[1]), motion.delta), by_wheels)
+        off = se2.local(se2.compose(se2.between(self._since[1], self._estimated), motion.delta), by_wheels)
         if math.hypot(off[0], off[1]) >= _MIN_OFF_M:
             motion = replace(motion, delta=se2.retract(motion.delta, off), cov=motion.cov + np.outer(off, off))
             step = replace(step, predicted=motion, turn=None)
-        self._since = np.array([self._poses[0], se2.compose(self._poses[1], motion.delta)])
+        self._since = np.array([self._poses[0], se2.compose(self._estimated, motion.delta)])
         for lidar in self._lidars.values():
             lidar.views = deque((self._led_back(view, self._since) for view in lidar.views), maxlen=_MAX_VIEWS)
         return step
@@ -213,7 +214,7 @@ class MovingObjects(Check):
         delta = step.predicted.delta
         if step.turn is not None and not step.is_standing:
             delta = np.array([delta[0], delta[1], step.turn.angle])
-        self._poses[0] = se2.compose(self._poses[0], delta)
+        self._estimated, self._poses = self._poses[1], se2.compose(self._poses, delta)
 
     def _references(self, lidar: _Lidar) -> list[_View]:
         """The oldest view from which wheels and estimate have hardly moved, and the middle one of those after it."""
