@@ -61,12 +61,12 @@ def modules_with_messages() -> list[str]:
 
 
 def _warning_nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """Expressions that become warnings: of a `Fault`, of functions and variables with that word in their name."""
+    """Expressions that become warnings: of a `SensorFault`, of functions and variables with that word in their name."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and any(word in node.name for word in ("warning", "contradiction")):
             docstring = ast.get_docstring(node) is not None
             yield from node.body[docstring:]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Fault":
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "SensorFault":
             yield from node.args[:1]
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("append", "extend"):
             if "warning" in ast.unparse(node.func.value):

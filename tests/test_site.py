@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from localization import sensor_checks
-from localization.sensor_checks.faults import Fault
+from localization.sensor_checks.faults import SensorFault
 from tests.helpers.checkout import enter_checkout
 from tests.helpers.extended import cases
 
@@ -76,7 +76,7 @@ def test_every_fault_of_a_sensor_has_its_text_in_the_lists():
     modules = [importlib.import_module(f"{sensor_checks.__name__}.{m.name}") for m in pkgutil.iter_modules(sensor_checks.__path__)]
     texts = [text for path in HOOKS.modules_with_messages() for text in HOOKS.messages(path)]
     patterns = [re.compile(".+".join(map(re.escape, text.strip().split("\N{HORIZONTAL ELLIPSIS}")))) for text in texts]
-    faults = [thing for module in modules for thing in vars(module).values() if isinstance(thing, Fault)]
+    faults = [thing for module in modules for thing in vars(module).values() if isinstance(thing, SensorFault)]
     assert len(faults) >= 15
     assert [f.message for f in faults if not any(pattern.fullmatch(f.message) for pattern in patterns)] == []
 

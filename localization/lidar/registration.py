@@ -40,7 +40,7 @@ OUTLIER_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
-class Fit:
+class Alignment:
     """The cost above, linearized at a pose: as a rule its minimum."""
 
     pose: Pose2
@@ -61,7 +61,7 @@ class Fit:
     """Sum of the squared sums of e over blocks of `_BLOCK` neighbouring inliers."""
 
 
-def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, guess_error: float | None = None) -> Fit:
+def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2, guess_error: float | None = None) -> Alignment:
     """Gauss-Newton from ``guess`` (3,) for ``points`` (N, 2), with the ``prior`` (3,) of covariance ``cov`` (3, 3).
 
     ``guess_error``: how far the guess may be off at a point [m]; None for a guess that is as uncertain as the prior.
@@ -69,7 +69,7 @@ def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, gues
     information, H, g = np.asarray(np.linalg.inv(cov), dtype=float), np.empty((3, 3)), np.empty(3)
     first = prior_error_at_points(points, cov) if guess_error is None else guess_error
     pose, sums = _align(grid, points, triple(prior), information, triple(guess), first, H, g)
-    return Fit(np.array(pose), H, g, *sums)
+    return Alignment(np.array(pose), H, g, *sums)
 
 
 @kernel
@@ -92,10 +92,10 @@ def mahalanobis(prior: Pose2, pose: Pose2, cov: Cov3) -> float:
     return float(off @ np.linalg.solve(cov, off))
 
 
-def linearize(grid: VoxelGrid, points: Points2, x: Pose2) -> Fit:
+def linearize(grid: VoxelGrid, points: Points2, x: Pose2) -> Alignment:
     """The cost of ``points`` (N, 2) at ``x`` (3,), with information and gradient."""
     H, g = np.empty((3, 3)), np.empty(3)
-    return Fit(x, H, g, *_linearize(grid, points, triple(x), 0.0, H, g))
+    return Alignment(x, H, g, *_linearize(grid, points, triple(x), 0.0, H, g))
 
 
 @kernel
@@ -139,12 +139,12 @@ def _add_prior(information: FloatArray, off: Triple, jacobian: FloatArray, H: Fl
 
 
 _Sums = tuple[float, float, int, int, float, float]
-"""Overlap, cost, inliers, associated points, squares and those of blocks, as `Fit` has them."""
+"""Overlap, cost, inliers, associated points, squares and those of blocks, as `Alignment` has them."""
 
 
 @kernel
 def _linearize(grid: VoxelGrid, points: Points2, x: Triple, guess_error: float, H: FloatArray, g: FloatArray) -> _Sums:
-    """Fill ``H`` (3, 3) and ``g`` (3,), and return the sums of `Fit`.
+    """Fill ``H`` (3, 3) and ``g`` (3,), and return the sums of `Alignment`.
 
     While the pose may still be off by ``guess_error`` [m] at a point, points are associated from so far, and residuals are weighed by it.
     """

@@ -9,7 +9,7 @@ import numpy as np
 
 from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
 from localization.lidar.correlative_search import OUTLIER_COST, LikelihoodImage, draw_image, find_place, prior_outlier_cov
-from localization.lidar.registration import Fit, align_points, fill_informations, is_narrow, linearize, mahalanobis
+from localization.lidar.registration import Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
 from localization.lidar.submap import VoxelGrid, make_grid, measure_shares, voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
@@ -243,7 +243,7 @@ class ScanMatcher:
             self._image = draw_image(self._grid.means, self.cell)
         return find_place(self._image, voxel_means(points, self.cell), prior, wide, cov)
 
-    def _result(self, fit: Fit, outlier_cov: Cov3) -> ScanMatch:
+    def _result(self, fit: Alignment, outlier_cov: Cov3) -> ScanMatch:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
         R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
         measured = se2.retract(fit.pose, -R @ fit.gradient)
@@ -256,17 +256,17 @@ def choose_cell(config: LidarConfig, points: Points2) -> float:
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), 2.0 * config.range_noise_m)
 
 
-def _is_within_basin(fit: Fit, cov: Cov3) -> bool:
+def _is_within_basin(fit: Alignment, cov: Cov3) -> bool:
     """Whether Gauss-Newton from a prior with ``cov`` (3, 3) converges to the right pose: what the scan takes off the prior is within its
     basin. Along directions that the scene leaves open, the prior may be of any width.
     """
     return is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
 
 
-def _is_better(found: Fit, fit: Fit, prior: Pose2, cov: Cov3) -> bool:
+def _is_better(found: Alignment, fit: Alignment, prior: Pose2, cov: Cov3) -> bool:
     """Whether the pose that was ``found`` is more probable than ``fit``, where the prior may be an outlier."""
     return _total_cost(found, prior, cov) < _total_cost(fit, prior, cov)
 
 
-def _total_cost(fit: Fit, prior: Pose2, cov: Cov3) -> float:
+def _total_cost(fit: Alignment, prior: Pose2, cov: Cov3) -> float:
     return fit.cost + min(mahalanobis(prior, fit.pose, cov) / 2.0, OUTLIER_COST)

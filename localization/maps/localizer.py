@@ -22,7 +22,7 @@ from localization.maps.place_probability import (
     MAX_SEARCH_ODDS,
     NEAR_WEIGHTS,
     SEARCH_WEIGHTS,
-    Hypothesis,
+    PlaceHypothesis,
     Weights,
     log_odds,
     sigmoid,
@@ -31,7 +31,7 @@ from localization.maps.place_probability import (
 )
 from localization.maps.place_search import CELL_M, OPEN_INFORMATION, Place, PlaceMap
 from localization.maps.position_plane import PositionFix
-from localization.maps.recent_scans import Motion, RecentScans
+from localization.maps.recent_scans import RecentMotion, RecentScans
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
@@ -102,7 +102,7 @@ class Localizer:
         self.pose, self._cov = place_map.centre, np.zeros((3, 3))
         self._is_tracking, self._track_odds, self._search_odds = False, 0.0, -MAX_SEARCH_ODDS
         self._recent = RecentScans(place_map.range_noise_m)
-        self.hypotheses: Sequence[Hypothesis] = ()
+        self.hypotheses: Sequence[PlaceHypothesis] = ()
         """Places that a search found, the most probable first."""
         self._initial_left = 0
         self._is_doubtful = False  # the last scan does not fit, as the first one does after the robot was carried unnoticed
@@ -151,7 +151,7 @@ class Localizer:
     def add(self, points: Points2, delta: Pose2, cov: Cov3) -> None:
         """A keyframe with the scan ``points`` (N, 2) of the body frame [m]: moved by ``delta`` (3,) with covariance ``cov`` (3, 3) since
         the one before."""
-        delta, cov = self._recent.move(Motion(delta, cov), points)
+        delta, cov = self._recent.move(RecentMotion(delta, cov), points)
         if not is_narrow(cov):  # carried, or driven blind: scans before and after do not belong together
             self._running, self.hypotheses = None, ()
             self._failures = self._wait = 0

@@ -23,7 +23,7 @@ _MAX_NEAR_MARGIN = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class PlaceHypothesis:
     """A place where the robot may be."""
 
     pose: Pose2
@@ -59,7 +59,7 @@ def features(places: Sequence[Place], n_points: int, most_margin: float = _MAX_M
     return np.array([best.on_walls, best.in_free, min(margin, most_margin), math.log(n_points / _POINTS), 1.0])
 
 
-def weigh(places: Sequence[Place], n_points: int, weights: Weights = SEARCH_WEIGHTS, is_narrowed: bool = False) -> list[Hypothesis]:
+def weigh(places: Sequence[Place], n_points: int, weights: Weights = SEARCH_WEIGHTS, is_narrowed: bool = False) -> list[PlaceHypothesis]:
     """``places`` with their probabilities; that of the best by regression, those of others by their scores. ``is_narrowed``: the search
     left out rivals, and no odometry from a known place leads to what it found."""
     if not places:
@@ -69,10 +69,10 @@ def weigh(places: Sequence[Place], n_points: int, weights: Weights = SEARCH_WEIG
     share = 1.0 / (1.0 + rivals.sum())  # places that fit equally are equally probable
     probability = min(sigmoid(min(max(odds, -MAX_SEARCH_ODDS), MAX_SEARCH_ODDS)), share)
     every = np.r_[probability, probability * rivals]
-    return [Hypothesis(place.pose, float(p), place.measured_cov) for place, p in zip(places, every, strict=True)]
+    return [PlaceHypothesis(place.pose, float(p), place.measured_cov) for place, p in zip(places, every, strict=True)]
 
 
-def with_fix(found: Sequence[Hypothesis], fix: PositionFix) -> list[Hypothesis]:
+def with_fix(found: Sequence[PlaceHypothesis], fix: PositionFix) -> list[PlaceHypothesis]:
     """``found`` near a measured position, by Bayes: probabilities times the density of ``fix`` at each place. That none of them is right
     has the mean density over the window of 3 sigma that was searched."""
     densities = np.exp([-0.5 * fix.square(place.pose[:2], np.zeros((2, 2))) for place in found])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from localization.lidar.correlative_search import COARSE, draw_image, reduce_image
-from localization.lidar.registration import Fit, align_points
+from localization.lidar.registration import Alignment, align_points
 from localization.lidar.submap import VoxelGrid, make_grid, voxel_means
 from localization.maps.grid import Grid, draw_grid
 from localization.maps.keyframe_map import KeyframeMap
@@ -62,7 +62,7 @@ class Place:
 
     pose: Pose2
     """(3,) ``map_T_body``."""
-    fit: Fit
+    fit: Alignment
     on_walls: float
     """Share of the points that lie on walls of the map."""
     in_free: float
@@ -195,7 +195,7 @@ class PlaceMap:
         fit = align_points(self.surfaces, points, pose, cov, pose)
         return self.compare(points, fit)
 
-    def compare(self, points: Points2, fit: Fit) -> Place:
+    def compare(self, points: Points2, fit: Alignment) -> Place:
         """How ``points`` (N, 2) agree with walls and free space at the pose of ``fit``."""
         moved = np.asarray(se2.transform(fit.pose, points))
         is_near = _look_up(self._walls.levels[0], moved - self._walls.origin) >= _NEAR

@@ -44,7 +44,7 @@ _FARTHEST_SQUARE = 16.3
 """Squared distance of an aligned motion from the odometry's, beyond which one in a thousand is right [sigma^2]: one of both is wrong."""
 
 
-class Motion(NamedTuple):
+class RecentMotion(NamedTuple):
     """Motion since the keyframe before."""
 
     delta: Pose2
@@ -83,7 +83,7 @@ class RecentScans:
         """Forget all scans: those to come do not belong together with them."""
         self._keys.clear()
 
-    def move(self, motion: Motion, points: Points2) -> Motion:
+    def move(self, motion: RecentMotion, points: Points2) -> RecentMotion:
         """Add ``motion``, at whose end ``points`` (N, 2) of the body frame are measured [m]. Returns the motion by scans and odometry where
         the odometry is wide."""
         motion = self._aligned(motion, points)
@@ -108,7 +108,7 @@ class RecentScans:
     def _seen_from(self, pose: Pose2, n: int) -> Points2:
         return np.vstack([se2.transform(se2.between(pose, key.pose), key.points) for key in list(self._keys)[-n:]])
 
-    def _aligned(self, motion: Motion, points: Points2) -> Motion:
+    def _aligned(self, motion: RecentMotion, points: Points2) -> RecentMotion:
         delta, cov = motion.delta, motion.cov + _LEAST_COV
         is_wide = np.trace(cov[:2, :2]) > _WIDE_M**2 or cov[2, 2] > _WIDE_RAD**2
         is_near = np.trace(cov[:2, :2]) < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2
@@ -122,7 +122,7 @@ class RecentScans:
             self.clear()
             return motion
         by_scans = (fit.information + OPEN_INFORMATION) / max(fit.sum_squares / fit.n_inliers, 1.0)
-        return Motion(fit.pose, np.asarray(np.linalg.inv(np.linalg.inv(cov) + by_scans), dtype=float))
+        return RecentMotion(fit.pose, np.asarray(np.linalg.inv(np.linalg.inv(cov) + by_scans), dtype=float))
 
 
 def _is_partial(points: Points2) -> bool:

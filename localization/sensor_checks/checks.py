@@ -11,15 +11,15 @@ from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.disagreement import Disagreement
-from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
+from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GyroRate
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MovingObjects
 from localization.sensor_checks.own_body import OwnBody
-from localization.sensor_checks.sensor_check import Check
-from localization.sensor_checks.sensor_consistency import Consistency
+from localization.sensor_checks.sensor_check import SensorCheck
+from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.travel_direction import TravelDirection
 from localization.sensor_checks.turn_rates import TurnRates
@@ -39,7 +39,7 @@ class SensorChecks:
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
         self._disagreement, self._moving = Disagreement(faults), MovingObjects(faults, window)
-        self._checks: tuple[Check, ...] = (
+        self._checks: tuple[SensorCheck, ...] = (
             OwnBody(faults),
             GyroRate(faults),
             TurnRates(faults, step_config),
@@ -51,14 +51,14 @@ class SensorChecks:
         self._preparing, self._comparing = self._that_override("prepare"), self._that_override("compare")
         self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
         self._watching = tuple(check for check in self._applying if not check.is_of_declared_faults)
-        self._consistency, self._places, self._tilt = Consistency(faults), KnownPlaces(faults), LidarTilt(mounts)
+        self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None
 
-    def _that_override(self, method: str) -> tuple[Check, ...]:
+    def _that_override(self, method: str) -> tuple[SensorCheck, ...]:
         """The checks with a ``method`` of their own."""
-        return tuple(check for check in self._checks if getattr(type(check), method) is not getattr(Check, method))
+        return tuple(check for check in self._checks if getattr(type(check), method) is not getattr(SensorCheck, method))
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
@@ -133,6 +133,6 @@ class SensorChecks:
         return [*self._tilt.warnings(), *self._faults.warnings()]
 
     @property
-    def found(self) -> Mapping[Fault, DetectedFault]:
+    def found(self) -> Mapping[SensorFault, DetectedFault]:
         """Faults so far."""
         return self._faults.found

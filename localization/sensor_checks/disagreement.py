@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
-from localization.sensor_checks.sensor_check import Check
+from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
+from localization.sensor_checks.sensor_check import SensorCheck
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-DISAGREEMENT = Fault(
+DISAGREEMENT = SensorFault(
     "for {seconds:.0f} s the motion by the scans and that by the wheels differ ({sigmas:.1f} sigma in the mean, {metres:.2f} m and"
     " {degrees:.0f} deg at the end{others}). Wheels slip, or the mount, the stamps or the scale of a sensor are wrong: run `skidloc"
     " diagnose` on the log."
@@ -30,7 +30,7 @@ _SCAN_NOISE = np.diag([0.02, 0.02, 0.01]) ** 2
 _NS = 1e-9
 
 
-class Disagreement(Check):
+class Disagreement(SensorCheck):
     """Leaves out nothing, as either may be right. While it lasts, the covariance has the difference, and afterwards if a scan was lost
     meanwhile: else scans were matched all the way to a submap that is older, and it was the wheels."""
 

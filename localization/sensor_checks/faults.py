@@ -20,7 +20,7 @@ _MIN_LASTING_S = 1.0
 _NS = 1e-9
 
 
-class Fault(NamedTuple):
+class SensorFault(NamedTuple):
     """A kind of fault; each check has its own."""
 
     message: str
@@ -29,7 +29,7 @@ class Fault(NamedTuple):
     """Its sensors are right: the estimate's distance from it inflates the covariance when the fault is found."""
     is_of_scans: bool = False
     """Its scans have led the estimate, which is led back to ``reference``."""
-    explains: Fault | None = None
+    explains: SensorFault | None = None
     """A fault that is no longer reported where this one is."""
 
 
@@ -37,7 +37,7 @@ class Fault(NamedTuple):
 class DetectedFault:
     """A fault with its time and numbers."""
 
-    fault: Fault
+    fault: SensorFault
     at_s: float
     """After the first step [s]."""
     message: str
@@ -50,12 +50,12 @@ class FaultLog:
         self.inflation = inflation
         self.start_s = self.now_s = 0.0
         """Stamp of the first step's begin [s], and end of the present one after it [s]."""
-        self.declared: dict[Fault, DetectedFault] = {}
+        self.declared: dict[SensorFault, DetectedFault] = {}
         """Faults that were declared, and are not explained by later ones."""
         self._start_ns: int | None = None
         self.has_left_scans_out = False
         """A fault of scans was found in this step."""
-        self._revised: dict[Fault, DetectedFault] = {}
+        self._revised: dict[SensorFault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
         """What is declared from now on is of ``step``."""
@@ -63,7 +63,7 @@ class FaultLog:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
         self.now_s, self.has_left_scans_out = (step.end_ns - self._start_ns) * _NS, False
 
-    def declare(self, fault: Fault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+    def declare(self, fault: SensorFault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
         if fault in self.declared or any(other.explains == fault for other in self.declared):
             return
@@ -78,12 +78,12 @@ class FaultLog:
         """Report ``found`` in place of what was reported of the same fault."""
         self._revised[found.fault] = found
 
-    def retract(self, fault: Fault) -> None:
+    def retract(self, fault: SensorFault) -> None:
         """Report ``fault`` no more: another one explains it."""
         self._revised.pop(fault, None)
 
     @property
-    def found(self) -> dict[Fault, DetectedFault]:
+    def found(self) -> dict[SensorFault, DetectedFault]:
         """All so far, those last whose numbers change."""
         return {**self.declared, **self._revised}
 

@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 
 from localization.events import Step
-from localization.sensor_checks.faults import MEMORY_S, Fault, FaultLog
-from localization.sensor_checks.sensor_check import Check
+from localization.sensor_checks.faults import MEMORY_S, FaultLog, SensorFault
+from localization.sensor_checks.sensor_check import SensorCheck
 
-GYRO_RATE = Fault(
+GYRO_RATE = SensorFault(
     "the gyro turns by {rate:.1f} rad/s against the wheels, more than slip explains. It is not used for 3 s after each time. Check"
     " the units of the IMU's driver.",
     reference="wheels",
@@ -20,7 +20,7 @@ _MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE = 2.0, 3.0
 outdoors it is 0.22 rad/s at most."""
 
 
-class GyroRate(Check):
+class GyroRate(SensorCheck):
     """Needs the wheels as they were measured: stands before the checks that leave them out."""
 
     def __init__(self, faults: FaultLog) -> None:

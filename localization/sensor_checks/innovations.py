@@ -57,7 +57,7 @@ class Bin(NamedTuple):
     """(k, 3) by the estimate and by dead reckonings, before its last step."""
 
 
-class Window(NamedTuple):
+class InnovationWindow(NamedTuple):
     """The innovations of the last seconds."""
 
     bins: list[Bin]
@@ -119,7 +119,7 @@ class InnovationWindows:
             self.bins.popleft()
         return True
 
-    def worst(self) -> Window | None:
+    def worst(self) -> InnovationWindow | None:
         """That of the windows that end now whose sum is farthest from zero, in sigmas; None before the first is full."""
         bins, last, worst = list(self.bins), self.bins[-1], None
         for seconds in WINDOWS_S:
@@ -130,5 +130,5 @@ class InnovationWindows:
             total, variance = last.innovation - first.innovation, last.variance - first.variance
             sigmas = abs(total) / math.sqrt(variance + self.pair.floor**2)
             if worst is None or sigmas > worst.sigmas:
-                worst = Window(bins[before:], seconds, total, sigmas)
+                worst = InnovationWindow(bins[before:], seconds, total, sigmas)
         return worst

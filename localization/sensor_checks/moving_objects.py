@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
+from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, explain
-from localization.sensor_checks.sensor_check import Check, without_scan
+from localization.sensor_checks.sensor_check import SensorCheck, without_scan
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
 from localization.sensor_checks.turn_rates import LIDAR_OPPOSITE, WHEELS_OPPOSITE
@@ -23,7 +23,7 @@ from localization.trajectory import BoolArray
 from motion_models import se2
 from motion_models.se2 import FloatArray, Points2, Pose2
 
-MOVING_OBJECTS = Fault(
+MOVING_OBJECTS = SensorFault(
     "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
     " the wheels are matched meanwhile. Without people and vehicles about the robot, check the wheels' radius and what covers the LiDAR."
 )
@@ -86,7 +86,7 @@ class _Lidar:
     is_active: bool = False
 
 
-class MovingObjects(Check):
+class MovingObjects(SensorCheck):
     """Where part of a scene moves and the rest agrees with wheels and gyro, the rest alone is matched.
 
     A scan is compared with one from before under the motion by wheels and gyro. Where one other motion explains all of it, as with wheels
@@ -114,7 +114,7 @@ class MovingObjects(Check):
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
         self._is_by_scans = False
         """The estimate is by scans, too: one by wheels alone is where they lead."""
-        self._explained: tuple[Fault, ...] = ()
+        self._explained: tuple[SensorFault, ...] = ()
         """Named faults so far that explain what was taken for moving objects."""
         self.report = _Report(faults)
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import Scan, Step
-from localization.sensor_checks.faults import Fault, FaultLog
-from localization.sensor_checks.sensor_check import Check
+from localization.sensor_checks.faults import FaultLog, SensorFault
+from localization.sensor_checks.sensor_check import SensorCheck
 from localization.trajectory import BoolArray
 from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray
 
-LIDAR_OWN_BODY = Fault(
+LIDAR_OWN_BODY = SensorFault(
     "{percent:.0f} % of the LiDAR's points are the robot itself (same ranges while it drives and turns). They are left out"
     " from then on. Remove what covers the LiDAR, or filter these beams in its driver (laser_filters).",
     reference="wheels and gyro",
@@ -33,7 +33,7 @@ _MIN_BODY_TRAVEL_M, _MIN_BODY_TURN_RAD = 1.5, 0.4
 that is hit at a right angle; 0.4 rad change these by 8 %."""
 
 
-class OwnBody(Check):
+class OwnBody(SensorCheck):
     """Leaves out the points of the robot itself."""
 
     def __init__(self, faults: FaultLog) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from localization.sensor_checks.faults import Fault
+from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
@@ -84,7 +84,7 @@ CAUSES: Mapping[Pair, Causes] = {
 _OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_STANDING)
 _OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)
 _OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION)
-NAMED: Mapping[Pair, tuple[Fault, ...]] = {
+NAMED: Mapping[Pair, tuple[SensorFault, ...]] = {
     GYRO_WHEELS: (*_OF_GYRO, *_OF_WHEELS),
     LIDAR_GYRO: (*_OF_GYRO, *_OF_LIDAR),
     LIDAR_WHEELS_TURNS: (*_OF_WHEELS, *_OF_LIDAR),

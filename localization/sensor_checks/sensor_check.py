@@ -10,7 +10,7 @@ from localization.sensor_checks.window import Window
 from motion_models.se2 import Cov3, FloatArray
 
 
-class Check:
+class SensorCheck:
     """A check overrides what it needs; `SensorChecks` calls these in the order in which they stand here."""
 
     is_of_declared_faults: ClassVar[bool] = False

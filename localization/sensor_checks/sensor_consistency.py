@@ -15,21 +15,21 @@ import numpy as np
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
 from localization.sensor_checks.disagreement import DISAGREEMENT
-from localization.sensor_checks.faults import DetectedFault, Fault, FaultLog
+from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.innovations import BIN_S, TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2
 
-DIFFERENCES: Mapping[Pair, Fault] = {
-    pair: Fault(
+DIFFERENCES: Mapping[Pair, SensorFault] = {
+    pair: SensorFault(
         f"for {{seconds:.0f}} s in all the {pair.quantity} by the {pair.first} and those by the {pair.second} differ by more than both"
         " sensors' noise ({sigmas:.1f} sigma: {difference} in {window:.0f} s). {cause} {use}"
     )
     for pair in NAMED
 }
 """What is reported of each pair that differs."""
-PARAMETER_FAR = Fault(
+PARAMETER_FAR = SensorFault(
     "{name} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or load, a"
     " wrong scale of the gyro, or encoders that lose counts. {use} Fit the file with `skidloc calibrate`.",
 )
@@ -64,7 +64,7 @@ class _Episode(NamedTuple):
 
     begin_s: float
     poses: FloatArray
-    """(3, 3) poses at its begin: see `Consistency`."""
+    """(3, 3) poses at its begin: see `SensorConsistency`."""
     reckoning: int
     """Row of the dead reckoning that the estimate is compared with."""
     is_by_lidar: bool = False
@@ -84,7 +84,7 @@ _ESTIMATED, _BY_FILE, _BY_GYRO = range(3)
 """Rows of the poses: by the estimate, by the wheels with the robot file's parameters, by these with the gyro's turns."""
 
 
-class Consistency:
+class SensorConsistency:
     """Leaves out nothing, as either sensor may be right. While a pair differs the covariance has the distance of the estimate from the
     dead reckoning by the wheels with the robot file's parameters (LiDAR and gyro: with the gyro's turns); it stays afterwards, as no scan
     takes it back. Where scans are matched, and it is not their stamps that explain the difference, they decide."""
@@ -98,8 +98,8 @@ class Consistency:
         self._gyro_turn = math.nan  # in the last step [rad]
         self._has_moved = False
         self._matched_s = -math.inf
-        self._episodes: dict[Fault, _Episode] = {}
-        self._reported: dict[Fault, _Reported] = {}
+        self._episodes: dict[SensorFault, _Episode] = {}
+        self._reported: dict[SensorFault, _Reported] = {}
 
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
@@ -196,7 +196,7 @@ class Consistency:
         numbers: dict[str, float | str] = {"name": off.name, "value": off.value, "sigma": off.sigma, "file": off.file_value}
         self._report(PARAMETER_FAR, episode, abs(off.value - off.file_value) / off.sigma, numbers)
 
-    def _is_explained(self, fault: Fault, named: Sequence[Fault]) -> bool:
+    def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
         if not self._faults.declared:
             return False
@@ -211,7 +211,7 @@ class Consistency:
             self._reported.pop(fault, None)
         return True
 
-    def _report(self, fault: Fault, episode: _Episode, sigmas: float, numbers: Mapping[str, float | str]) -> None:
+    def _report(self, fault: SensorFault, episode: _Episode, sigmas: float, numbers: Mapping[str, float | str]) -> None:
         """Report the begin of the first episode, the time of all, and the numbers of the worst moment."""
         use = _USE_WITHOUT_SCANS if self._is_inflating(episode) else _USE_WITH_SCANS
         now = _Reported(episode.begin_s, 0.0, sigmas, {**numbers, "use": use})
@@ -222,7 +222,7 @@ class Consistency:
         message = fault.message.format(seconds=seconds, sigmas=worst.sigmas, **worst.numbers)
         self._faults.revise(DetectedFault(fault, before.begin_s, message))
 
-    def _end(self, fault: Fault) -> None:
+    def _end(self, fault: SensorFault) -> None:
         """The sensors agree again: what the pose is off by stays."""
         episode = self._episodes.pop(fault, None)
         if episode is None or not self._is_inflating(episode):

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import ImuSample, Step
-from localization.sensor_checks.faults import Fault, FaultLog
-from localization.sensor_checks.sensor_check import Check, without_wheels
+from localization.sensor_checks.faults import FaultLog, SensorFault
+from localization.sensor_checks.sensor_check import SensorCheck, without_wheels
 from localization.sensor_checks.window import Bins, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray
 
-WHEELS_STANDING = Fault(
+WHEELS_STANDING = SensorFault(
     "the wheels read zero while {others}. They count as unknown there. Check the encoders, the driver of the wheels and the"
     " joints' names in the robot file's [joints].{besides}"
 )
@@ -38,7 +38,7 @@ _SHAKE_S = 2.0
 _NS = 1e-9
 
 
-class Standstill(Check):
+class Standstill(SensorCheck):
     """Such wheels count as unknown, for as long as that lasts.
 
     Objects that move around a standing robot look like its own motion. Where there is a gyro or an IMU, one must confirm the LiDAR, once

@@ -9,13 +9,13 @@ import numpy as np
 from scipy.special import stdtrit
 
 from localization.events import Step
-from localization.sensor_checks.faults import Evidence, Fault, FaultLog
-from localization.sensor_checks.sensor_check import Check, without_scan
+from localization.sensor_checks.faults import Evidence, FaultLog, SensorFault
+from localization.sensor_checks.sensor_check import SensorCheck, without_scan
 from localization.sensor_checks.window import Window
 from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray
 
-LIDAR_DIRECTION = Fault(
+LIDAR_DIRECTION = SensorFault(
     "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used while that lasts."
     " Correct the yaw of its frame by {correction:+.0f} deg in /tf_static or in the robot file's [mounts].",
     reference="wheels and gyro",
@@ -40,7 +40,7 @@ _NOISE_M, _SLIDE_M_PER_RAD = 0.005, 0.5
 """Noise of a bin's way by scans at least [m], and what a robot may slide in a turn: half its length [m/rad]."""
 
 
-class TravelDirection(Check):
+class TravelDirection(SensorCheck):
     """Leaves out scans while most comparisons show another direction than the wheels."""
 
     is_of_declared_faults = True
@@ -71,7 +71,7 @@ class TravelDirection(Check):
         return self._off.is_majority or self._far_off.is_majority
 
 
-class Direction(NamedTuple):
+class LidarDirection(NamedTuple):
     """Direction of the LiDAR's travel against the wheels'."""
 
     angle: float
@@ -85,7 +85,7 @@ class Direction(NamedTuple):
         return True if size - self.bound > most else False if size <= most and self.bound <= most else None
 
 
-def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
+def travel_direction(wheels: FloatArray, lidar: FloatArray) -> LidarDirection | None:
     """Direction of the LiDAR's travel against the wheels', by their motions (n, 3) in bins; None where it is not known.
 
     Least squares of lidar_k = alpha wheels_k + beta turn_k, ways as complex numbers: the angle of alpha is the direction, beta what the
@@ -93,7 +93,7 @@ def travel_direction(wheels: FloatArray, lidar: FloatArray) -> Direction | None:
     do wheels that spin. Where beta is beyond two sigmas, or alpha is no length that a direction has, there is none.
     """
     n, angle, sigma = _mean_direction(wheels, lidar)
-    return Direction(angle, float(stdtrit(n - 2, _CONFIDENCE)) * sigma) if n else None
+    return LidarDirection(angle, float(stdtrit(n - 2, _CONFIDENCE)) * sigma) if n else None
 
 
 @kernel

@@ -13,32 +13,32 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.faults import Evidence, Fault, FaultLog
+from localization.sensor_checks.faults import Evidence, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
-from localization.sensor_checks.sensor_check import Check, without_scan, without_wheels
+from localization.sensor_checks.sensor_check import SensorCheck, without_scan, without_wheels
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.compiled import kernel, subroutine
 from motion_models.se2 import FloatArray, Triple
 
-GYRO_OPPOSITE = Fault(
+GYRO_OPPOSITE = SensorFault(
     "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign{or_wheels}.",
     reference="wheels",
 )
-GYRO_UNIT = Fault(
+GYRO_UNIT = SensorFault(
     "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used while that lasts. Let its driver publish rad/s.",
     reference="wheels",
     explains=GYRO_RATE,
 )
-GYRO_STUCK = Fault(
+GYRO_STUCK = SensorFault(
     "the gyro repeats one value while {others} turn. It is not used as long as that lasts. Check the IMU and its driver.",
     reference="wheels",
 )
-WHEELS_OPPOSITE = Fault(
+WHEELS_OPPOSITE = SensorFault(
     "the wheels turn opposite to {others}. They are not used while that lasts. Swap left and right in the robot file's [joints].",
     reference="wheels and gyro",
 )
-LIDAR_OPPOSITE = Fault(
+LIDAR_OPPOSITE = SensorFault(
     "the LiDAR turns opposite to {others}. Its scans are not used while that lasts. It is mounted upside down, or left and right wheels"
     " are swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints].",
     reference="wheels and gyro",
@@ -68,7 +68,7 @@ _OR_WHEELS = ", or, as nothing else measures turns, the robot file's [joints]: l
 Numbers = Mapping[str, float | str]
 
 
-class TurnRates(Check):
+class TurnRates(SensorCheck):
     """Leaves out what contradicts the other sensors in most comparisons of the last seconds."""
 
     is_of_declared_faults = True
@@ -172,9 +172,9 @@ def _is_opposite(n: int, products: Triple) -> bool:
     return r <= _OPPOSITE_CORRELATION and r * math.sqrt((n - 2) / max(1.0 - r * r, 1e-9)) <= -_MIN_T
 
 
-def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> dict[Fault, Numbers]:
+def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> dict[SensorFault, Numbers]:
     """Faults by the relations of the turn rates: the sensor that contradicts the two others, or one of two."""
-    found: dict[Fault, Numbers] = {}
+    found: dict[SensorFault, Numbers] = {}
     if wheels_gyro.is_opposite and lidar_gyro.is_equal:
         found[WHEELS_OPPOSITE] = {"others": "gyro and LiDAR"}
     elif wheels_gyro.is_opposite:
@@ -190,9 +190,9 @@ def _find_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _R
     return found
 
 
-def _excluded_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> set[Fault]:
+def _excluded_faults(wheels_gyro: _Relation, wheels_lidar: _Relation, lidar_gyro: _Relation) -> set[SensorFault]:
     """Faults of installation that a window excludes."""
-    found: set[Fault] = set()
+    found: set[SensorFault] = set()
     if wheels_gyro.is_equal or lidar_gyro.is_equal:
         found |= {GYRO_OPPOSITE, GYRO_UNIT}
     if wheels_gyro.is_equal or wheels_lidar.is_equal:

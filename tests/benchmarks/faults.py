@@ -25,8 +25,8 @@ from typing import Any
 from unittest import mock
 
 from localization.sensor_checks import SensorChecks, checks, turn_rates
-from localization.sensor_checks.faults import Fault
-from localization.sensor_checks.sensor_check import Check
+from localization.sensor_checks.faults import SensorFault
+from localization.sensor_checks.sensor_check import SensorCheck
 from tests.helpers import fault_drives, moving_scenes
 from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, named_faults, without_gyro
 from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
@@ -107,14 +107,14 @@ def _table_of_pairs(only: str) -> Iterator[str]:
         yield f"| {place} | {name} | {' | '.join(cells)} | {known} |"
 
 
-def _no_fault_of_turns(fault: Fault) -> Any:
+def _no_fault_of_turns(fault: SensorFault) -> Any:
     """Turn rates without one of their faults."""
     find = turn_rates._find_faults
     return lambda: mock.patch.object(turn_rates, "_find_faults", lambda *a: {f: v for f, v in find(*a).items() if f is not fault})
 
 
 def _no_check(name: str) -> Any:
-    return lambda: mock.patch.object(checks, name, return_value=Check())
+    return lambda: mock.patch.object(checks, name, return_value=SensorCheck())
 
 
 _WITHOUT = {

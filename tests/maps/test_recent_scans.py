@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.maps.recent_scans import Motion, RecentScans
+from localization.maps.recent_scans import RecentMotion, RecentScans
 from motion_models import se2
 from tests.helpers import floor_plan
 from tests.helpers.floor_plan import OFFICE, path
@@ -17,13 +17,13 @@ SLIPPING = np.diag([0.2, 0.2, 0.2]) ** 2
 WAY = path((1, 1), (4, 1), (4, 3.6), (7, 3.6), (7, 6.5))
 
 
-def driven(seed: int, cov: np.ndarray = WHEELS) -> tuple[list[Motion], list[np.ndarray], RecentScans]:
+def driven(seed: int, cov: np.ndarray = WHEELS) -> tuple[list[RecentMotion], list[np.ndarray], RecentScans]:
     """Motions as the scans have them, the true ones, and the scans."""
     rng, recent, found, moves = np.random.default_rng(seed), RecentScans(0.02), [], floor_plan.moves(WAY)
     for k, delta in enumerate(moves):
         points = floor_plan.scan(OFFICE, WAY[k], noise=0.02, seed=1000 * seed + k)
         measured = se2.compose(delta, rng.multivariate_normal(np.zeros(3), cov)) if k else delta
-        found.append(recent.move(Motion(measured, cov if k else np.zeros((3, 3))), points))
+        found.append(recent.move(RecentMotion(measured, cov if k else np.zeros((3, 3))), points))
         recent.add(points)
     return found, list(moves), recent
 
@@ -54,14 +54,14 @@ def test_motions_by_scans_have_their_covariance(cov: np.ndarray) -> None:
 
 def test_recent_scans_of_a_carried_robot_are_forgotten() -> None:
     _, _, recent = driven(1)
-    recent.move(Motion(np.zeros(3), np.diag([3.0, 3.0, math.pi]) ** 2), np.empty((0, 2)))
+    recent.move(RecentMotion(np.zeros(3), np.diag([3.0, 3.0, math.pi]) ** 2), np.empty((0, 2)))
     assert not len(recent)
 
 
 def test_motion_that_is_uncertain_along_one_axis_alone_is_aligned() -> None:
     """A robot that stands, and may be pushed along a corridor only."""
     _, _, recent = driven(1)
-    motion = recent.move(Motion(np.zeros(3), np.diag([0.16, 0.0, 0.0]) ** 2), floor_plan.scan(OFFICE, WAY[-1], noise=0.02, seed=1))
+    motion = recent.move(RecentMotion(np.zeros(3), np.diag([0.16, 0.0, 0.0]) ** 2), floor_plan.scan(OFFICE, WAY[-1], noise=0.02, seed=1))
     assert len(recent) == 12
     assert math.sqrt(motion.cov[0, 0]) < 0.02
     assert math.hypot(motion.delta[0], motion.delta[1]) < 0.02

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from localization.events import Step
-from localization.sensor_checks.faults import DetectedFault, Evidence, Fault, FaultLog
+from localization.sensor_checks.faults import DetectedFault, Evidence, FaultLog, SensorFault
 from localization.sensor_checks.inflation import CovarianceInflation
 from motion_models.base import Motion
 
@@ -36,8 +36,8 @@ def test_evidence_lasts_from_the_last_comparison_that_did_not_show_it(between: b
 
 
 def test_fault_that_another_one_explains_is_reported_no_more() -> None:
-    log, rate = FaultLog(CovarianceInflation()), Fault("by {rate} rad/s")
-    unit = Fault("in deg/s", explains=rate)
+    log, rate = FaultLog(CovarianceInflation()), SensorFault("by {rate} rad/s")
+    unit = SensorFault("in deg/s", explains=rate)
     log.start_step(Step(5 * S, 7 * S, Motion(np.zeros(3), np.eye(3)), np.zeros(3), np.zeros(3), False, True))
     assert log.now_s == 2.0
     log.declare(rate, 1.0, {"rate": 3})
@@ -50,7 +50,7 @@ def test_fault_that_another_one_explains_is_reported_no_more() -> None:
 
 def test_fault_whose_numbers_change_is_reported_last() -> None:
     log = FaultLog(CovarianceInflation())
-    slip, other = Fault("slip"), Fault("other")
+    slip, other = SensorFault("slip"), SensorFault("other")
     log.revise(DetectedFault(slip, 1.0, "for 1 s"))
     log.declare(other, 2.0, {})
     log.revise(DetectedFault(slip, 1.0, "for 2 s"))

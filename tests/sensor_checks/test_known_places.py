@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from localization.sensor_checks.faults import Fault, FaultLog
+from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.scan_motion import make_profile
@@ -21,7 +21,7 @@ def _scan(pose: np.ndarray):
 
 
 def _add_fault(faults: FaultLog, begin_s: float, now_s: float) -> None:
-    faults.declare(Fault("of a test"), begin_s, {})
+    faults.declare(SensorFault("of a test"), begin_s, {})
     faults.inflation.add(np.array([5.0, 0.0, 0.5]))
     faults.now_s = now_s
 

@@ -14,7 +14,7 @@ from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.innovations import InnovationWindows
 from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
-from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, Consistency
+from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency
 from motion_models import se2
 from motion_models.base import Motion
 from tests.helpers.event_faults import faults_of_stamps, faults_of_turns
@@ -61,7 +61,7 @@ class Driven:
 
     def __init__(self) -> None:
         self.faults = FaultLog(CovarianceInflation())
-        self.check = Consistency(self.faults)
+        self.check = SensorConsistency(self.faults)
         self.seconds = 0.0
 
     def drive(
@@ -125,7 +125,7 @@ def test_distance_while_the_turns_differ_stays_in_the_covariance() -> None:
     robot.drive(80.0, 0.0, speed=0.0)
     assert robot.inflation_m >= 0.9 * during_m
     assert robot.faults.inflation.ongoing_pair is None
-    assert isinstance(restored, Consistency)
+    assert isinstance(restored, SensorConsistency)
 
 
 def test_turns_that_differ_while_scans_match_leave_the_covariance() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.sensor_checks.faults import Fault
+from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.turn_rates import GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from tests.helpers.checked_drive import CheckedDrive
 
@@ -23,7 +23,7 @@ from tests.helpers.checked_drive import CheckedDrive
     ids=["flipped", "deg/s", "stuck at zero", "stuck at a turn"],
 )
 @pytest.mark.parametrize("has_scans", [True, False])
-def test_gyro_that_contradicts_wheels_is_left_out(gyro, fault: Fault, has_scans: bool) -> None:
+def test_gyro_that_contradicts_wheels_is_left_out(gyro, fault: SensorFault, has_scans: bool) -> None:
     robot = CheckedDrive(gyro=gyro, has_scans=has_scans)
     checks = robot.drive()
     assert list(checks.found) == [fault]
