@@ -119,11 +119,11 @@ def driven(
     def judge(folder: Path) -> Found:
         log, robot, motion = write_log(folder, vehicle, how, edit)
         code, text = replayed(folder, log, robot)
-        said = _warnings(text)
-        is_named = not words or any(word in said for word in words)
+        warned = _warnings(text)
+        is_named = not words or any(word in warned for word in words)
         if code:
             outcome: Outcome = "right" if refused and is_named else "named" if words and is_named else "misnamed"
-            return Found(outcome, f"[exit {code}] {said or text}")
+            return Found(outcome, f"[exit {code}] {warned or text}")
         ours, best = errors_of(folder / "out", motion), healthy_errors(vehicle)
         state = f"[odometry {ours[0]:.3f} ({best[0]:.3f}), EKF {ours[1]:.3f} ({best[1]:.3f}) m]"
         is_right = all(a < 1.5 * b + 0.03 for a, b in zip(ours, best, strict=True))
@@ -132,8 +132,8 @@ def driven(
         wrong = [row for row in checked if row["verdict"] == "contradiction"]
         state += f" check: {[row['quantity'] + ': ' + row['advice'] for row in wrong] or code or 'no contradiction'}\n"
         if is_right:
-            return Found("right" if is_named else "misnamed" if said else "silent", state + said)
-        return Found("named" if words and is_named else "misnamed" if said else "silent", state + said)
+            return Found("right" if is_named else "misnamed" if warned else "silent", state + warned)
+        return Found("named" if words and is_named else "misnamed" if warned else "silent", state + warned)
 
     return Case(kind, name, judge)
 
@@ -179,12 +179,12 @@ def clouded(name: str, vehicle: Vehicle, field_name: str, dtype: str, times: Tim
         found = _cloud_error(folder, vehicle, field_name, dtype, times)
         (folder / "healthy").mkdir()
         best = _cloud_error(folder / "healthy", vehicle, "time", "f4", lambda u, period, stamp: u * period)
-        said, state = _warnings(found[1]), f"[EKF {found[0]:.3f} ({best[0]:.3f}) m] "
-        is_named = bool(words) and any(word in said for word in words)
+        warned, state = _warnings(found[1]), f"[EKF {found[0]:.3f} ({best[0]:.3f}) m] "
+        is_named = bool(words) and any(word in warned for word in words)
         if words:
-            return Found("right" if is_named else "misnamed" if said else "silent", state + said)
+            return Found("right" if is_named else "misnamed" if warned else "silent", state + warned)
         is_right = found[0] < 1.5 * best[0] + 0.01
-        return Found("right" if is_right and not said else "misnamed" if said else "silent", state + said)
+        return Found("right" if is_right and not warned else "misnamed" if warned else "silent", state + warned)
 
     return Case("point times", name, judge)
 
