@@ -74,13 +74,26 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[BinaryIO]:
         with output_errors(path):
             with os.fdopen(descriptor, "wb") as file:
                 yield file
-            if not replace:
-                refuse_existing(path)
             os.chmod(name, 0o644)  # mkstemp's files are for their owner only
-            os.replace(name, path)
+            if replace:
+                os.replace(name, path)
+            else:
+                _name_new_file(name, path)
     finally:
         with contextlib.suppress(OSError):
             os.unlink(name)
+
+
+def _name_new_file(name: str, path: Path) -> None:
+    """Give the file ``name`` the name ``path`` in one step, so that of two writers one is refused. Raises `OutputError`."""
+    try:
+        os.link(name, path)
+    except FileExistsError:
+        refuse_existing(path)
+        raise
+    except OSError:  # a file system without hard links, as FAT: to look and to rename are two steps there
+        refuse_existing(path)
+        os.replace(name, path)
 
 
 def write_text_file(path: Path, text: str, *, replace: bool = False) -> None:

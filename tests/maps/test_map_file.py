@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
+import os
 import random
 import threading
 import zipfile
@@ -140,8 +142,9 @@ def test_load_of_truncated_and_damaged_files_raises_map_errors(file: Path) -> No
             load_map(file)
 
 
-def test_save_by_two_at_once_leaves_one_whole_file_and_refuses_the_other(tmp_path: Path) -> None:
-    path, both, refused = tmp_path / "room.skidmap", threading.Barrier(2), []
+@pytest.mark.parametrize("attempt", range(30))
+def test_save_by_two_at_once_leaves_one_whole_file_and_refuses_the_other(tmp_path: Path, attempt: int) -> None:
+    path, both, refused = tmp_path / f"room{attempt}.skidmap", threading.Barrier(2), []
 
     def save(log: str) -> None:
         both.wait(10.0)
@@ -158,4 +161,17 @@ def test_save_by_two_at_once_leaves_one_whole_file_and_refuses_the_other(tmp_pat
     assert len(refused) == 1
     assert "exists already" in refused[0]
     assert load_map(path).provenance["log"] in ("first", "second")
-    assert [file.name for file in tmp_path.iterdir()] == ["room.skidmap"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_save_on_a_file_system_without_hard_links_writes_a_whole_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(source: str, target: Path) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path, saved = tmp_path / "room.skidmap", square_room.saved()
+    save_map(path, saved)
+    np.testing.assert_array_equal(load_map(path).map.points, saved.map.points)
+    with pytest.raises(OutputError, match="exists already"):
+        save_map(path, saved)
+    assert list(tmp_path.iterdir()) == [path]
