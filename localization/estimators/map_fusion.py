@@ -22,6 +22,7 @@ from localization.maps.changes import Changes, find_changes
 from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
+from localization.maps.recent_scans import RecentMotion
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
@@ -59,7 +60,8 @@ class MapFusion(FilteredOdometry):
         assert isinstance(odometry, EkfFusion)
         self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial, is_background=True)
         self._end_ns = 0
-        self._is_keyframe_due, self._has_key, self._summed_cov = False, False, np.zeros((3, 3))
+        self._is_keyframe_due, self._is_scan_awaited = False, True  # no scan since the robot was carried, or at all
+        self._summed = RecentMotion(np.zeros(3), np.zeros((3, 3)))  # step by step, since the last keyframe
         self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
         self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
         self._outside_s = 0.0
@@ -79,9 +81,11 @@ class MapFusion(FilteredOdometry):
         self._waiting_s += step.duration
         self._add_step()
         delta, cov = self._motion_since_keyframe()
+        if delta is self._summed.delta:
+            self._map_T_odom = se2.compose(se2.compose(self.localizer.pose, delta), se2.inverse(estimate.pose))
         is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
         has_scan = len(self.odometry.scan_points) > 0
-        self._is_keyframe_due = ((is_far or not self._has_key) and has_scan) or not is_narrow(cov)  # carried: what was is no longer so
+        self._is_keyframe_due = ((is_far or self._is_scan_awaited) and has_scan) or not is_narrow(cov)  # carried: what was is no longer so
         self._take_positions(step.end_ns, delta)
         A = se2.adjoint(se2.inverse(delta))
         pose, covariance = se2.compose(self._map_T_odom, estimate.pose), A @ self._key_cov @ A.T + cov
@@ -96,11 +100,11 @@ class MapFusion(FilteredOdometry):
         if self.localizer.advance(passed_s):
             self._take_pose()
         if self._is_keyframe_due:
-            self._is_keyframe_due, self._has_key = False, True
+            self._is_keyframe_due, self._is_scan_awaited = False, not len(self.odometry.scan_points)
             was_localized = self.localizer.state == "localized"
             self.localizer.add(self.odometry.scan_points, *self._motion_since_keyframe())
             self.odometry.start_key()
-            self._summed_cov = np.zeros((3, 3))
+            self._summed = RecentMotion(np.zeros(3), np.zeros((3, 3)))
             self._n_losses += was_localized and self.localizer.state == "lost"
             self._take_pose()
             self._record()
@@ -127,22 +131,22 @@ class MapFusion(FilteredOdometry):
             self._drive.append(_DriveKeyframe(self._end_ns, self.odometry.scan_points, self.odometry.lidar_position, pose))
 
     def _add_step(self) -> None:
-        """Sum the covariance of the motion, step by step: the filter's, or that of the wheels where that is smaller."""
-        step, cov = self.odometry.state.between("start", "pose")
-        by_wheels = self.odometry.wheels.motion.cov
-        cov = by_wheels if np.trace(by_wheels) < np.trace(cov) else cov
-        A = se2.adjoint(se2.inverse(step))
-        self._summed_cov = A @ self._summed_cov @ A.T + cov
+        """Add the motion of the step: the filter's, or that of the wheels where that is narrower."""
+        step, wheels = RecentMotion(*self.odometry.state.between("start", "pose")), self.odometry.wheels.motion
+        if np.trace(wheels.cov) < np.trace(step.cov):
+            step = RecentMotion(wheels.delta, wheels.cov)
+        A = se2.adjoint(se2.inverse(step.delta))
+        self._summed = RecentMotion(se2.compose(self._summed.delta, step.delta), A @ self._summed.cov @ A.T + step.cov)
 
-    def _motion_since_keyframe(self) -> tuple[Pose2, Cov3]:
-        """Motion (3,) since the last keyframe and its covariance (3, 3): by the sum of the steps where that is smaller: after the
-        filter has lost its place, its clones are as uncertain as the place."""
-        delta, cov = self.odometry.state.between("key", "pose")
-        return delta, cov if np.trace(cov) <= np.trace(self._summed_cov) else self._summed_cov
+    def _motion_since_keyframe(self) -> RecentMotion:
+        """Motion (3,) since the last keyframe and its covariance (3, 3): the sum of the steps where that is narrower. After the filter has
+        lost its place, its clones are as uncertain as the place, and where it finds it again, the pose moves and the keyframe does not."""
+        by_clones = RecentMotion(*self.odometry.state.between("key", "pose"))
+        return by_clones if np.trace(by_clones.cov) <= np.trace(self._summed.cov) else self._summed
 
     def set_pose(self, pose: Pose2, cov: Cov3) -> None:
         """Search near the present ``pose`` (3,) in the map, with covariance ``cov`` (3, 3), as a person gives it. Odometry goes on."""
-        delta, _ = self.odometry.state.between("key", "pose")
+        delta, _ = self._motion_since_keyframe()
         self.localizer.set_pose(se2.compose(pose, se2.inverse(delta)), cov)
         self._take_pose()
 
@@ -227,7 +231,7 @@ class MapFusion(FilteredOdometry):
         """Problems of the measurements so far: those of the filter, and for how long the place in the map was not known."""
         found, total = list(self.odometry.warnings()), sum(self._seconds.values())
         state, unknown = self.localizer.state, self._seconds["lost"]
-        if self._first_s is None and self._has_key:
+        if self._first_s is None and self.odometry.counts()["scans"]:
             found.append(
                 "the robot was never localized in the map. It may be another building's, or much may have changed: check --map, or give "
                 "--initial-pose."

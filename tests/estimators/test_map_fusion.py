@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import pytest
 
+from localization.core.filter import set_marginal
 from localization.estimators import MapFusion, PriorMap
 from localization.events import PositionSample
 from localization.log_replay import replay
@@ -124,6 +125,19 @@ def test_map_fusion_pose_given_between_keyframes_is_of_that_moment():
     assert np.abs(delta).max() > 0.01
     estimates = [estimate for event in drive()[1000:1100] for estimate in pipeline.process(event)]
     assert estimates[0].pose == pytest.approx(pose, abs=0.1)
+
+
+def test_map_fusion_filter_that_moves_its_pose_leaves_the_place():
+    """As when the filter finds its submap again after it was lost: the odometry's pose moves by metres, the keyframe's clone does not."""
+    pipeline = start(np.array([0.2, -0.2, 0.1]))
+    before = [estimate for event in drive()[:1000] for estimate in pipeline.process(event)][-1]
+    filtered = pipeline.estimator.odometry
+    elsewhere = filtered.state["pose"] + np.array([3.0, -2.0, 0.0])
+    filtered.state = set_marginal(filtered.state, "pose", elsewhere, np.diag([9.0, 9.0, 0.1]))
+    after = next(estimate for event in drive()[1000:] for estimate in pipeline.process(event))
+    assert np.hypot(*(after.odometry[0] - before.odometry[0])[:2]) > 1.0
+    assert after.pose == pytest.approx(before.pose, abs=0.05)
+    np.testing.assert_allclose(se2.compose(after.map_T_odom, after.odometry[0]), after.pose, atol=1e-12)
 
 
 def test_map_fusion_has_the_filters_residuals_and_learned_parameters():
