@@ -238,6 +238,8 @@ class Step:
     """A sensor check left out points of ``scan`` that move."""
     restarts_calibration: bool = False
     """A sensor check found that what was learned so far is by a faulty sensor."""
+    restarts_map: bool = False
+    """A sensor check found that the scans so far were distorted."""
     rested_s: float = 0.0
     """For how long wheels, gyro and accelerometer have all measured what they do on a robot at rest [s]."""
 

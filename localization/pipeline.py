@@ -122,6 +122,8 @@ class Pipeline:
             return
         if isinstance(event, ImuSample):
             self.checks.insert_imu(event)
+        if isinstance(event, Scan):
+            event = self.checks.correct(event)
         if self.plane is not None and isinstance(event, Scan) and not event.is_planar:
             self.plane.has_clouds = True
             self.synchronizer.measure_in_space()

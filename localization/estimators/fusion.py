@@ -85,6 +85,8 @@ class EkfFusion(Estimator):
         self._outlier.start_step()
         if step.restarts_calibration:
             self._restart_calibration()
+        if step.restarts_map and self._sensor is not None:
+            self._sensor.begin_submap()
         state = clone(self.state, "pose", "start")
         state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
         if unseen.any():  # the submap moves along

@@ -21,6 +21,7 @@ from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.sensor_check import SensorCheck
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
+from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.travel_direction import TravelDirection
 from localization.sensor_checks.turn_rates import TurnRates
 from localization.sensor_checks.window import Window
@@ -39,12 +40,14 @@ class SensorChecks:
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
         self._disagreement, self._moving = Disagreement(faults), MovingObjects(faults, window)
+        self._sweep_times = SweepTimes(faults)
         self._checks: tuple[SensorCheck, ...] = (
             OwnBody(faults),
             GyroRate(faults),
             TurnRates(faults, step_config),
             TravelDirection(faults),
             Standstill(faults, window, step_config),
+            self._sweep_times,
             self._moving,
             self._disagreement,
         )
@@ -64,6 +67,10 @@ class SensorChecks:
         """Specific force shows whether the robot moves."""
         for check in self._checks:
             check.insert_imu(sample)
+
+    def correct(self, scan: Scan) -> Scan:
+        """``scan`` with the times of its points as they were found to be."""
+        return self._sweep_times.correct(scan)
 
     def apply(self, step: Step) -> Step:
         """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain."""

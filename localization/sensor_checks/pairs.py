@@ -9,6 +9,7 @@ from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
+from localization.sensor_checks.sweep_times import REVERSED_TIMES
 from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
 from localization.sensor_checks.turn_rates import (
     GYRO_OPPOSITE,
@@ -83,7 +84,7 @@ CAUSES: Mapping[Pair, Causes] = {
 
 _OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_STANDING)
 _OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)
-_OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION)
+_OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION, REVERSED_TIMES)
 NAMED: Mapping[Pair, tuple[SensorFault, ...]] = {
     GYRO_WHEELS: (*_OF_GYRO, *_OF_WHEELS),
     LIDAR_GYRO: (*_OF_GYRO, *_OF_LIDAR),

@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.events import Scan
 from localization.lidar import LidarConfig, Sweep
@@ -114,6 +115,12 @@ def make_profile(points: Points2, center: FloatArray) -> Profile | None:
 def bearing_bin(x: float, y: float) -> int:
     """Bearing of a point, as an index of a profile."""
     return math.floor(math.atan2(y, x) / _BIN_RAD) % BEARINGS
+
+
+def bearing_bins(points: Points2) -> NDArray[np.int64]:
+    """(N,) `bearing_bin` of each of ``points`` (N, 2); 0 where NaN."""
+    bearings = np.floor(np.arctan2(points[:, 1], points[:, 0]) / _BIN_RAD)
+    return np.where(np.isfinite(bearings), bearings, 0.0).astype(np.int64) % BEARINGS
 
 
 @kernel

@@ -15,9 +15,10 @@ from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.innovations import InnovationWindows
 from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
 from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency
+from localization.sensor_checks.sweep_times import REVERSED_TIMES
 from motion_models import se2
 from motion_models.base import Motion
-from tests.helpers.event_faults import faults_of_stamps, faults_of_turns
+from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, without_gyro
 from tests.helpers.extended import cases
 from tests.helpers.fault_drives import in_room, run, upright_axis, without_lidar
 
@@ -45,10 +46,19 @@ def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> N
 @pytest.mark.parametrize("name", cases(faults_of_stamps(), usual=["wrong sign of time_increment"]))
 def test_wrong_stamps_of_scans_are_reported_and_in_the_covariance(name: str) -> None:
     outcome = run(in_room(), faults_of_stamps()[name])
-    assert DIFFERENCES[LIDAR_GYRO] in outcome.pipeline.checks.found, outcome.warnings
+    assert {DIFFERENCES[LIDAR_GYRO], REVERSED_TIMES} & {*outcome.pipeline.checks.found}, outcome.warnings
     error, sigma = outcome.worst
     assert error < max(5.0 * sigma, 0.1)
     assert not outcome.is_silent
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("number", range(3))
+def test_reversed_times_without_a_gyro_are_named_and_turned_round(number: int) -> None:
+    outcome = run(in_room(number), without_gyro(faults_of_stamps()["wrong sign of time_increment"]))
+    assert REVERSED_TIMES in outcome.pipeline.checks.found, outcome.warnings
+    error, sigma = outcome.last
+    assert error < 3.0 * sigma
 
 
 @pytest.mark.parametrize("number", cases(range(3), usual=[]))
