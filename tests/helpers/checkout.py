@@ -16,7 +16,7 @@ def beginning_of(log: Path, part: int, path: Path) -> Path:
     return path
 
 
-def enter_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int = 5) -> None:
+def enter_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int = 10) -> None:
     """Go to a folder with the data of this repository, of the Husky's and of ACES's log the first ``part``-th."""
     data = Path("tests/data")
     (tmp_path / data).mkdir(parents=True)

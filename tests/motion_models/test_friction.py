@@ -240,7 +240,7 @@ def rounded_balance(twist, roll, cg, p, law):
 def test_newton_from_any_start_finds_the_same_motion(law):
     """With Appendix A's constants the balance has one solution: searches from eight other twists end at the same."""
     rng = np.random.default_rng(5)
-    wheels, cg = every_kind_of_case(rng, 1000)
+    wheels, cg = every_kind_of_case(rng, 300)
     wheels = wheels[np.any(wheels != 0, axis=1)]
     cg = cg[: len(wheels)]
     speed = np.hypot(wheels[:, 0], wheels[:, 1])[:, None] * 0.164 / math.sqrt(2)
@@ -254,7 +254,7 @@ def test_newton_from_any_start_finds_the_same_motion(law):
             if ok:
                 reached += 1
                 np.testing.assert_allclose(found, v, atol=1e-7)
-    assert reached > 1333  # single starts often fail; that is what the other ways are for
+    assert reached > 400  # single starts often fail; that is what the other ways are for
 
 
 @given(st.floats(-2, 2), st.floats(-3, 3), st.floats(-0.9, 0.9), st.floats(-0.9, 0.9))
