@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo-out
 DATA := tests/data
+# As the commands themselves ask for, see localization/blas_threads.py.
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo demo-buildings test test-extended test-all test-ros2 check docs benchmark clean
 

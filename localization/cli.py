@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
+from localization.blas_threads import use_one_blas_thread
 from localization.commands.common import PlainConsole
 from localization.commands.short_help import short_help
 from motion_models.errors import SkidlocError
@@ -66,6 +67,7 @@ def overview() -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 for bad input, 70 for a defect of skidloc."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    use_one_blas_thread()
     _prepare_streams()
     errors = PlainConsole(stderr=True, soft_wrap=True, highlight=False)
     try:

@@ -1,4 +1,4 @@
-"""Start of the command `skidloc`: whether another package has overwritten ours, before anything of it is imported."""
+"""Start of the commands `skidloc` and `skidloc_node`: what must be known or set before anything of the packages is imported."""
 
 from __future__ import annotations
 
@@ -31,5 +31,15 @@ def main() -> int:
         print(f"skidloc: {problem}", file=sys.stderr)
         return 2
     from localization.cli import main as run
+
+    return run()
+
+
+def node() -> int:
+    """Run the managed node; returns its exit code, 2 for bad input."""
+    from localization.blas_threads import use_one_blas_thread
+
+    use_one_blas_thread()
+    from localization.ros.lifecycle import main as run
 
     return run()

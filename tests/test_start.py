@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -22,3 +23,15 @@ def test_start_beside_a_foreign_localization_names_it(tmp_path: Path) -> None:
 
 def test_start_alone_finds_no_clash() -> None:
     assert clash() is None
+
+
+def test_command_has_one_thread_of_linear_algebra_unless_the_environment_asks_for_more() -> None:
+    code = "import os; from skidloc.start import main; main(); print(len(os.listdir('/proc/self/task')))"
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    counts = []
+    for more in ({}, {"OPENBLAS_NUM_THREADS": "2"}):
+        run = subprocess.run(
+            [sys.executable, "-c", code, "robots"], capture_output=True, text=True, check=True, env={**environment, **more}
+        )
+        counts.append(int(run.stdout.splitlines()[-1]))
+    assert counts == [1, min(2, len(os.sched_getaffinity(0)))]

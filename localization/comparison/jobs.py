@@ -19,6 +19,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
+from localization.blas_threads import ONE_BLAS_THREAD
 from localization.calibration.lidar_check import open_log_checked
 from localization.comparison.remote import AccessError, is_url, local_copy, url_fingerprint
 from localization.comparison.turning import MeanCg, turning
@@ -48,7 +49,7 @@ FAULT_SEPARATOR = " | "
 """Between the sentences of a row's `faults`."""
 _TRIES = 2
 _POLL_S = 5.0  # after which a lost connection is noticed at the latest
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+_ONE_THREAD = {**ONE_BLAS_THREAD, "NUMBA_NUM_THREADS": "1"}
 _ADDRESS = re.compile(r"((tcp|tls|wss?|ucxx?)://)?(\[[^\]]+\]|[^/:\[\]\s]+):\d+")
 
 Row = dict[str, Any]
