@@ -34,4 +34,5 @@ def test_command_has_one_thread_of_linear_algebra_unless_the_environment_asks_fo
             [sys.executable, "-c", code, "robots"], capture_output=True, text=True, check=True, env={**environment, **more}
         )
         counts.append(int(run.stdout.splitlines()[-1]))
-    assert counts == [1, min(2, len(os.sched_getaffinity(0)))]
+    assert counts[0] == 1
+    assert counts[1] > 1 or len(os.sched_getaffinity(0)) == 1
