@@ -34,6 +34,9 @@ _FASTEST_M_S = 3.0
 """Speed of such robots; velocities that mean more are no rad/s."""
 _SCALE_UNKNOWN_M2_PER_M = 0.2
 """Noise of the distance where its scale is known to 10 % alone: 1 m after 10 m is 0.1 x^2 / x."""
+_MAX_SQUARES = 0.25
+"""Part of the squared residuals of turns that is left with a factor for each side, at most: along one arc both sides are proportional, and
+any two factors fit."""
 _COUNTERS = (65536.0, 32768.0, 4294967296.0, 16777216.0)
 _SAME_JUMP = 0.02
 
@@ -72,6 +75,9 @@ def expected_scaling(robot: Robot) -> float:
 
 def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
     """Units of the joint states and of the gyro; ``signals`` have the signs of ``robot``."""
+    of_side = _check_side_units(signals, robot)
+    if of_side is not None:
+        return of_side
     measured = {
         "velocities": _measure(signals, signals.rates, robot),
         "positions": _measure(signals, signals.angle_rates, robot),
@@ -86,6 +92,59 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
     for what, unit in wrong.items():
         report = _name_unit(report, signals, what, unit if right is None else _of_messages(signals, what) or unit)
     return _name_range(report, signals)
+
+
+def _check_side_units(signals: WheelSignals, robot: Robot) -> UnitReport | None:
+    """Rates of one side in another unit than those of the other; None where both have one unit, or no turn shows it.
+
+    A turn is a_L omega_L + a_R omega_R with -a_L = a_R = k r / b: least squares give both factors. That of the side in rad/s is the
+    robot's own. The other side is corrected by its radius multiplier.
+    """
+    rates = signals.angle_rates if np.isfinite(signals.angle_rates).any() else signals.rates
+    sides = np.column_stack([rates[:, : signals.left].mean(axis=1), rates[:, signals.left :].mean(axis=1)])
+    for source, turn in signals.turns.items():
+        if source == "gyro" and not signals.is_gyro_upright:
+            continue
+        factors = _factors_of_sides(sides, turn)
+        if factors is None or 1 / MAX_RATIO <= factors[0] / factors[1] <= MAX_RATIO:
+            continue
+        expected = expected_scaling(robot) * robot.geometry.wheel_radius_m / robot.geometry.track_width_m
+        off = np.abs(np.log(factors / expected))
+        is_certain = bool(off.min() <= math.log(MAX_RATIO))
+        return _name_side(robot, source, int(off.argmax()), factors, is_certain)
+    return None
+
+
+def _factors_of_sides(sides: FloatArray, turn: FloatArray) -> FloatArray | None:
+    """-a_L and a_R (2,) from the rates of ``sides`` (n, 2) to ``turn`` (n,) [m/m]; None where they do not explain it, or one factor for
+    both sides explains it nearly as well."""
+    known = np.isfinite(sides).all(axis=1) & np.isfinite(turn)
+    if known.sum() < _MIN_INTERVALS:
+        return None
+    X, y = sides[known] * (-1.0, 1.0), turn[known]
+    y = y - bias_at_rest(X.sum(axis=1), y, _MAX_BIAS * _DEG)
+    squares = [float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=None)[0]) ** 2)) for A in (X, X.sum(axis=1, keepdims=True))]
+    factors = np.linalg.lstsq(X, y, rcond=None)[0]
+    is_explained = squares[0] <= min((1.0 - _MIN_CORRELATION**2) * float(y @ y), _MAX_SQUARES * squares[1])
+    return np.asarray(factors) if is_explained and factors.min() > 0.0 else None
+
+
+def _name_side(robot: Robot, source: str, odd: int, factors: FloatArray, is_certain: bool) -> UnitReport:
+    """``odd``: the side, 0 for left, whose rates have another unit, if that ``is_certain``; ``factors`` (2,) as measured."""
+    value = float(factors[odd] / factors[1 - odd])  # rad/s for each unit
+    names = _names("velocities", robot.geometry.wheel_radius_m)
+    name = min(names, key=lambda known: abs(math.log(value / names[known])))
+    is_named = abs(math.log(value / names[name])) <= _SIGMAS * _SIGMA_BY_SPEED
+    side, other = ("left", "right") if odd == 0 else ("right", "left")
+    text = f"by the turns of the {source}, rates of the {side} wheels are {1.0 / value:.3g} times those of the {other} wheels"
+    text += f": they are {name}" if is_named else ": another unit, or gear"
+    if not is_certain:
+        return UnitReport(
+            robot, (f"{text}, or the others are. Nothing is corrected: let the driver publish rad/s for both.",), is_ambiguous=True
+        )
+    key = f"{side}_wheel_radius_multiplier"
+    geometry = replace(robot.geometry, **{key: getattr(robot.geometry, key) * (names[name] if is_named else value)})
+    return UnitReport(replace(robot, geometry=geometry), (f"{text}. Corrected in this run; let the driver publish rad/s for both sides.",))
 
 
 def _gyro_factor(signals: WheelSignals, robot: Robot, measured: Mapping[str, _Unit | None]) -> float | None:

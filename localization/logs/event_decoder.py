@@ -98,7 +98,8 @@ class EventDecoder:
         left, right = joints
         self._multipliers = robot.geometry.radius_multipliers
         self._has_multipliers = bool((self._multipliers != 1.0).any())
-        self.from_joints = JointsToWheels(left, right, robot.geometry.wheel_radius_m, wheels, stats)
+        least_radius = robot.geometry.wheel_radius_m * min(1.0, float(self._multipliers.min()))
+        self.from_joints = JointsToWheels(left, right, least_radius, wheels, stats)
         self.from_joints.angle_period = robot.joints.angle_range * robot.joints.angle_unit_rad or math.tau
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats, is_whole=odometry_type not in ODOMETRY_DECODERS)
         named = " and ".join(source.topic for source in sources.arms)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +69,15 @@ def test_wiring_with_axles_for_sides_is_corrected(tmp_path: Path) -> None:
 def test_wiring_with_gyro_opposite_is_corrected_by_odometry(tmp_path: Path) -> None:
     report = report_of(drive(tmp_path / "log.mcap", gyro=-1.0, has_odometry=True))
     assert (report.robot.imu.rate_unit_rad_s, report.robot.joints) == (-1.0, ROBOT.joints)
+
+
+@pytest.mark.parametrize(("side", "unit"), cases([("right", 60.0 / math.tau), ("left", 180.0 / math.pi)], ["right"]))
+def test_wiring_with_one_side_in_another_unit_is_corrected(tmp_path: Path, side: str, unit: float) -> None:
+    factors = np.where(SIGNS[side] < 0.0, unit, 1.0)
+    report = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (np.zeros(0), factors * velocity)))
+    multipliers = np.array([unit if side == "left" else 1.0, unit if side == "right" else 1.0]) ** -1
+    np.testing.assert_allclose(report.robot.geometry.radius_multipliers, multipliers, rtol=1e-6)
+    assert f"rates of the {side} wheels are" in report.findings[0]
 
 
 @pytest.mark.parametrize("is_gyro", [False, True])
