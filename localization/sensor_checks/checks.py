@@ -10,7 +10,6 @@ import numpy as np
 from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
-from localization.sensor_checks.disagreement import Disagreement
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GyroRate
 from localization.sensor_checks.inflation import CovarianceInflation
@@ -39,8 +38,7 @@ class SensorChecks:
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
-        self._disagreement, self._moving = Disagreement(faults), MovingObjects(faults, window)
-        self._sweep_times = SweepTimes(faults)
+        self._moving, self._sweep_times = MovingObjects(faults, window), SweepTimes(faults)
         self._checks: tuple[SensorCheck, ...] = (
             OwnBody(faults),
             GyroRate(faults),
@@ -49,7 +47,6 @@ class SensorChecks:
             Standstill(faults, window, step_config),
             self._sweep_times,
             self._moving,
-            self._disagreement,
         )
         self._preparing, self._comparing = self._that_override("prepare"), self._that_override("compare")
         self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
@@ -123,7 +120,6 @@ class SensorChecks:
     def _compare_places(self, scan: Scan, pose: Pose2) -> None:
         """A place from before the faults may show ``pose`` (3,): then differences of sensors count from here on."""
         if self._places.update(lambda: self._window.profile(scan), pose):
-            self._disagreement.restart()
             self._consistency.restart()
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:

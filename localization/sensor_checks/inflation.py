@@ -30,14 +30,12 @@ class CovarianceInflation:
         """The wheels contradict the gyro, which the LiDAR confirms: their distance from the estimate is no error of it."""
         self.count = 0
         """Differences that were added."""
-        self.ongoing: FloatArray | None = None
-        """(3,) difference of a disagreement that lasts, of wheels and scans."""
         self.ongoing_pair: FloatArray | None = None
         """(3,) difference of a pair of sensors that differ for now."""
         self.ongoing_scene: FloatArray | None = None
         """(3,) difference of wheels and scans while objects move in these."""
         self.possible: FloatArray | None = None
-        """(3,) the same while that is not decided: no fault yet. A disagreement that lasts, and is larger, has it."""
+        """(3,) the same while that is not decided: no fault yet."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -76,14 +74,11 @@ class CovarianceInflation:
     @property
     def is_lasting(self) -> bool:
         """Whether sensors disagree at present."""
-        return (
-            self.ongoing_pair is not None or self.ongoing_scene is not None or (self.ongoing is not None and not self.are_wheels_outvoted)
-        )
+        return bool(self._lasting)
 
     @property
     def _lasting(self) -> list[FloatArray]:
-        ongoing = None if self.are_wheels_outvoted else self.ongoing
-        return [difference for difference in (ongoing, self.ongoing_pair, self.ongoing_scene) if difference is not None]
+        return [difference for difference in (self.ongoing_pair, self.ongoing_scene) if difference is not None]
 
     @property
     def spread(self) -> Cov3:
@@ -102,9 +97,8 @@ class CovarianceInflation:
             A = se2.adjoint(se2.inverse(delta))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
-        possible, ongoing = self.possible, self.ongoing
-        if estimate.covariance is not None and possible is not None and (ongoing is None or possible @ possible > ongoing @ ongoing):
-            estimate = _widen(estimate, np.outer(possible, possible))
+        if estimate.covariance is not None and self.possible is not None:
+            estimate = _widen(estimate, np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
             return estimate
         spread = self.total

@@ -14,16 +14,15 @@ import numpy as np
 
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
-from localization.sensor_checks.disagreement import DISAGREEMENT
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.innovations import BIN_S, TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
+from localization.sensor_checks.innovations import TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2
 
 DIFFERENCES: Mapping[Pair, SensorFault] = {
     pair: SensorFault(
-        f"for {{seconds:.0f}} s in all the {pair.quantity} by the {pair.first} and those by the {pair.second} differ by more than both"
+        f"the {pair.quantity} by the {pair.first} and those by the {pair.second} differ by more than both"
         " sensors' noise ({sigmas:.1f} sigma: {difference} in {window:.0f} s). {cause} {use}"
     )
     for pair in NAMED
@@ -47,8 +46,6 @@ _MIN_TURNING_SIGMAS, _MIN_TURNING_SHARE = 1.4, 0.18
 on, and from this share of the file's value. ACES, fr079, CSAIL and the Husky outdoors have 0.2 sigmas and 3 %, simulated robots 11 %
 (two wheels, and a caster that drags)."""
 _TURNING = ("k_0", "wheel_separation_multiplier", "rotation_scale")
-_SAME_AS_DISAGREEMENT = (DIFFERENCES[LIDAR_WHEELS_TURNS], DIFFERENCES[LIDAR_WHEELS_WAYS])
-"""Both are of wheels and LiDAR: one report is enough."""
 _MATCHED_S = 2.0
 """Scans that were matched so recently hold the pose, whatever wheels and gyro do [s]."""
 _MAX_CLIPPED_SIGMAS = 3.0
@@ -75,9 +72,7 @@ class _Reported(NamedTuple):
     """What was reported of a fault."""
 
     begin_s: float
-    seconds: float
     sigmas: float
-    numbers: Mapping[str, float | str]
 
 
 _ESTIMATED, _BY_FILE, _BY_GYRO = range(3)
@@ -165,10 +160,6 @@ class SensorConsistency:
     def _compare(self, pair: Pair) -> None:
         """Report whether ``pair`` differs now, and begin or end an episode."""
         fault, worst = DIFFERENCES[pair], self._windows[pair].worst()
-        if fault in _SAME_AS_DISAGREEMENT and DISAGREEMENT in self._faults.found:
-            self._faults.retract(fault)
-            self._end(fault)
-            return
         is_clipped = self._clipping.is_clipped and pair != LIDAR_WHEELS_WAYS
         if self._is_explained(fault, NAMED[pair]) or worst is None or worst.sigmas < (_MAX_CLIPPED_SIGMAS if is_clipped else _MAX_SIGMAS):
             self._end(fault)
@@ -212,15 +203,15 @@ class SensorConsistency:
         return True
 
     def _report(self, fault: SensorFault, episode: _Episode, sigmas: float, numbers: Mapping[str, float | str]) -> None:
-        """Report the begin of the first episode, the time of all, and the numbers of the worst moment."""
+        """Report the begin of the first episode, and the numbers of the worst moment."""
+        before = self._reported.get(fault)
+        if before is not None and sigmas < before.sigmas:
+            return
+        begin_s = episode.begin_s if before is None else before.begin_s
+        self._reported[fault] = _Reported(begin_s, sigmas)
         use = _USE_WITHOUT_SCANS if self._is_inflating(episode) else _USE_WITH_SCANS
-        now = _Reported(episode.begin_s, 0.0, sigmas, {**numbers, "use": use})
-        before = self._reported.get(fault, now)
-        worst = now if sigmas >= before.sigmas else before
-        seconds = before.seconds + BIN_S
-        self._reported[fault] = _Reported(before.begin_s, seconds, worst.sigmas, worst.numbers)
-        message = fault.message.format(seconds=seconds, sigmas=worst.sigmas, **worst.numbers)
-        self._faults.revise(DetectedFault(fault, before.begin_s, message))
+        message = fault.message.format(sigmas=sigmas, use=use, **numbers)
+        self._faults.revise(DetectedFault(fault, begin_s, message))
 
     def _end(self, fault: SensorFault) -> None:
         """The sensors agree again: what the pose is off by stays."""
