@@ -6,13 +6,19 @@ only kernels have one.
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import sys
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any, TypeVar
 
 import numba
+from numba.core import caching
 from numba.extending import register_jitable
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+_PACKAGES = ("motion_models", "localization", "tests")
 
 
 def kernel(function: _Function) -> _Function:
@@ -28,3 +34,61 @@ def threaded_kernel(function: _Function) -> _Function:
 def subroutine(function: _Function) -> _Function:
     """A part of kernels, compiled with them. Called from Python, it is interpreted."""
     return register_jitable(error_model="numpy", no_cfunc_wrapper=True)(function)
+
+
+class KernelCacheLocator(caching._CacheLocator):
+    """Where numba stores machine code of this project: in its usual folder, under a name that has all sources that are compiled into it.
+
+    Numba itself compares the kernel's own file alone: it would go on with an older subroutine or constant of another file, and ends with
+    "Can't get attribute" where a class of a kernel's arguments has another name by now.
+    """
+
+    def __init__(self, usual: Any, fingerprint: str) -> None:
+        self._usual, self._fingerprint, self._py_file = usual, fingerprint, usual._py_file
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> KernelCacheLocator | None:
+        """Called by numba for each function that it caches; None for those of others."""
+        if py_func.__module__.partition(".")[0] not in _PACKAGES:
+            return None
+        classes: list[Any] = caching.CacheImpl._locator_classes
+        usual = (each.from_function(py_func, py_file) for each in classes)
+        found = next((locator for locator in usual if locator is not None), None)
+        return None if found is None else cls(found, fingerprint(py_func.__module__))
+
+    def get_cache_path(self) -> str:
+        """Folder of the usual locator."""
+        return str(self._usual.get_cache_path())
+
+    def get_source_stamp(self) -> str:
+        """Nothing that the name does not have."""
+        return self._fingerprint
+
+    def get_disambiguator(self) -> str:
+        """Part of the files' name."""
+        return f"{self._usual.get_disambiguator()}-{self._fingerprint}"
+
+
+@functools.cache
+def fingerprint(name: str) -> str:
+    """Hash of the source of the module ``name``, of the numbers that it has imported, and of the modules with kernels that it imports."""
+    module = sys.modules[name]
+    with open(module.__file__ or "", "rb") as file:
+        found = hashlib.sha256(file.read())
+    for key, value in list(vars(module).items()):
+        other = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None) or ""
+        if isinstance(value, int | float):
+            found.update(f"{key}={value!r}".encode())
+        elif other != name and other.partition(".")[0] in _PACKAGES and "motion_models.compiled" in _modules(sys.modules[other]):
+            found.update(fingerprint(other).encode())
+    return found.hexdigest()[:12]
+
+
+def _modules(module: ModuleType) -> set[str]:
+    """Modules from which ``module`` has names."""
+    return {getattr(value, "__module__", None) or "" for value in vars(module).values()}
+
+
+if hasattr(numba.config, "CACHE_LOCATOR_CLASSES"):  # since numba 0.62
+    _usual = numba.config.CACHE_LOCATOR_CLASSES or ",".join(each.__name__ for each in caching.CacheImpl._locator_classes)
+    numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelCacheLocator.__name__},{_usual}"
