@@ -1,4 +1,8 @@
-"""Where scans fit into a whole map: branch and bound over free space and its border, and all headings (Olson 2009, Hess et al. 2016)."""
+"""Where scans fit into a whole map: branch and bound over free space and its border, and all headings (Olson 2009, Hess et al. 2016).
+
+A block of poses is bounded by the sum over the points of the highest score that each of them can reach in it. Blocks are halved from 8
+cells and four headings to one pose; those that cannot come to a share of the best are left out.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from localization.lidar.correlative_search import COARSE, draw_image, reduce_image
+from localization.lidar.correlative_search import draw_image
 from localization.lidar.registration import Alignment, align_points
 from localization.lidar.submap import VoxelGrid, make_grid, voxel_means
 from localization.maps.grid import Grid, draw_grid
@@ -19,7 +23,7 @@ from localization.maps.keyframe_map import KeyframeMap
 from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.compiled import subroutine, threaded_kernel
-from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Triple
 
 CELL_M = 0.1
 """Cell of the search's image and of the grid that divides space into walls, free and unknown [m]."""
@@ -28,8 +32,10 @@ _SURFACE_CELL_M = 0.08
 CERTAINLY_FREE = 0.125
 """Probability below which a cell contradicts a tracked place: four passes. With two, walls that a map has by few, slanting beams have up to
 0.3 of the points of a right place in free space (ACES, halves); with four, 0.13."""
+_BLOCK = 4
+"""Edge of the blocks into which positions are divided [cells], and headings in a block of twice that edge."""
 _MARGIN_BLOCKS = 1
-"""Positions that are searched around free space, in blocks of `COARSE` cells: 0.4 m. At the border of a map the robot stands where no beam
+"""Positions that are searched around free space, in blocks: 0.4 m. At the border of a map the robot stands where no beam
 has passed twice, and measures mapped walls all the same: 22 of 263 such keyframes in halves of fr079, and one of them farther outside."""
 _FREE_BORDER_CELLS = 2
 """Points in free space contradict a tracked place from so many cells inside it: 0.2 m. Walls that a map has from afar alone, by slanting
@@ -38,8 +44,12 @@ _SEARCH_POINTS = 150
 """Points of a search: what is aligned afterwards has all."""
 _UNKNOWN_SCORE = 0.4
 """What a point in unknown space counts, where one on a wall counts 1 and one in free space 0."""
-_CHUNK, _MAX_COARSE = 1000, 12_000
-"""Coarse poses that are refined at once, and at most."""
+_WIDTHS, _SHIFTS = (1, 2, 5, 11), (0.0, 0.5, 2.0, 5.0)
+"""Cells that a point can reach from the poses of a block of 1, 2, 4 and 8 cells, and how many of them lie before the cell that it reaches
+from its middle: as many as the block has, and one for the two headings of the third, three for the four of the last, which are a cell
+apart at the range that eight of ten points are nearer than."""
+_CHUNK, _MAX_BLOCKS = 200, 6_000
+"""Blocks of 8 cells that are refined at once, and at most."""
 _SHARE_OF_BEST = 0.85
 """A place is a candidate where its score is above this share of the best."""
 _APART_M, _APART_RAD = 0.6, 0.3
@@ -48,6 +58,7 @@ _MAX_PLACES = 12
 _SEARCH_S, _SEARCH_S_PER_BLOCK = 0.2, 2e-4
 """Time that a search beside the estimates is given, and for each block of free space [s]: 0.13 to 0.27 ms of CPU are measured for each, on
 six maps and a machine with nine processes on two cores."""
+_BLOCK_M, _PADDING = _BLOCK * CELL_M, max(_WIDTHS)
 _NEAR = math.exp(-0.5 * 1.5**2)
 """Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
 OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
@@ -104,7 +115,8 @@ class PlaceMap:
         walls = points if not len(walls) else walls
         self.surfaces: VoxelGrid = make_grid(walls, _SURFACE_CELL_M, range_noise_m)
         self._walls = draw_image(self.surfaces.means, CELL_M)
-        self._scores, self._bounds = self._score_images()
+        self._scores = self._score_images()
+        """For each of `_WIDTHS`, the highest score in so many cells from each one on; `_PADDING` cells of unknown space are around."""
         self._starts = self._free_blocks(keyframes)
         self.search_s = _SEARCH_S + _SEARCH_S_PER_BLOCK * len(self._starts)
         """Time after which the result of a search beside the estimates is due [s]."""
@@ -121,15 +133,15 @@ class PlaceMap:
         A = se2.adjoint(se2.inverse(se2.between(self._poses[k], pose)))
         return np.asarray(A @ self._covs[k] @ A.T)
 
-    def _score_images(self) -> tuple[FloatArray, FloatArray]:
-        """What a point counts in each cell, 1 on walls, `_UNKNOWN_SCORE` in unknown space and 0 in free space; and its upper bounds."""
+    def _score_images(self) -> tuple[FloatArray, ...]:
         fine = self._walls.levels[0]
         rows, columns = fine.shape
         x, y = (self._walls.origin[0] + CELL_M * (np.arange(rows) + 0.5), self._walls.origin[1] + CELL_M * (np.arange(columns) + 0.5))
         centres = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
         is_free = self._grid_values(centres).reshape(rows, columns) == 0
         scores = np.maximum(fine, np.where(is_free, 0.0, _UNKNOWN_SCORE).astype(fine.dtype))
-        return scores, reduce_image(scores)
+        scores = np.pad(scores, _PADDING, constant_values=_UNKNOWN_SCORE)
+        return tuple(ndimage.maximum_filter(scores, width, origin=-(width // 2), mode="nearest") for width in _WIDTHS)
 
     def is_unknown(self, points: Points2) -> NDArray[np.bool_]:
         """(N,) whether each of ``points`` (N, 2) is in space that the map does not have, and not beside a wall."""
@@ -140,14 +152,14 @@ class PlaceMap:
         return _look_up(self.grid.cells.T, points - self.grid.origin, -1)
 
     def _free_blocks(self, keyframes: KeyframeMap) -> FloatArray:
-        """(C, 2) centres of the blocks of `COARSE` cells that hold free space or a keyframe, and of those around [m]."""
+        """(C, 2) the blocks that hold free space or a keyframe, and those around: their middles [m]."""
         rows, columns = np.nonzero(self.grid.cells == 0)
         free = np.vstack([self.grid.origin + CELL_M * (np.column_stack([columns, rows]) + 0.5), keyframes.poses[:, :2]])
-        step, margin = CELL_M * COARSE, np.arange(-_MARGIN_BLOCKS, _MARGIN_BLOCKS + 1)
+        margin = np.arange(-_MARGIN_BLOCKS, _MARGIN_BLOCKS + 1)
         around = np.stack(np.meshgrid(margin, margin), axis=-1).reshape(-1, 2)
-        blocks = np.unique(np.floor(free / step), axis=0)
+        blocks = np.unique(np.floor(free / _BLOCK_M), axis=0)
         blocks = np.unique((blocks[:, None, :] + around).reshape(-1, 2), axis=0)
-        return np.asarray((blocks + 0.5) * step)
+        return np.asarray((blocks + 0.5) * _BLOCK_M)
 
     def search(self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None) -> list[Place]:
         """Places where ``points`` (N, 2) of the body frame [m] fit best, the best first; with ``near`` (3,), within
@@ -155,38 +167,42 @@ class PlaceMap:
         some = voxel_means(points, 2.0 * CELL_M)
         some = np.ascontiguousarray(some[np.linspace(0, len(some) - 1, min(len(some), _SEARCH_POINTS)).astype(np.intp)])
         reach = float(np.quantile(np.hypot(some[:, 0], some[:, 1]), 0.8))
-        n_yaws = COARSE * max(math.ceil(2.0 * math.pi * reach / CELL_M / COARSE), 8)
-        yaws = 2.0 * math.pi * np.arange(n_yaws) / n_yaws
-        turned = np.ascontiguousarray(se2.transform(np.column_stack([np.zeros((n_yaws, 2)), yaws])[:, None, :], some))
-        coarse_rows = np.arange(COARSE // 2, n_yaws, COARSE)
-        starts = self._starts
+        n_turns = max(math.ceil(2.0 * math.pi * reach / CELL_M / _BLOCK), 8)
+        step = 2.0 * math.pi / n_turns
+        yaws = step / (2 * _BLOCK) * np.arange(2 * _BLOCK * n_turns)  # every other one is a pose's, those between are middles of blocks
+        turned = se2.transform(np.column_stack([np.zeros((len(yaws), 2)), yaws])[:, None, :], some)
+        starts, turns = self._starts, np.arange(n_turns)
         if near is not None and half is not None:
-            starts = starts[(np.abs(starts - near[:2]) <= half[:2] + CELL_M * COARSE).all(axis=1)]
-            off = np.abs(se2.wrap_angle(yaws[coarse_rows] - near[2]))
-            coarse_rows = coarse_rows[off <= half[2] + 2.0 * math.pi * COARSE / n_yaws]
-        if not len(starts) or not len(coarse_rows):
+            starts = starts[(np.abs(starts - near[:2]) <= half[:2] + _BLOCK_M).all(axis=1)]
+            turns = turns[np.abs(se2.wrap_angle(step * (turns + 0.5) - near[2])) <= half[2] + step]
+        if not len(starts) or not len(turns):
             return []
-        starts = starts - self._walls.origin
-        coarse = _score_blocks(self._bounds, turned[coarse_rows] / (CELL_M * COARSE), starts / (CELL_M * COARSE))
-        poses, scores = self._refine(turned / CELL_M, starts / CELL_M, coarse, coarse_rows - COARSE // 2)
+        poses, scores = self._branch_and_bound(np.ascontiguousarray(turned / CELL_M + _PADDING), starts, turns)
         found = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
         places = [self.align(points, pose) for pose in _distinct(found, scores)]
         return sorted(places, key=lambda place: -place.score)
 
-    def _refine(self, turned: FloatArray, starts: FloatArray, coarse: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Fine poses (K, 3) as x, y [cells] and row of the yaw, and their scores (K,), by the bounds ``coarse`` (Y, C) of
-        blocks whose first rows are ``rows`` (Y,)."""
-        bounds, n = coarse.ravel(), coarse.shape[1]
-        order = np.argpartition(-bounds, min(_MAX_COARSE, len(bounds) - 1))[:_MAX_COARSE]
+    def _branch_and_bound(self, turned: FloatArray, starts: FloatArray, turns: IntArray) -> tuple[FloatArray, FloatArray]:
+        """The best poses (K, 3) of blocks, as x, y [cells] and row of ``turned`` (Y, N, 2), and their scores (K,): in blocks about
+        ``starts`` (C, 2) [m] and headings of ``turns`` (T,)."""
+        wide, which = np.unique(np.floor(starts / (2.0 * _BLOCK_M)), axis=0, return_inverse=True)
+        centres = 2.0 * _BLOCK_M * (wide + 0.5)
+        column, row = (starts > centres[which.ravel()]).T
+        is_start = np.zeros((len(wide), 4), dtype=bool)
+        is_start[which.ravel(), 2 * column + row] = True
+        middles = (centres - self._walls.origin) / CELL_M
+        bounds = _bound_blocks(self._scores[3], turned[2 * _BLOCK * turns + _BLOCK - 1], middles).ravel()
+        order = np.argpartition(-bounds, min(_MAX_BLOCKS, len(bounds) - 1))[:_MAX_BLOCKS]
         order = order[np.argsort(-bounds[order], kind="stable")]
         poses, scores, best = [], [], 0.0
         for begin in range(0, len(order), _CHUNK):
             chunk = order[begin : begin + _CHUNK]
             if bounds[chunk[0]] < _SHARE_OF_BEST * best:
                 break
-            one, score = _refine_blocks(self._scores, turned, starts[chunk % n], rows[chunk // n], best)
-            poses.append(one)
-            scores.append(score)
+            turn, block = np.divmod(chunk, len(wide))
+            one, score = _refine_blocks(self._scores, turned, middles[block], is_start[block], 2 * _BLOCK * turns[turn], best)
+            poses.append(one[score > 0.0])
+            scores.append(score[score > 0.0])
             best = max(best, float(score.max()))
         return np.vstack(poses), np.concatenate(scores)
 
@@ -242,27 +258,49 @@ def _mean(image: FloatArray, points: Points2, x: float, y: float, spare: float) 
 
 
 @threaded_kernel
-def _score_blocks(image: FloatArray, turned: FloatArray, starts: FloatArray) -> FloatArray:
-    """(Y, C) mean of the coarse ``image`` where points ``turned`` (Y, N, 2) lie, moved by ``starts`` (C, 2) [its cells]."""
-    out = np.empty((turned.shape[0], starts.shape[0]))
-    for y in range(turned.shape[0]):
-        for c in range(starts.shape[0]):
-            out[y, c] = _mean(image, turned[y], starts[c, 0], starts[c, 1], np.inf)
+def _bound_blocks(image: FloatArray, turned: FloatArray, middles: FloatArray) -> FloatArray:
+    """(T, C) bounds of the blocks of 8 cells about ``middles`` (C, 2) [cells], with points ``turned`` (T, N, 2)."""
+    out = np.empty((turned.shape[0], middles.shape[0]))
+    for t in range(turned.shape[0]):
+        for c in range(middles.shape[0]):
+            out[t, c] = _mean(image, turned[t], middles[c, 0] - _SHIFTS[3], middles[c, 1] - _SHIFTS[3], np.inf)
     return out
 
 
 @threaded_kernel
-def _refine_blocks(image: FloatArray, turned: FloatArray, starts: FloatArray, rows: IntArray, best: float) -> tuple[FloatArray, FloatArray]:
-    """The best pose (K, 3) within each block of `COARSE` cells about ``starts`` (K, 2) [cells] and as many rows of ``turned`` (Y, N, 2),
-    and its score (K,); -1 for what cannot come to a share of the ``best``.
+def _refine_blocks(
+    images: tuple[FloatArray, ...], turned: FloatArray, middles: FloatArray, is_start: NDArray[np.bool_], rows: IntArray, best: float
+) -> tuple[FloatArray, FloatArray]:
+    """The best pose (8 K, 3) in each block of 4 cells and two headings within those of 8 cells about ``middles`` (K, 2) [cells] and four
+    headings from ``rows`` (K,) of ``turned`` (Y, N, 2) on, where ``is_start`` (K, 4); and its score (8 K,), -1 for what cannot come to a
+    share of the ``best``.
     """
-    poses, scores, n = np.zeros((starts.shape[0], 3)), np.full(starts.shape[0], -1.0), turned.shape[1]
-    for k in range(starts.shape[0]):
-        for j in range(COARSE**3):
-            row, a, b = rows[k] + j // COARSE**2, j // COARSE % COARSE, j % COARSE
-            x, y = starts[k, 0] + a + 0.5 * (1 - COARSE), starts[k, 1] + b + 0.5 * (1 - COARSE)
-            score = _mean(image, turned[row], x, y, n * (1.0 - _SHARE_OF_BEST * best))
+    poses, scores, n = np.zeros((8 * middles.shape[0], 3)), np.full(8 * middles.shape[0], -1.0), turned.shape[1]
+    for k in range(8 * middles.shape[0]):
+        block, part, row = k // 8, k // 2 % 4, rows[k // 8] + 4 * (k % 2)
+        x, y = middles[block, 0] + 4 * (part // 2) - 2, middles[block, 1] + 4 * (part % 2) - 2
+        spare = n * (1.0 - _SHARE_OF_BEST * best)
+        if not is_start[block, part] or _mean(images[2], turned[row + 1], x - _SHIFTS[2], y - _SHIFTS[2], spare) < 0.0:
+            continue
+        for j in range(8):
+            pose = row + 2 * (j // 4), x + 2 * (j // 2 % 2) - 1, y + 2 * (j % 2) - 1
+            score, dx, dy = _best_of_four(images, turned[pose[0]], pose[1], pose[2], spare)
             if score > scores[k]:
                 scores[k], best = score, max(best, score)
-                poses[k, 0], poses[k, 1], poses[k, 2] = x, y, row
+                poses[k, 0], poses[k, 1], poses[k, 2] = dx, dy, pose[0]
     return poses, scores
+
+
+@subroutine
+def _best_of_four(images: tuple[FloatArray, ...], points: Points2, x: float, y: float, spare: float) -> Triple:
+    """Score and position of the best of the four poses about ``x`` and ``y`` [cells]; the score is -1 where the points miss more than
+    ``spare`` of theirs."""
+    found = -1.0, x, y
+    if _mean(images[1], points, x - _SHIFTS[1], y - _SHIFTS[1], spare) < 0.0:
+        return found
+    for j in range(4):
+        u, v = x + j // 2 - 0.5, y + j % 2 - 0.5
+        score = _mean(images[0], points, u, v, spare)
+        if score > found[0]:
+            found = score, u, v
+    return found

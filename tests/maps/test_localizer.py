@@ -54,6 +54,17 @@ def test_localizer_from_nothing_finds_the_place_and_keeps_it(office: PlaceMap) -
     assert 0.02 < math.sqrt(localizer.covariance[0, 0]) < 0.1
 
 
+def test_place_map_search_finds_the_true_pose_at_any_heading(office: PlaceMap) -> None:
+    """Off the middles of blocks; nothing that is left out by its bound is better."""
+    rng = np.random.default_rng(4)
+    for x, y in ((7.3, 4.1), (9.9, 5.7), (3.4, 2.2), (1.3, 1.1)):
+        pose = np.array([x, y, rng.uniform(-math.pi, math.pi)])
+        scan = floor_plan.scan(OFFICE, pose, seed=int(10 * x))
+        best = office.search(scan)[0]
+        assert se2.between(pose, best.pose) == pytest.approx(np.zeros(3), abs=0.06)
+        assert best.score >= office.align(scan, pose).score - 0.02
+
+
 def test_localizer_in_another_buildings_map_is_never_localized(office: PlaceMap) -> None:
     """Nor does it give any place a probability above 0.9."""
     localizer, way = Localizer(office), path((1, 1), (12, 1), (13, 4), step=2.0)[:4]
