@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from localization.events import Scan
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
-from tests.helpers.hills import HillDrive, terrain
+from tests.helpers.hills import HILLS, Ground, HillDrive
 
 MOUNT = Mount(0.1, 0.0, 0.7)
 _EXTENT_M, _CELL_M = 70.0, 0.1
@@ -38,8 +38,8 @@ class Scene:
     heights: FloatArray
 
 
-def make_scene(drive: HillDrive, seed: int, n_trees: int = 60, n_walls: int = 4, is_flat: bool = False) -> Scene:
-    """Trees and walls by chance, off the way of ``drive``; ``is_flat``: the plane z = 0 instead of hills."""
+def make_scene(drive: HillDrive, seed: int, n_trees: int = 60, n_walls: int = 4, is_flat: bool = False, ground: Ground = HILLS) -> Scene:
+    """Trees and walls on ``ground`` by chance, off the way of ``drive``; ``is_flat``: on the plane z = 0 instead."""
     rng = np.random.default_rng(seed)
     way = drive.positions[::25, :2]
     trees: list[list[float]] = []
@@ -50,7 +50,7 @@ def make_scene(drive: HillDrive, seed: int, n_trees: int = 60, n_walls: int = 4,
     sides = [(-24.0, -15.0, -24.0, 10.0), (-10.0, 25.0, 16.0, 25.0), (25.0, -8.0, 25.0, 14.0), (-12.0, -25.0, 8.0, -25.0)][:n_walls]
     axis = np.arange(-_EXTENT_M, _EXTENT_M + _CELL_M, _CELL_M)
     x, y = np.meshgrid(axis, axis, indexing="ij")
-    heights = np.zeros_like(x) if is_flat else terrain(x, y)
+    heights = np.zeros_like(x) if is_flat else ground.height(x, y)
     return Scene(np.array(trees).reshape(-1, 4), np.array([[*side, 5.0] for side in sides]).reshape(-1, 5), heights)
 
 

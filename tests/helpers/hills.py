@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,6 +60,39 @@ def gradient(x: float, y: float) -> tuple[float, float]:
         steep = _WAVE_SLOPE * math.cos(2.0 * math.pi / wavelength * (c * x + s * y) + phase)
         dx, dy = dx + c * steep, dy + s * steep
     return dx, dy
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A ground by its height."""
+
+    height: Callable[[FloatArray, FloatArray], FloatArray]
+    """At x and y [m]."""
+    gradient: Callable[[float, float], tuple[float, float]]
+    """Slope along x and y [-]."""
+
+
+HILLS = Ground(terrain, gradient)
+_RAMP_SLOPE = math.tan(math.radians(15.0))
+_RAMP_EDGES = ((5.0, 1.0), (9.0, -2.0), (13.0, 1.0))
+"""x where the ramp begins, has its crest and ends [m], and how its slope changes there, over `_RAMP_SLOPE`."""
+_EDGE_M = 0.15
+"""Scale over which an edge is rounded: nine tenths of its change lie within 3 of it."""
+
+
+def _ramp_height(x: FloatArray, y: FloatArray) -> FloatArray:
+    total = np.zeros(np.broadcast(x, y).shape)
+    for at, change in _RAMP_EDGES:
+        total = total + _RAMP_SLOPE * change * _EDGE_M * np.logaddexp(0.0, (x - at) / _EDGE_M)
+    return np.asarray(total)
+
+
+def _ramp_gradient(x: float, y: float) -> tuple[float, float]:
+    return sum(0.5 * _RAMP_SLOPE * change * (1.0 + math.tanh(0.5 * (x - at) / _EDGE_M)) for at, change in _RAMP_EDGES), 0.0
+
+
+RAMP = Ground(_ramp_height, _ramp_gradient)
+"""Up by 15 degrees, over a crest, and down by 15 degrees, along x."""
 
 
 def rolling_drive(seconds: float, speed: float = 0.7, turn_rate: float = 0.3, seed: int = 1, is_flat: bool = False) -> HillDrive:

@@ -16,7 +16,7 @@ from localization.events import Event, ImuSample, WheelSample
 from motion_models.robot import Mount, Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
-from tests.helpers.hills import HillDrive, gradient, terrain
+from tests.helpers.hills import HILLS, Ground, HillDrive
 from tests.helpers.mujoco_vehicle import CONE, CONTACT, FLATTENING
 
 _STEP_S, _IMU_EVERY, _WHEELS_EVERY, _GROUND_EVERY = 0.001, 10, 20, 2
@@ -64,10 +64,23 @@ class Wander:
         return self._command
 
 
-def drive(command, seconds: float, mu: float = 0.8, slope_deg: float | None = None, robot: Robot | None = None, seed: int = 1) -> HillDrive:
-    """Drive by ``command(t, position, heading)``: on the hills, or on a plane that rises by ``slope_deg`` towards +x."""
+def drive(
+    command,
+    seconds: float,
+    mu: float = 0.8,
+    slope_deg: float | None = None,
+    robot: Robot | None = None,
+    seed: int = 1,
+    softness: float = 1.0,
+    ground: Ground = HILLS,
+) -> HillDrive:
+    """Drive by ``command(t, position, heading)``: on ``ground``, or on a plane that rises by ``slope_deg`` towards +x.
+
+    ``softness``: how much softer the wheels are than `mujoco_vehicle.CONTACT`, by which they give way by .6 mm under the robot's weight.
+    Such wheels do not adapt to ground that is not plane: on the hills each is lifted off for a quarter of the time.
+    """
     robot = robot or robot_of(mu)
-    model = mujoco.MjModel.from_xml_string(_xml(robot, mu))
+    model = mujoco.MjModel.from_xml_string(_xml(robot, mu, softness))
     down = -9.81 * np.array([0.0, 0.0, 1.0])
     tilt = np.eye(3)
     if slope_deg is not None:
@@ -76,12 +89,15 @@ def drive(command, seconds: float, mu: float = 0.8, slope_deg: float | None = No
         down = tilt.T @ down
     model.opt.gravity[:] = down
     data = mujoco.MjData(model)
-    has_hills = slope_deg is None
-    data.qpos[2] += float(terrain(np.zeros(1), np.zeros(1))[0]) * has_hills
-    return _record(model, data, command, seconds, robot, tilt, has_hills, np.random.default_rng(seed))
+    uneven = ground if slope_deg is None else None
+    if uneven is not None:
+        data.qpos[2] += float(uneven.height(np.zeros(1), np.zeros(1))[0])
+    return _record(model, data, command, seconds, robot, tilt, uneven, np.random.default_rng(seed))
 
 
-def _record(model, data, command, seconds: float, robot: Robot, tilt: FloatArray, has_hills: bool, rng: np.random.Generator) -> HillDrive:
+def _record(
+    model, data, command, seconds: float, robot: Robot, tilt: FloatArray, ground: Ground | None, rng: np.random.Generator
+) -> HillDrive:
     g = robot.geometry
     hinges = [model.joint(name).id for name, _, _ in _WHEELS]
     angles_at, rates_at = [model.jnt_qposadr[j] for j in hinges], [model.jnt_dofadr[j] for j in hinges]
@@ -119,34 +135,34 @@ def _record(model, data, command, seconds: float, robot: Robot, tilt: FloatArray
             sums[:] = 0.0
         if is_standing:
             continue
-        if has_hills and i % _GROUND_EVERY == 0:
-            _move_ground(data, g.wheel_radius_m)
+        if ground is not None and i % _GROUND_EVERY == 0:
+            _move_ground(data, g.wheel_radius_m, ground)
         mujoco.mj_step(model, data)
     mounts = {"base_link": Mount(), "imu_link": Mount(0.1, 0.0, 0.2)}
     return HillDrive(robot, mounts, events, np.array(stamps), np.array(positions), np.array(rotations))
 
 
-def _move_ground(data, radius_m: float) -> None:
-    """Put the plane of each wheel tangent to the hills below it."""
+def _move_ground(data, radius_m: float, ground: Ground) -> None:
+    """Put the plane of each wheel tangent to the ground below it."""
     for k, (name, _, _) in enumerate(_WHEELS):
         x, y, _ = data.body(name).xpos
         for _ in range(2):  # the wheel's foot lies below its centre along the normal
-            dx, dy = gradient(x, y)
+            dx, dy = ground.gradient(x, y)
             normal = np.array([-dx, -dy, 1.0]) / math.sqrt(1.0 + dx * dx + dy * dy)
             x, y = data.body(name).xpos[:2] - radius_m * normal[:2]
-        data.mocap_pos[k] = (x, y, float(terrain(np.array([x]), np.array([y]))[0]))
+        data.mocap_pos[k] = (x, y, float(ground.height(np.array([x]), np.array([y]))[0]))
         half = math.sqrt(0.5 * (1.0 + normal[2]))
         data.mocap_quat[k] = (half, -normal[1] / (2.0 * half), normal[0] / (2.0 * half), 0.0)
 
 
-def _xml(robot: Robot, mu: float) -> str:
+def _xml(robot: Robot, mu: float, softness: float = 1.0) -> str:
     g = robot.geometry
     mass, radius = 50.0, g.wheel_radius_m
     wheel_mass = 0.02 * mass
     chassis = mass - 4.0 * wheel_mass
     height = (g.cg_height_m - radius) * mass / chassis
     inertia = mass * (g.track_width_m**2 + g.wheelbase_m**2) / 12.0
-    own = radius * (1.0 + FLATTENING)
+    own = radius * (1.0 + softness * FLATTENING)
     floor = "".join(
         f'<body name="ground_{n}" mocap="true"><geom name="ground_{n}" type="plane" size="100 100 1" contype="0"/></body>'
         for n, _, _ in _WHEELS
@@ -157,7 +173,8 @@ def _xml(robot: Robot, mu: float) -> str:
         f'<geom name="{name}" type="ellipsoid" size="{own} {0.25 * radius} {own}" mass="{wheel_mass}" contype="0"/></body>'
         for name, x, y in _WHEELS
     )
-    pairs = "".join(f'<pair geom1="ground_{n}" geom2="{n}" condim="3" friction="{mu} {mu} 0 0 0" {CONTACT}/>' for n, _, _ in _WHEELS)
+    contact = CONTACT.replace('solref="0.01 1"', f'solref="{0.01 * math.sqrt(softness)} 1"')
+    pairs = "".join(f'<pair geom1="ground_{n}" geom2="{n}" condim="3" friction="{mu} {mu} 0 0 0" {contact}/>' for n, _, _ in _WHEELS)
     servos = "".join(f'<velocity joint="{n}" kv="{20.0 * mass * 9.81 * radius}"/>' for n, _, _ in _WHEELS)
     return f"""
 <mujoco>

@@ -2,10 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 
 pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
 
+from tests.helpers.hills import RAMP, rolling_drive
+from tests.studies.hill_reckoning import along, in_body
 from tests.studies.hills import HEADINGS, TURNINGS, over_headings, turn
 
 _TO_15_DEG = [row for row in TURNINGS if row.slope_deg < 15.0]
@@ -26,3 +29,19 @@ def test_hills_centre_of_rotation_moves_as_in_mujoco(row):
     assert law.x_m == pytest.approx(row.x_m, rel=0.2)
     assert law.y_m == pytest.approx(row.y_m, rel=0.3)
     assert law.k == pytest.approx(row.k, abs=0.085)
+
+
+def test_hills_ramp_has_the_gradient_of_its_height():
+    """15 degrees up and down, level before and after."""
+    x, d = np.linspace(0.0, 18.0, 200), 1e-5
+    differences = (RAMP.height(x + d, 0.0 * x) - RAMP.height(x - d, 0.0 * x)) / (2.0 * d)
+    slopes = np.array([RAMP.gradient(a, 0.0)[0] for a in x.tolist()])
+    np.testing.assert_allclose(slopes, differences, atol=1e-6)
+    assert [RAMP.gradient(a, 0.0)[0] for a in (1.0, 7.0, 11.0, 17.0)] == pytest.approx([0.0, 0.268, -0.268, 0.0], abs=1e-3)
+
+
+def test_reckoning_parts_of_a_true_drive_are_zero():
+    """Body motions along their own rotations give the way again, so that each part is only what its name says."""
+    made = rolling_drive(8.0)
+    R, ways = made.rotations, made.positions - made.positions[0]
+    np.testing.assert_allclose(along(in_body(ways, R), R), ways, atol=1e-4)
