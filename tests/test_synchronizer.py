@@ -672,7 +672,7 @@ def test_step_length_is_zero_only_at_the_first_scan():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: WheelSample(7, NAN, np.zeros(4)), "WheelSample at 7 ns: position has shape (4,); it must be an array of shape (2,)"),
         (lambda: WheelSample(7, [1.0, 1.0], NAN), "velocity is a list; it must be an array of shape (2,)"),
@@ -690,8 +690,8 @@ def test_step_length_is_zero_only_at_the_first_scan():
         (lambda: ImuSample(7, np.zeros(3), np.array([0.0, 0.0, np.inf])), "linear_acceleration holds inf"),
     ],
 )
-def test_event_with_unusable_numbers_is_refused(make, said):
-    with pytest.raises(EventError, match=re.escape(said)):
+def test_event_with_unusable_numbers_is_refused(make, message):
+    with pytest.raises(EventError, match=re.escape(message)):
         make()
 
 

@@ -93,8 +93,10 @@ def main() -> None:
     for text, table in (("136 ccw", one), ("68 + 68 cw", both)):
         print(f"{text}: warp and treads look alike to {np.mean([k.warp_and_treads for k in table]):+.2f}")
         for k in table:
-            said = ", ".join(f"{f.cause} {f.size:+.3f} +- {f.sigma:.3f} {[name for name, _ in f.aliases]}" for f in k.diagnosis.findings)
-            print(f"  {k.diagnosis.verdict}: {said}")
+            reported = ", ".join(
+                f"{f.cause} {f.size:+.3f} +- {f.sigma:.3f} {[name for name, _ in f.aliases]}" for f in k.diagnosis.findings
+            )
+            print(f"  {k.diagnosis.verdict}: {reported}")
 
 
 if __name__ == "__main__":

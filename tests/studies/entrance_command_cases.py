@@ -125,37 +125,29 @@ def renamed_frames(parent: str, child: str) -> Callable[[Any], Any]:
     return change
 
 
-def also(*topics: tuple[str, str, float]) -> Callable[[Vehicle], Edit]:
-    """Truth at 5 Hz on more topics: (topic, form, noise [m])."""
+def also(vehicle: Vehicle, *topics: tuple[str, str, float]) -> Edit:
+    """Truth of a ``vehicle`` at 5 Hz on more topics: (topic, form, noise [m])."""
+    motion = drive(vehicle)
 
-    def of(vehicle: Vehicle) -> Edit:
-        motion = drive(vehicle)
+    def edit(records: list[Record]) -> list[Record]:
+        rng, more = np.random.default_rng(9), []
+        for topic, form, noise in topics:
+            for t in np.arange(0.0, motion.t[-1], 0.2):
+                x, y, a = motion.poses[motion.at(t)] + [*(noise * rng.normal(size=2)), 0.0]
+                stamp = START + round(t * S)
+                if form == "odometry":
+                    message = bags.odometry(stamp, x, y, a, *motion.twists[motion.at(t)])
+                elif form == "pose":
+                    message = bags.pose_stamped(stamp, x, y, a)
+                elif form == "covariance":
+                    message = bags.pose_with_covariance(stamp, x, y, a, np.diag([0.01, 0.01, 0, 0, 0, 0.01]))
+                else:
+                    longitude = 9.0 + math.degrees(x / (6.389e6 * math.cos(math.radians(48.0))))
+                    message = bags.fix(stamp, 48.0 + math.degrees(y / 6.367e6), longitude, covariance=np.eye(3).ravel() * noise**2)
+                more.append((topic, message, stamp + S // 50))
+        return [*records, *more]
 
-        def edit(records: list[Record]) -> list[Record]:
-            rng, more = np.random.default_rng(9), []
-            for topic, form, noise in topics:
-                for t in np.arange(0.0, motion.t[-1], 0.2):
-                    x, y, a = motion.poses[motion.at(t)] + [*(noise * rng.normal(size=2)), 0.0]
-                    stamp = START + round(t * S)
-                    if form == "odometry":
-                        message = bags.odometry(stamp, x, y, a, *motion.twists[motion.at(t)])
-                    elif form == "pose":
-                        message = bags.pose_stamped(stamp, x, y, a)
-                    elif form == "covariance":
-                        message = bags.pose_with_covariance(stamp, x, y, a, np.diag([0.01, 0.01, 0, 0, 0, 0.01]))
-                    else:
-                        message = bags.fix(
-                            stamp,
-                            48.0 + math.degrees(y / 6.367e6),
-                            9.0 + math.degrees(x / (6.389e6 * math.cos(math.radians(48.0)))),
-                            covariance=np.eye(3).ravel() * noise**2,
-                        )
-                    more.append((topic, message, stamp + S // 50))
-            return [*records, *more]
-
-        return edit
-
-    return of
+    return edit
 
 
 def without(topic: str) -> Edit:
@@ -172,11 +164,6 @@ def both(*edits: Edit) -> Edit:
         return records
 
     return edit
-
-
-def to_topic(old: str, new: str) -> Edit:
-    """A topic of another name."""
-    return lambda records: [(new if t == old else t, m, log) for t, m, log in records]
 
 
 CLOCKS = (
@@ -260,57 +247,44 @@ MOUNTS = (
     driven("mounts", "LiDAR upside down and backwards", ROSBOT, Publishing(lidar_flip=True, lidar_yaw=math.pi), ["upside"]),
 )
 
-TOPICS = (
-    driven(
-        "topics",
-        "wheels beside filtered, truth and AMCL",
+FILTERED, TRUTH = ("/j100_0001/platform/odom/filtered", "odometry", 0.0), ("/j100_0001/ground_truth/state", "odometry", 0.0)
+BESIDE = {
+    "wheels beside filtered, truth and AMCL": (JACKAL, "joint_states", {}, (FILTERED, TRUTH, ("/amcl_pose", "covariance", 0.1))),
+    "driver's odometry beside filtered, both namespaced": (
         JACKAL,
-        edit=also(
-            ("/j100_0001/platform/odom/filtered", "odometry", 0.0),
-            ("/j100_0001/ground_truth/state", "odometry", 0.0),
-            ("/amcl_pose", "covariance", 0.1),
-        )(JACKAL),
+        "odometry",
+        {"/odom": "/j100_0001/platform/odom"},
+        (FILTERED, ("/mocap/pose", "pose", 0.001)),
     ),
-    driven(
-        "topics",
-        "filtered odometry alone",
-        JACKAL,
-        words=["no wheels"],
-        edit=both(without("/joint_states"), also(("/odometry/filtered", "odometry", 0.0))(JACKAL)),
-        refused=True,
-    ),
-    driven(
-        "topics",
-        "mocap as Odometry alone",
-        WARTHOG,
-        words=["no wheels"],
-        edit=both(without("/joint_states"), also(("/vrpn_client_node/robot/odom", "odometry", 0.0))(WARTHOG)),
-        refused=True,
-    ),
-    driven(
-        "topics",
-        "GPS odometry alone",
-        WARTHOG,
-        words=["no wheels"],
-        edit=both(without("/joint_states"), also(("/odometry/gps", "odometry", 0.2))(WARTHOG)),
-        refused=True,
-    ),
-    driven(
-        "topics",
-        "driver's odometry beside filtered, both namespaced",
-        JACKAL,
-        Publishing(forms="odometry"),
-        edit=both(
-            to_topic("/odom", "/j100_0001/platform/odom"),
-            also(("/j100_0001/platform/odom/filtered", "odometry", 0.0), ("/mocap/pose", "pose", 0.001))(JACKAL),
-        ),
-    ),
-    driven(
-        "topics",
-        "lidar odometry and wheels' odometry",
+    "lidar odometry and wheels' odometry": (
         SCANS,
-        Publishing(forms="odometry"),
-        edit=both(to_topic("/odom", "/wheel_odom"), also(("/kiss/odometry", "odometry", 0.02), ("/fix", "fix", 0.5))(SCANS)),
+        "odometry",
+        {"/odom": "/wheel_odom"},
+        (("/kiss/odometry", "odometry", 0.02), ("/fix", "fix", 0.5)),
+    ),
+}
+"""Vehicle, form and names of its wheels, and other topics."""
+ALONE = {
+    "filtered odometry alone": (JACKAL, "/odometry/filtered", 0.0),
+    "mocap as Odometry alone": (WARTHOG, "/vrpn_client_node/robot/odom", 0.0),
+    "GPS odometry alone": (WARTHOG, "/odometry/gps", 0.2),
+}
+"""Vehicle, topic and noise [m] of odometry that is not of wheels, in a log without these."""
+TOPICS = (
+    *(
+        driven("topics", name, vehicle, Publishing(forms=forms, names=names), edit=also(vehicle, *topics))
+        for name, (vehicle, forms, names, topics) in BESIDE.items()
+    ),
+    *(
+        driven(
+            "topics",
+            name,
+            vehicle,
+            words=["no wheels"],
+            edit=both(without("/joint_states"), also(vehicle, (topic, "odometry", noise))),
+            refused=True,
+        )
+        for name, (vehicle, topic, noise) in ALONE.items()
     ),
 )
 

@@ -28,7 +28,7 @@ from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 from tests.helpers.entrance_drives import Motion, Publishing, Vehicle, cast, drive, records_of
-from tests.studies.entrances import AS_THEY_ARE, Found, Outcome, print_shares
+from tests.studies.entrances import AS_THEY_ARE, Found, choose_outcome, print_shares
 
 Edit = Callable[[list[Record]], list[Record]]
 Times = Callable[[np.ndarray, float, int], np.ndarray]
@@ -122,8 +122,7 @@ def driven(
         warned = _warnings(text)
         is_named = not words or any(word in warned for word in words)
         if code:
-            outcome: Outcome = "right" if refused and is_named else "named" if words and is_named else "misnamed"
-            return Found(outcome, f"[exit {code}] {warned or text}")
+            return Found(choose_outcome(refused, is_named, True, words), f"[exit {code}] {warned or text}")
         ours, best = errors_of(folder / "out", motion), healthy_errors(vehicle)
         state = f"[odometry {ours[0]:.3f} ({best[0]:.3f}), EKF {ours[1]:.3f} ({best[1]:.3f}) m]"
         is_right = all(a < 1.5 * b + 0.03 for a, b in zip(ours, best, strict=True))
@@ -131,9 +130,7 @@ def driven(
         checked = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []
         wrong = [row for row in checked if row["verdict"] == "contradiction"]
         state += f" check: {[row['quantity'] + ': ' + row['advice'] for row in wrong] or code or 'no contradiction'}\n"
-        if is_right:
-            return Found("right" if is_named else "misnamed" if warned else "silent", state + warned)
-        return Found("named" if words and is_named else "misnamed" if warned else "silent", state + warned)
+        return Found(choose_outcome(is_right, is_named, bool(warned), words), state + warned)
 
     return Case(kind, name, judge)
 
@@ -151,23 +148,15 @@ def scored(
         flat = " ".join(text.split())
         if words:
             is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
-            return Found(
-                "right"
-                if is_named and not is_judged
-                else "misnamed"
-                if code or "reference" in _warnings(text) or "until that" in flat.lower()
-                else "silent",
-                f"[exit {code}] {text}",
-            )
+            is_warned = bool(code) or "reference" in _warnings(text) or "until that" in flat.lower()
+            return Found(choose_outcome(True, is_named and not is_judged, is_warned, words), f"[exit {code}] {text}")
         if code:
             return Found("misnamed", f"[exit {code}] {text}")
         found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
         best = dict(zip(("odometry", "ekf"), healthy_errors(vehicle), strict=True))
         is_right = all(abs(found[k] - best[k]) < 0.3 * best[k] + 0.03 + noise for k in best)
-        return Found(
-            "right" if is_right and "Until that" not in text else "silent" if is_right is False and not _warnings(text) else "misnamed",
-            f"[{found}, {best}] {_warnings(text)}",
-        )
+        has_doubt, warned = "Until that" in text, _warnings(text)
+        return Found(choose_outcome(is_right, not has_doubt, has_doubt or bool(warned), words), f"[{found}, {best}] {warned}")
 
     return Case("references", name, judge)
 
@@ -180,11 +169,9 @@ def clouded(name: str, vehicle: Vehicle, field_name: str, dtype: str, times: Tim
         (folder / "healthy").mkdir()
         best = _cloud_error(folder / "healthy", vehicle, "time", "f4", lambda u, period, stamp: u * period)
         warned, state = _warnings(found[1]), f"[EKF {found[0]:.3f} ({best[0]:.3f}) m] "
-        is_named = bool(words) and any(word in warned for word in words)
-        if words:
-            return Found("right" if is_named else "misnamed" if warned else "silent", state + warned)
-        is_right = found[0] < 1.5 * best[0] + 0.01
-        return Found("right" if is_right and not warned else "misnamed" if warned else "silent", state + warned)
+        is_named = any(word in warned for word in words) if words else not warned
+        is_right = bool(words) or found[0] < 1.5 * best[0] + 0.01
+        return Found(choose_outcome(is_right, is_named, bool(warned), words), state + warned)
 
     return Case("point times", name, judge)
 
@@ -232,16 +219,16 @@ def initialized(
         flat = " ".join(text.split())
         is_named = all(word in flat for word in words)
         if code or not (folder / "new.toml").exists():
-            return Found("right" if refused and is_named else "named" if is_named else "misnamed", f"[exit {code}] {text}")
+            return Found(choose_outcome(refused, is_named, True, words), f"[exit {code}] {text}")
         try:
             robot = load_robot(folder / "new.toml")
         except SkidlocError as error:
             is_right = bool(asked) and all(name in str(error) + text for name in asked)
-            return Found("right" if is_right and is_named else "named" if is_named else "misnamed", f"{error}\n{text}")
+            return Found(choose_outcome(is_right, is_named, True, words), f"{error}\n{text}")
         pairs = ((robot.geometry.wheel_radius_m, vehicle.radius), (robot.geometry.track_width_m, vehicle.track))
         is_right = all(abs(math.log(a / b)) < 0.05 for a, b in pairs) and not refused
         state = f"[{pairs}, CG {robot.center_of_gravity}] "
-        return Found(("right" if is_named else "misnamed") if is_right else "named" if is_named and words else "silent", state + text)
+        return Found(choose_outcome(is_right, is_named, is_right, words), state + text)
 
     return Case("descriptions", name, judge)
 

@@ -64,12 +64,17 @@ class Variant:
     judge: Callable[[Path], Found]
 
 
+def choose_outcome(is_right: bool, is_named: bool, is_warned: bool, words: Sequence[str]) -> Outcome:
+    """``words`` name what is wrong with the input, if anything is; ``is_named``: they are in the sentences, or there is none to be."""
+    if is_named and (is_right or words):
+        return "right" if is_right else "named"
+    return "misnamed" if is_warned else "silent"
+
+
 def outcome_of(is_right: bool, text: str, words: Sequence[str], is_healthy: bool = False) -> Found:
     """``words``: of which one must be in the sentences where something is wrong with the input."""
     is_named = not words or any(word in text for word in words)
-    if is_right:
-        return Found("right" if is_named and not (is_healthy and text) else "misnamed" if text else "silent", text)
-    return Found("silent" if not text else "named" if is_named and words else "misnamed", text)
+    return Found(choose_outcome(is_right, is_named and not (is_healthy and text), bool(text), words), text)
 
 
 # wheels and gyro

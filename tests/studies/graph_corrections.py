@@ -12,7 +12,7 @@ The same odometry on a real Husky outdoors, where the gyro is all that it can be
 
 python -m tests.studies.graph_corrections hidden
 
-The friction model on laps of a robot whose CG is not where it is said to be.
+The friction model on laps of a robot whose CG is not where its file has it.
 """
 
 from __future__ import annotations

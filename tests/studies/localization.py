@@ -3,7 +3,7 @@
 ``python -m tests.studies.localization`` prints four tables. *Starts*: the robot is put down at random moments of one half, the map is of
 the other half, and it drives for ``--seconds``; keyframes and truth are those of the smoothed graph of the whole log. A start is
 mapped where, at its end, the scan at the true pose has a score of at least 0.5. Right is within 0.5 m and 0.2 rad. *Reliability*: of all
-keyframes by the probability that was said, and of all searches by weights that were fitted to the other buildings. *Drives*: the second
+keyframes by the probability that was given, and of all searches by weights that were fitted to the other buildings. *Drives*: the second
 half of each log, replayed in the map of the first, and the reverse; errors while the state is localized, where the map has most of the
 walls and outside of it, where the pose is by odometry. *Carried*: the same drives with cuts; times count from where the scan
 at the true pose is mapped, and a place that the map does not have cannot be found.
@@ -76,7 +76,7 @@ def halves(keyframes: KeyframeMap) -> tuple[np.ndarray, np.ndarray]:
 def run_start(
     places: RecordedSearches, keyframes: KeyframeMap, scans: Sequence[np.ndarray], ids: np.ndarray, name: str, is_same: bool
 ) -> tuple[Start, list[Moment], list[Search]]:
-    """Keyframes ``ids`` of building ``name`` in a row, from an unknown place: its end, what was said, and what searches found."""
+    """Keyframes ``ids`` of building ``name`` in a row, from an unknown place: its end, the probabilities, and what searches found."""
     localizer, last, after, spent = Localizer(places), None, math.nan, 0.0
     moments, searches, kind = [], [], "starts" if is_same else "starts in maps of other buildings"
     truth = keyframes.poses[ids[0]]
@@ -100,7 +100,7 @@ def run_start(
 
 
 def _best(localizer: Localizer) -> np.ndarray:
-    """(3,) the pose that is said, or the best place of the last search."""
+    """(3,) the pose that is given, or the best place of the last search."""
     return localizer.pose if localizer.state == "localized" or not localizer.hypotheses else localizer.hypotheses[0].pose
 
 

@@ -108,7 +108,7 @@ def draw(moments: Sequence[Moment], path: Path) -> None:
         axes.errorbar(
             rows[:, 0], rows[:, 2], [np.maximum(rows[:, 2] - low, 0), np.maximum(high - rows[:, 2], 0)], marker="o", capsize=3, label=kind
         )
-    axes.set(xlabel="probability that is said", ylabel="share that is right", xlim=(0, 1), ylim=(0, 1.02))
+    axes.set(xlabel="probability that is given", ylabel="share that is right", xlim=(0, 1), ylim=(0, 1.02))
     axes.legend(fontsize=8)
     figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
 

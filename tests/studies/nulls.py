@@ -98,7 +98,7 @@ def kept(null: Null, folder: Path) -> Drive:
 
 
 class Outcome(NamedTuple):
-    """What was said of a healthy drive, and what would be written."""
+    """What was reported of a healthy drive, and what would be written."""
 
     verdict: str
     is_written: bool

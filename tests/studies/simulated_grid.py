@@ -113,9 +113,9 @@ def _measure(run: RunRecord, window: _Window, mount: Mount) -> Rotation:
     model = make_model("friction", robot)
     rates = make_model("diff_drive", robot).wheels(np.array([0.0, 0.3]), cg, make_model("diff_drive", robot).nominal)
     per_wheels = g.wheel_radius_m * (rates[1] - rates[0]) / g.track_width_m
-    said = _centre(model.twist(rates, cg, model.nominal).value, per_wheels)
+    predicted = _centre(model.twist(rates, cg, model.nominal).value, per_wheels)
     settled = _centre(_settled(rates, cg), per_wheels)
-    return Rotation(cg, k, sigma, centre.value, centre.cov, said, settled)
+    return Rotation(cg, k, sigma, centre.value, centre.cov, predicted, settled)
 
 
 def _track(scans: Sequence[Scan], mount: Mount, begin_ns: int) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -196,15 +196,15 @@ def main() -> None:
         found = rotations(Path(folder))
     assert len(found) == len(grid_points())
     measured, sigma = np.array([[r.k, *r.cor] for r in found]), sigmas(found)
-    for title, said in (("the closed model", [r.model for r in found]), ("the vehicle at constant rates", [r.settled for r in found])):
-        off = measured - np.array(said)
+    for title, predicted in (("the closed model", [r.model for r in found]), ("the vehicle at constant rates", [r.settled for r in found])):
+        off = measured - np.array(predicted)
         print(f"measured against {title}\n{'':6} {'bias':>9} {'scatter':>9} {'stated sigma':>13} {'rms of z':>9} {'range':>9}")
         for i, name in enumerate(TERMS):
             z = off[:, i] / sigma[:, i]
-            numbers = off[:, i].mean(), off[:, i].std(), sigma[:, i].mean(), np.sqrt(np.mean(z**2)), np.ptp(np.array(said)[:, i])
+            numbers = off[:, i].mean(), off[:, i].std(), sigma[:, i].mean(), np.sqrt(np.mean(z**2)), np.ptp(np.array(predicted)[:, i])
             print(f"{name:6} {numbers[0]:9.5f} {numbers[1]:9.5f} {numbers[2]:13.5f} {numbers[3]:9.2f} {numbers[4]:9.3f}")
-    for name, (seen, said) in fits(found).items():
-        for term, a, s, b in zip(seen.names, seen.coefficients, np.sqrt(np.diagonal(seen.cov)), said.coefficients, strict=True):
+    for name, (seen, predicted) in fits(found).items():
+        for term, a, s, b in zip(seen.names, seen.coefficients, np.sqrt(np.diagonal(seen.cov)), predicted.coefficients, strict=True):
             print(f"{name:5} {term:6} measured {a:9.4f} +- {s:.4f}   closed model {b:9.4f}   {(a - b) / s:+.1f} sigma")
 
 

@@ -26,8 +26,8 @@ def drives():
 def test_rotations_by_scan_matching_reproduce_the_regressions(measured):
     """4.21, 4.22 and 4.25 through bag, scan matching and arcs: each coefficient within three of its stated sigmas."""
     z = []
-    for seen, said in simulated_grid.fits(measured).values():
-        z += ((seen.coefficients - said.coefficients) / np.sqrt(np.diagonal(seen.cov))).tolist()
+    for seen, predicted in simulated_grid.fits(measured).values():
+        z += ((seen.coefficients - predicted.coefficients) / np.sqrt(np.diagonal(seen.cov))).tolist()
     assert len(z) == 8
     assert np.abs(z).max() < 3.0
 
