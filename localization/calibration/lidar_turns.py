@@ -26,6 +26,8 @@ _CLEARER = 3.0
 """How many times nearer to 1 the correlation with an offset is than that without."""
 
 
+Track = tuple[FloatArray, FloatArray]
+"""Times (n,) [s] and headings (n,) [rad]."""
 Sensor = Literal["lidar", "gyro", "wheel"]
 
 
@@ -69,28 +71,26 @@ class GyroHeading:
             self._stamps.append(sample.stamp_ns)
             self._rates.append(float(self._up @ sample.angular_velocity))
 
-    def at(self, seconds: FloatArray, origin_ns: int) -> FloatArray:
-        """Heading (N,) [rad] at ``seconds`` (N,) after ``origin_ns``, from zero at the first sample; NaN outside of the samples."""
-        if len(self._stamps) < 2:
-            return np.full(len(seconds), np.nan)
+    def since(self, origin_ns: int) -> Track:
+        """Heading by all samples so far, from zero at the first; times after ``origin_ns``."""
         t, rates = np.array([stamp - origin_ns for stamp in self._stamps]) * 1e-9, np.array(self._rates)
-        headings = np.r_[0.0, np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t))]
-        return np.interp(seconds, t, headings, left=np.nan, right=np.nan)
+        return t, np.r_[0.0, np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t))][: len(t)]
 
 
-def compare_turns(
-    rows: Sequence[tuple[int, int, Pose2]], wheels: tuple[FloatArray, FloatArray], gyro: GyroHeading, origin_ns: int
-) -> LidarTurns | None:
+def compare_turns(rows: Sequence[tuple[int, int, Pose2]], wheels: Track, gyro: GyroHeading, origin_ns: int) -> LidarTurns | None:
     """``rows``: begin and end [ns] of intervals and the motion (3,) by scans. ``wheels``: times (n,) [s] after ``origin_ns`` and right less
     left way (n,) [m]. None for too few turns; nothing is shown where wheels and gyro do not agree."""
+    heading = gyro.since(origin_ns)
+    if not len(heading[0]):
+        return None
     edges = np.array([[begin - origin_ns, end - origin_ns] for begin, end, _ in rows]).reshape(-1, 2) * 1e-9
     scans = np.array([delta[2] for _, _, delta in rows])
-    by_wheels = np.diff(np.interp(edges, *wheels, left=np.nan, right=np.nan), axis=1)[:, 0]
-    by_gyro = _turns(gyro, edges, 0.0, origin_ns)
+    by_wheels = _turns(wheels, edges, 0.0)
+    by_gyro = _turns(heading, edges, 0.0)
     known = np.isfinite(by_wheels) & np.isfinite(by_gyro)
     if known.sum() < _MIN_INTERVALS or np.abs(by_gyro[known]).sum() < _MIN_TURN_RAD:
         return None
-    wheels_offset, scans_offset = (_offset(turns, gyro, edges, origin_ns) for turns in (by_wheels, scans))
+    wheels_offset, scans_offset = (_offset(turns, heading, edges) for turns in (by_wheels, scans))
     if wheels_offset.likeness < _SURE_LIKENESS or abs(scans_offset.likeness) < _SURE_LIKENESS:
         return LidarTurns()
     return LidarTurns(scans_offset.likeness < 0.0, *_odd_clock(wheels_offset, scans_offset))
@@ -109,18 +109,18 @@ def _odd_clock(wheels: _Offset, scans: _Offset) -> tuple[Sensor, float]:
     return "lidar", 0.0
 
 
-def _offset(turns: FloatArray, gyro: GyroHeading, edges: NDArray[np.float64], origin_ns: int) -> _Offset:
+def _offset(turns: FloatArray, heading: Track, edges: NDArray[np.float64]) -> _Offset:
     """Of ``turns`` (N,) over ``edges`` (N, 2) of stamps [s] that are late."""
     offsets = np.arange(-round(_MAX_LATE_S / _STEP_S), round(_MAX_LATE_S / _STEP_S) + 1) * _STEP_S
-    found = np.array([_likeness(_turns(gyro, edges, late, origin_ns), turns) for late in offsets])
+    found = np.array([_likeness(_turns(heading, edges, late), turns) for late in offsets])
     best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])
     is_clear = 1.0 - abs(at_zero) > _CLEARER * (1.0 - abs(found[best]))
     return _Offset(float(offsets[best]), float(found[best]), is_clear)
 
 
-def _turns(gyro: GyroHeading, edges: NDArray[np.float64], late_s: float, origin_ns: int) -> FloatArray:
-    """(N,) over ``edges`` (N, 2) of stamps that are late."""
-    return np.asarray(np.diff(gyro.at((edges - late_s).ravel(), origin_ns).reshape(-1, 2), axis=1)[:, 0])
+def _turns(heading: Track, edges: NDArray[np.float64], late_s: float) -> FloatArray:
+    """(N,) over ``edges`` (N, 2) of stamps that are late; NaN outside of the ``heading``."""
+    return np.asarray(np.diff(np.interp(edges - late_s, *heading, left=np.nan, right=np.nan), axis=1)[:, 0])
 
 
 def _likeness(a: FloatArray, b: FloatArray) -> float:
