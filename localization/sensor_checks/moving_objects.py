@@ -102,6 +102,8 @@ class MovingObjects(SensorCheck):
         self._poses = np.zeros((2, 3))  # by the wheels, and by the estimate, which has the wheels' motion in a step until its end
         self._estimated = np.zeros(3)  # pose by the estimate at the begin of the step
         self._lidars: dict[str, _Lidar] = {}
+        self._next_view: tuple[_Lidar, float, Profile, bool] | None = None
+        """LiDAR, time [s] and profile of the last scan, and whether the robot stood: a view once the pose at its step's end is known."""
         self._compared: _View | None = None
         """With which the last scan was compared."""
         self._is_unsure = False
@@ -120,6 +122,7 @@ class MovingObjects(SensorCheck):
 
     def apply(self, step: Step) -> Step:
         """``step`` whose scan has the still world alone, while more than a few objects move."""
+        self._keep_view()
         self._add_motion(step)
         declared = self._faults.declared
         if declared and any(fault in declared for fault in _EXPLAINING if fault not in self._explained):
@@ -154,15 +157,22 @@ class MovingObjects(SensorCheck):
         elif lidar.is_active:
             step = without_scan(step)
         if is_due:
-            view = _View(now_s, self._poses, profile)  # `compare_estimate` corrects them
-            lidar.views.append(view)
-            if step.is_standing and lidar.standing is None:
-                lidar.standing = view
+            self._next_view = lidar, now_s, profile, step.is_standing
         return step
+
+    def _keep_view(self) -> None:
+        """The last scan is a view, with the poses at the end of its step."""
+        if self._next_view is None:
+            return
+        lidar, at_s, profile, is_standing = self._next_view
+        self._next_view, view = None, _View(at_s, self._poses, profile)
+        lidar.views.append(view)
+        if is_standing and lidar.standing is None:
+            lidar.standing = view
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
-        self._poses[1] = se2.compose(self._estimated, delta)
+        self._poses = np.array([self._poses[0], se2.compose(self._estimated, delta)])
         self._is_by_scans |= nis is not None
         inflation, view = self._faults.inflation, self._compared
         if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
