@@ -30,7 +30,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "info": ("Info", "Show what a log holds and what would be used of it."),
     "replay": ("Replay", "Run motion models and estimators over a log and score their trajectories."),
     "compare": ("Compare", "Compare motion models and estimators over many logs."),
-    "table": ("Table", "Show k, centres of rotation and gravity, and faults by robot, floor and day, with an alarm where k changed."),
+    "table": (
+        "TableCommand",
+        "Show k, centres of rotation and gravity, and faults by robot, floor and day, with an alarm where k changed.",
+    ),
     "calibrate": ("Calibrate", "Fit a motion model to logs or tables and write the robot file."),
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
     "weigh": ("Weigh", "Estimate the centre of gravity and an unknown load from how the robot turns."),
@@ -39,7 +42,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
     "map": ("Map", "Show a saved map, in words or in a browser, export it for planners and viewers, or join two."),
-    "online": ("Online", "Run the estimator live on ROS topics, or on a log as it was recorded."),
+    "online": ("OnlineCommand", "Run the estimator live on ROS topics, or on a log as it was recorded."),
     "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),
 }
 """By name: the class in `localization.commands.NAME`, and one line for the overview."""

@@ -43,7 +43,7 @@ _LEARNED = 8  # corrections that are shown; grids of them have dozens
 
 
 @dataclass(frozen=True)
-class Online(OnlineSettings):
+class OnlineCommand(OnlineSettings):
     """Run the estimator live on ROS topics, or on a log as it was recorded."""
 
     log: tyro.conf.Positional[Path | None] = None

@@ -20,7 +20,7 @@ _MOST_FAULTS = 10
 
 
 @dataclass(frozen=True)
-class Table:
+class TableCommand:
     """Show k, centres of rotation and gravity, and faults by robot, floor and day, with an alarm where k changed."""
 
     results: tyro.conf.Positional[Path]

@@ -111,7 +111,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Table:
+class NotebookTable:
     """Rows that a notebook shows, and a console prints."""
 
     header: tuple[str, ...]
@@ -129,9 +129,9 @@ class Table:
         )
 
 
-def table(header: Sequence[str], *rows: Sequence[object]) -> Table:
+def table(header: Sequence[str], *rows: Sequence[object]) -> NotebookTable:
     """Numbers to four digits; None and NaN as a dash."""
-    return Table(tuple(header), tuple(tuple(_cell(cell) for cell in row) for row in rows))
+    return NotebookTable(tuple(header), tuple(tuple(_cell(cell) for cell in row) for row in rows))
 
 
 def _cell(value: object) -> str:

@@ -155,10 +155,10 @@ def test_all_data_files_exist():
 
 
 def test_settings_of_the_command_and_of_the_node_are_the_same():
-    from localization.commands.online import Online
+    from localization.commands.online import OnlineCommand
 
     shared = {field.name for field in dataclasses.fields(make_settings({"robot": "vaultbot"}, Names()))} - {"autostart"}
-    assert shared <= {field.name for field in dataclasses.fields(Online)}
+    assert shared <= {field.name for field in dataclasses.fields(OnlineCommand)}
 
 
 def test_layouts_show_topics_that_are_published_or_read():
