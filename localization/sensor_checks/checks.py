@@ -11,7 +11,6 @@ from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.gyro_rate import GyroRate
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
@@ -22,7 +21,7 @@ from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.travel_direction import TravelDirection
-from localization.sensor_checks.turn_rates import TurnRates
+from localization.sensor_checks.turn_rates import GyroRate, TurnRates
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
@@ -113,14 +112,10 @@ class SensorChecks:
                 check.compare_estimate(self._step, delta, estimate.nis)
             self._consistency.compare_estimate(delta, estimate.nis)
         inflated = self._inflation.inflate(estimate, delta)
-        if self._step is not None and self._step.scan is not None:
-            self._compare_places(self._step.scan, self._pose)
+        scan = None if self._step is None else self._step.scan
+        if scan is not None and self._places.update(lambda: self._window.profile(scan), self._pose):
+            self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on
         return inflated
-
-    def _compare_places(self, scan: Scan, pose: Pose2) -> None:
-        """A place from before the faults may show ``pose`` (3,): then differences of sensors count from here on."""
-        if self._places.update(lambda: self._window.profile(scan), pose):
-            self._consistency.restart()
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on."""

@@ -69,15 +69,11 @@ class CovarianceInflation:
     @property
     def is_inflating(self) -> bool:
         """Whether the covariance has anything of a fault."""
-        return (self._has_spread or self.is_lasting) and bool(self.total.any())
+        return (self._has_spread or bool(self.lasting)) and bool(self.total.any())
 
     @property
-    def is_lasting(self) -> bool:
-        """Whether sensors disagree at present."""
-        return bool(self._lasting)
-
-    @property
-    def _lasting(self) -> list[FloatArray]:
+    def lasting(self) -> list[FloatArray]:
+        """(3,) each: differences of sensors that disagree at present."""
         return [difference for difference in (self.ongoing_pair, self.ongoing_scene) if difference is not None]
 
     @property
@@ -119,7 +115,7 @@ class CovarianceInflation:
     @property
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        return self._spread + self._pending + sum((np.outer(d, d) for d in self._lasting), np.zeros((3, 3)))
+        return self._spread + self._pending + sum((np.outer(d, d) for d in self.lasting), np.zeros((3, 3)))
 
 
 def _widen(estimate: Estimate, spread: Cov3) -> Estimate:

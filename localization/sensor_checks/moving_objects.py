@@ -122,8 +122,15 @@ class MovingObjects(SensorCheck):
 
     def apply(self, step: Step) -> Step:
         """``step`` whose scan has the still world alone, while more than a few objects move."""
-        self._keep_view()
-        self._add_motion(step)
+        if self._next_view is not None:
+            of_lidar, at_s, last, was_standing = self._next_view
+            view, self._next_view = _View(at_s, self._poses, last), None
+            of_lidar.views.append(view)
+            of_lidar.standing = view if was_standing and of_lidar.standing is None else of_lidar.standing
+        delta = step.predicted.delta
+        if step.turn is not None and not step.is_standing:
+            delta = np.array([delta[0], delta[1], step.turn.angle])
+        self._estimated, self._poses = self._poses[1], se2.compose(self._poses, delta)
         declared = self._faults.declared
         if declared and any(fault in declared for fault in _EXPLAINING if fault not in self._explained):
             self._explained = tuple(fault for fault in _EXPLAINING if fault in declared)
@@ -159,16 +166,6 @@ class MovingObjects(SensorCheck):
         if is_due:
             self._next_view = lidar, now_s, profile, step.is_standing
         return step
-
-    def _keep_view(self) -> None:
-        """The last scan is a view, with the poses at the end of its step."""
-        if self._next_view is None:
-            return
-        lidar, at_s, profile, is_standing = self._next_view
-        self._next_view, view = None, _View(at_s, self._poses, profile)
-        lidar.views.append(view)
-        if is_standing and lidar.standing is None:
-            lidar.standing = view
 
     def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
@@ -219,12 +216,6 @@ class MovingObjects(SensorCheck):
         """``view`` from which the estimate has moved as the wheels have, to the poses ``now`` (2, 3)."""
         by_wheels = se2.between(now[0], view.poses[0])
         return view._replace(poses=np.array([view.poses[0], se2.compose(now[1], by_wheels)]))
-
-    def _add_motion(self, step: Step) -> None:
-        delta = step.predicted.delta
-        if step.turn is not None and not step.is_standing:
-            delta = np.array([delta[0], delta[1], step.turn.angle])
-        self._estimated, self._poses = self._poses[1], se2.compose(self._poses, delta)
 
     def _references(self, lidar: _Lidar) -> list[_View]:
         """The oldest view from which wheels and estimate have hardly moved, and the middle one of those after it."""

@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 
 from localization.sensor_checks.faults import SensorFault
-from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.sweep_times import REVERSED_TIMES
 from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
 from localization.sensor_checks.turn_rates import (
     GYRO_OPPOSITE,
+    GYRO_RATE,
     GYRO_STUCK,
     GYRO_UNIT,
     LIDAR_OPPOSITE,

@@ -1,4 +1,4 @@
-"""Turn rates of wheels, gyro and LiDAR: opposite signs, wrong units, a gyro that is stuck.
+"""Turn rates of wheels, gyro and LiDAR: opposite signs, wrong units, a gyro that is stuck, and rates of it that no slip explains.
 
 Of three sensors the one that contradicts the two others is at fault, of two either; the gyro or the LiDAR is left out then.
 """
@@ -13,14 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.faults import Evidence, FaultLog, SensorFault
-from localization.sensor_checks.gyro_rate import GYRO_RATE
+from localization.sensor_checks.faults import MEMORY_S, Evidence, FaultLog, SensorFault
 from localization.sensor_checks.sensor_check import SensorCheck, without_scan, without_wheels
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.compiled import kernel, subroutine
 from motion_models.se2 import FloatArray, Triple
 
+GYRO_RATE = SensorFault(
+    "the gyro turns by {rate:.1f} rad/s against the wheels, more than slip explains. It is not used for 3 s after each time. Check"
+    " the units of the IMU's driver.",
+    reference="wheels",
+)
 GYRO_OPPOSITE = SensorFault(
     "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign{or_wheels}.",
     reference="wheels",
@@ -45,6 +49,9 @@ LIDAR_OPPOSITE = SensorFault(
     is_of_scans=True,
 )
 
+_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE = 2.0, 3.0
+"""Difference of the gyro's rate from the wheels' that no slip explains, at least so large and so many times the wheels' rate. On the Husky
+outdoors it is 0.22 rad/s at most."""
 _MAX_BIAS_RAD_S = 0.05
 """Gyro bias that is no contradiction; ten times the prior sigma of the shipped robots."""
 _MIN_RATE_RAD_S = 0.001
@@ -66,6 +73,25 @@ _REPEATED_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 1e-7, 0.002
 _OR_WHEELS = ", or, as nothing else measures turns, the robot file's [joints]: left and right may be swapped, or all wheels count backwards"
 
 Numbers = Mapping[str, float | str]
+
+
+class GyroRate(SensorCheck):
+    """Leaves out a gyro whose rates no slip explains, at once. Stands before the checks that leave out the wheels, which it needs."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults = faults
+        self._last_s = -math.inf  # when the rate was last one that no slip explains
+
+    def apply(self, step: Step) -> Step:
+        """``step`` without the gyro, now and for the next seconds."""
+        now_s = self._faults.now_s
+        if step.turn is not None and step.has_wheels and step.duration > 0.0 and not step.is_standing:
+            by_wheels = float(step.predicted.delta[2]) / step.duration
+            off = abs(step.turn.angle / step.duration - by_wheels)
+            if off > max(_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE * abs(by_wheels)):
+                self._last_s = now_s
+                self._faults.declare(GYRO_RATE, now_s, {"rate": off})
+        return replace(step, turn=None) if now_s - self._last_s < MEMORY_S else step
 
 
 class TurnRates(SensorCheck):
