@@ -24,7 +24,7 @@ _MAX_NUMBER = 1e12
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """How means and errors change: e' = F e + w, cov(w) = Q. What is not named stays as it is, without noise."""
+    """Change of means and errors: e' = F e + w, cov(w) = Q. Variables that are not named are constant and without noise."""
 
     means: Mapping[str, FloatArray] = field(default_factory=dict)
     """New means of the variables that move."""
@@ -34,7 +34,7 @@ class Transition:
     noise: Mapping[str, FloatArray] = field(default_factory=dict)
     """Blocks (k, k) on the diagonal of Q."""
     what: str = "a transition"
-    """What moves the state, for messages."""
+    """Name of the transition in error messages."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,12 @@ class Measurement:
     """Variable whose error relative to that of a second one is measured, where the second is considered: the gain of the first then
     minimises the covariance of the difference (`update`)."""
     what: str = "a measurement"
-    """What was measured, for messages."""
+    """Name of the measurement in error messages."""
 
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """What an update found, and with which gain it was applied."""
+    """Innovation of an update, with its covariance, Jacobian and gain."""
 
     residual: FloatArray
     """(m,)"""

@@ -42,7 +42,7 @@ class FilterConfig(Settings):
 
 
 def initial_state(gyro: GyroNoise, corrections: Corrections, config: FilterConfig) -> State:
-    """At the origin of the odometry frame, where the pose and the submap are known exactly."""
+    """State at the origin of the odometry frame: zero covariance of pose and submap, which define it, and priors of the others."""
     one, unknown = Vector(1), np.zeros((1, 1))
     priors: dict[str, tuple[Group, FloatArray]] = {
         "pose": (SE2, np.zeros((3, 3))),

@@ -38,7 +38,7 @@ class PoseInSpace:
 
 SE3 = PoseInSpace()
 _LIFT = np.zeros((6, 3))
-"""From planar tangents (x, y, yaw) to those of SE(3)."""
+"""Matrix from planar tangents (x, y, yaw) to tangents of SE(3) (translation, rotation)."""
 _LIFT[[0, 1, 5], [0, 1, 2]] = 1.0
 _RATE_WITHOUT_GYRO = 0.5
 """Sigma of roll and pitch rates of a robot on hills, which the gyro measures [rad/s]."""
@@ -59,7 +59,7 @@ class SpaceConfig(Settings):
 
 
 def initial_space_state(gyro: GyroNoise, bias_sigma: float, config: SpaceConfig) -> State:
-    """At the origin of the odometry frame, level within 10 degrees; ``bias_sigma`` of the gyro's axes across the vertical [rad/s]."""
+    """State at the odometry origin, level within 10 deg (1 sigma); ``bias_sigma``: gyro axes across the vertical [rad/s]."""
     groups: dict[str, Group] = {"pose": SE3, "start": SE3, "map": Perturbation(6, "pose"), "gyro_bias": Vector(3)}
     layout = Layout({**groups, "gyro_scale": Vector(1), "accelerometer": Vector(3)})
     n = sum(group.dim for group in layout.groups.values())

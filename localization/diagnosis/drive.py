@@ -73,7 +73,7 @@ class Drive:
     robot: Robot
     maneuvers: tuple[Maneuver, ...]
     motion_reference: str
-    """What measured the motion, in words."""
+    """Name of the motion reference, for messages."""
     kind: str = "log"
     """log, windows, rotations or runs."""
     starts_s: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -92,7 +92,7 @@ class Drive:
     paths: tuple[FloatArray, ...] = ()
     """For runs: (n, 3) path of the controller's odometry in each, a pose at the end of each interval."""
     path_errors: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """For runs: (W,) measured mean distance of the driven path from it [m]."""
+    """For runs: (W,) measured mean distance of the driven path from the path of the controller's odometry [m]."""
     range_slopes: FloatArray | None = None
     """(W, 3) change of the measured motion per metre that is added to all ranges; None where no LiDAR measured it."""
     message_loss: MessageLoss | None = None
@@ -102,11 +102,11 @@ class Drive:
     lidar_frame: str = ""
     """Frame of the scans that were matched."""
     lidar_mount: Mount | None = None
-    """Its mount; None for tables."""
+    """Mount of `lidar_frame`; None for tables."""
     lidar_at: tuple[float, float] = (0.0, 0.0)
-    """Where it sits, by its transform [m]; the body's origin where a reference measured the motion."""
+    """x and y of the LiDAR in the body frame, by its mount [m]; (0, 0) where a reference measured the motion."""
     antenna: tuple[float, float] = (0.0, 0.0)
-    """Where in the body frame positions without headings were measured [m]."""
+    """x and y in the body frame of the antenna, for positions without headings [m]."""
     warnings: tuple[str, ...] = ()
 
     @property

@@ -1,4 +1,4 @@
-"""What a diagnosis returns: its findings, their JSON form, and the same in sentences."""
+"""Result of a diagnosis: findings, their JSON form, and their sentences."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Finding:
 
     @property
     def description(self) -> str:
-        """What it does, with its direction and size in words."""
+        """Effect of the cause, with direction and size, as a clause."""
         return self.definition.describe(self.size)
 
     def to_dict(self) -> dict[str, Any]:
@@ -154,10 +154,10 @@ class Component:
     unit: str
     rms: float
     expected_rms: float
-    """What noise alone makes of it, as estimated from this drive."""
+    """Root mean square by noise alone, as estimated from this drive."""
     p_value: float
     corrected_rms: float
-    """Once everything named is corrected."""
+    """Root mean square after correction of all named causes."""
     unattributed_rms: float
     """Once what is within tolerance is taken off as well."""
     noise_over_reference: float = 1.0
@@ -243,7 +243,7 @@ class HandoverCheck:
     """Share by which the windows' errors shrink, of the components that the file changes, over their noise; 95 % interval over blocks of
     windows."""
     replays: Mapping[str, Replayed] = field(default_factory=dict)
-    """By estimator."""
+    """Replays with the old and the new file, by estimator."""
     corrected: tuple[str, ...] = ()
     """Keys of the findings that the file corrects."""
 
@@ -283,7 +283,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     trends: tuple[Trend, ...]
     left_share: float
-    """How much of what can be predicted of the discrepancy follows such trends, 0 to 1."""
+    """Share of the predictable part of the discrepancy that `trends` explain, 0 to 1."""
     next_drive: str
     sentence: str
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -293,7 +293,7 @@ class Diagnosis:
     detectable_sizes: Mapping[str, float] = field(default_factory=dict)
     """Smallest size of each cause that this drive would show (three sigma, beside all that is tolerated)."""
     gain: Gain | None = None
-    """By all findings together."""
+    """Gain of correcting all findings together."""
     contradictions: tuple[str, ...] = ()
     """Measurements that exclude each other, in sentences."""
     outliers_s: tuple[float, ...] = ()
@@ -305,7 +305,7 @@ class Diagnosis:
     suspected: Finding | None = None
     """Where the verdict is consistent: the strongest cause, too weak to be named, but stronger than four in five healthy drives show."""
     handover: HandoverCheck | None = None
-    """What the corrected robot gains on the second half of the drive."""
+    """Gain of the corrected robot file on the second half of the drive."""
 
     @property
     def is_confirmed(self) -> bool:

@@ -47,14 +47,14 @@ _SENSOR_FIELDS = (
 
 @dataclasses.dataclass
 class Reader:
-    """How the diagnosed log is read with a robot: its drive, and its events."""
+    """Reads the diagnosed log with a given robot: its drive, and its events."""
 
     open: Callable[[Robot], Log]
     """The log as a robot reads it, with its wiring checked."""
     cut: Callable[[Log], Drive]
     """A log's windows."""
     _logs: dict[int, tuple[Robot, Log]] = dataclasses.field(default_factory=dict, init=False, repr=False)
-    """By robot; with the robot, so that its identity stays its own."""
+    """Logs by the robot's `id()`; the robot is stored as well, so that no other object can get the same id."""
     _replayed: dict[tuple[int, str, int], tuple[Robot, list[Run]]] = dataclasses.field(default_factory=dict, init=False, repr=False)
     """Runs by robot, model and start; with the robot as above."""
 

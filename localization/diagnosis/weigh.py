@@ -90,14 +90,14 @@ _WIDENED = "The interval has the errors in it that the model has on other contac
 
 
 class SlopeWeighing(NamedTuple):
-    """What turning on a slope shows."""
+    """Height of the centre of gravity and friction, from turning on a slope."""
 
     steepness_rad: float
     height: float
     """Height of the centre of gravity above the floor [m]."""
     height_sigma: float
     given_height: float
-    """By the robot file [m]."""
+    """Height by the robot file [m]."""
     mu: float
     """Friction of this floor."""
     mu_sigma: float
@@ -105,12 +105,12 @@ class SlopeWeighing(NamedTuple):
 
 
 class Nuisance(NamedTuple):
-    """What else could turn the robot as a load does, as it was estimated with the CG."""
+    """A parameter that turns the robot as a load does, estimated jointly with the CG."""
 
     size: float
     sigma: float
     prior_sigma: float
-    """How far robots, floors and mounts differ from their files."""
+    """Standard deviation of the prior, around the robot file's value."""
     unit: str
     """Unit of all three; "1" for a share."""
 
@@ -124,7 +124,7 @@ class DrivenWeighing:
     motion_reference: str
     windows: int
     turned_rad: float
-    """By the difference of the wheels over the track width, both directions added."""
+    """Angle turned, the sum of both directions, by the wheels' difference over the track width [rad]."""
     given: FloatArray
     """(2,) CG by robot file and arms, mean over the drive [m]."""
     offset: FloatArray
@@ -132,16 +132,16 @@ class DrivenWeighing:
     covariance: FloatArray
     """(2, 2) of the offset [m^2]."""
     mass_kg: float
-    """By the robot file."""
+    """Mass by the robot file [kg]."""
     noise_ratio: float
     """Noise of the drive over that of the motion reference by its own covariance."""
     corrections: Mapping[str, Nuisance]
-    """What else was estimated with the CG, by the label of its cause."""
+    """Parameters estimated jointly with the CG, by the label of their cause."""
     model_errors: tuple[str, ...] = ()
     """Why the friction model does not describe this drive, in sentences; the covariance has the errors of such models in it."""
     warnings: tuple[str, ...] = ()
     slope: SlopeWeighing | None = None
-    """What only a slope shows; None on a level floor."""
+    """Estimates that only a slope determines; None on a level floor."""
 
     @property
     def position(self) -> FloatArray:

@@ -56,7 +56,7 @@ class LearnedParameter(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """How far the measurements of the last step are from each other."""
+    """Disagreement of the measurements of the last step, for the sensor checks."""
 
     turn: tuple[float, float] | None
     """Innovation of the gyro by what wheels and all measurements so far predict, and its variance [rad, rad^2]; None without a gyro."""
@@ -69,7 +69,7 @@ class Residuals(NamedTuple):
 
 
 class GyroCalibration(NamedTuple):
-    """What an estimator has learned of the gyro."""
+    """Estimated bias and scale of the gyro."""
 
     bias: float
     """[rad/s]"""

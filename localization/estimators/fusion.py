@@ -45,10 +45,10 @@ _MIN_CLOCK_OFFSET_S = 0.05
 
 @dataclass(frozen=True, eq=False)
 class WheelPrediction:
-    """What the wheels have predicted in the last step."""
+    """Prediction by the wheels in the last step."""
 
     motion: Motion
-    """With its scaled and outlier covariance."""
+    """Predicted motion; its covariance includes the noise scale and outliers."""
     corrections: FloatArray
     """(k,) of the motion model, with which it was predicted."""
     is_turning: bool
@@ -120,7 +120,7 @@ class EkfFusion(Estimator):
         self.state = set_marginal(self.state, "corrections", mean, cov)
 
     def _restart_calibration(self) -> None:
-        """What was learned is as before the first step."""
+        """Reset all calibration variables and the wheel noise to their priors; the pose is kept."""
         prior, self._wheel_noise = initial_state(self._gyro, self.corrections, self._config), WheelNoiseScale()
         for name in ("gyro_bias", "gyro_scale", "clock", "radius", "corrections"):
             self.state = set_marginal(self.state, name, prior[name], prior.cov(name))

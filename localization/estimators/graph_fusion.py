@@ -34,7 +34,7 @@ from motion_models.preintegration import MotionPreintegration, PreintegratedMoti
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _CONSTANT_SHARE = 1e-3
-"""By which corrections that do not change may do so a minute, over the sigma of their prior: less than 1 % of it in an hour. With 1e-6
+"""Random walk in a minute of corrections that are constants, over their prior sigma: less than 1 % of it in an hour. With 1e-6
 GTSAM's Cholesky factors lose positive definiteness."""
 _NO_SIGMA = 1e-4
 """Prior sigma of the wheels' radius where it is not a variable of its own."""
@@ -60,9 +60,9 @@ class GraphConfig(Settings):
     keyframe_angle_rad: Positive = 0.5
     """A keyframe follows when the robot has turned this far [rad]."""
     antenna_x_m: Signed = 0.0
-    """Where the antenna of `--positions` sits, ahead of the body's origin [m]; estimated within half a metre."""
+    """x of the antenna of `--positions` in base_link, ahead [m]: prior mean of the lever arm, with a sigma of 0.5 m."""
     antenna_y_m: Signed = 0.0
-    """Where the antenna of `--positions` sits, to the left of the body's origin [m]; estimated within half a metre."""
+    """y of the antenna of `--positions` in base_link, to the left [m]: prior mean of the lever arm, with a sigma of 0.5 m."""
 
 
 class GraphFusion(FilteredOdometry):
@@ -125,7 +125,7 @@ class GraphFusion(FilteredOdometry):
         return odometry_cov.copy() if is_bound and is_smaller else cov
 
     def run_deferred(self) -> None:
-        """What the last estimate need not wait for: the submap, a keyframe, loops, positions."""
+        """Do what was deferred until the estimate was published: update the submap, add a keyframe, close loops, add positions."""
         self.odometry.run_deferred()
         if self._is_keyframe_due:
             self._is_keyframe_due = False

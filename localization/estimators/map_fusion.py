@@ -94,7 +94,7 @@ class MapFusion(FilteredOdometry):
         )
 
     def run_deferred(self) -> None:
-        """What the last estimate need not wait for: the submap, and the place in the map."""
+        """Do what was deferred until the estimate was published: update the submap, and localize the keyframe in the map."""
         self.odometry.run_deferred()
         passed_s, self._waiting_s = self._waiting_s, 0.0
         if self.localizer.advance(passed_s):
@@ -151,7 +151,7 @@ class MapFusion(FilteredOdometry):
         self._take_pose()
 
     def relocalize(self) -> None:
-        """Forget the place in the map, and search all of it. Odometry goes on."""
+        """Discard the pose in the map, and search the whole map. Odometry continues."""
         self.localizer.search_everywhere()
         self._take_pose()
 

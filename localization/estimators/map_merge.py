@@ -4,6 +4,7 @@ ties them to it."""
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,7 +108,7 @@ def _join(
 ) -> KeyframeMap:
     """Both as one, tied by ``closures`` to the nearest keyframes of the first."""
     n = len(first.poses)
-    nearest = [int(np.argmin(np.hypot(*(first.poses[:, :2] - pose[:2]).T))) for pose, _ in closures.values()]
+    nearest = _nearest(first, [pose for pose, _ in closures.values()])
     ties = np.array([se2.between(first.poses[j], pose) for j, (pose, _) in zip(nearest, closures.values(), strict=True)]).reshape(-1, 3)
     information = np.array([np.linalg.inv(cov) for _, cov in closures.values()]).reshape(-1, 3, 3)
     map_covs = [_at(first.poses[j], first.covariances[j], pose) for j, pose in zip(_nearest(first, poses), poses, strict=True)]
@@ -134,7 +135,8 @@ def _new_keyframes(places: PlaceMap, second: KeyframeMap, poses: FloatArray) -> 
     return np.array([k for k, scan in enumerate(second.scans()) if adds_to(places, changes, poses[k], scan)], dtype=np.int64)
 
 
-def _nearest(mapped: KeyframeMap, poses: FloatArray) -> list[int]:
+def _nearest(mapped: KeyframeMap, poses: Iterable[Pose2]) -> list[int]:
+    """Index of the keyframe of ``mapped`` nearest to each of ``poses`` (3,)."""
     return [int(np.argmin(np.hypot(*(mapped.poses[:, :2] - pose[:2]).T))) for pose in poses]
 
 

@@ -35,7 +35,7 @@ _CAUCHY = 1.0
 _HUBER = 1.345
 """Scale of the robust loss of wheels and positions [sigma]: 95 % efficiency on Gaussian noise (Huber 1981)."""
 LEVER_SIGMA_M = 0.5
-"""Where the antenna may be, away from the given lever arm [m]."""
+"""Prior sigma of the antenna's lever arm around the given one, along each axis [m]: half of a robot's length."""
 _ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
 _RELINEARIZE = 0.01
 """Change of a variable from which its factors are linearized anew [m, rad]. With GTSAM's 0.1 a loop that closes 0.15 m keeps the weight
@@ -72,7 +72,7 @@ class PositionMeasurement:
 
 @dataclass(frozen=True)
 class GraphUpdate:
-    """What enters the graph at once. Replayed in order, updates give the same graph to the last bit."""
+    """New variables and factors of one update. The same updates in the same order give the same graph to the last bit."""
 
     pose: Pose2 | None = None
     """(3,) initial value of the next keyframe, if there is one."""

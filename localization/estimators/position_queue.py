@@ -21,7 +21,7 @@ class PositionQueue:
     """Positions that wait until the odometry has come to their stamps."""
 
     n_late: int = 0
-    """Those of before the step in which they came."""
+    """Positions that were dropped because their stamp is before the present step."""
     _waiting: list[PositionSample] = field(default_factory=list)
 
     def add(self, sample: PositionSample) -> None:
@@ -29,7 +29,8 @@ class PositionQueue:
         self._waiting.append(sample)
 
     def take(self, step: Step, has_keyframe: bool) -> Iterator[tuple[PositionSample, float]]:
-        """Those in ``step``, with the share of it until their stamp; what is older is left out, and all before there is a keyframe."""
+        """Positions stamped within ``step``, each with the fraction of the step at its stamp (0 to 1). Older ones, and all before the first
+        keyframe, are dropped."""
         while self._waiting and self._waiting[0].stamp_ns <= step.end_ns:
             sample = self._waiting.pop(0)
             if not has_keyframe:
@@ -40,7 +41,7 @@ class PositionQueue:
             yield sample, (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
 
     def warnings(self, n_used: int, n_unused: int) -> list[str]:
-        """What could not be used: all, with ``n_unused`` taken in vain and ``n_used`` in the graph, and late ones."""
+        """Warnings about positions without effect: all of them if ``n_used`` is 0 (``n_unused`` were taken, others wait), and late ones."""
         found, n = [], n_unused + len(self._waiting)
         if n and not n_used:
             needed = f"it takes {MIN_POSITIONS} over {MIN_BASELINE_M:g} m to give the map its heading"

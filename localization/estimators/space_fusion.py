@@ -203,7 +203,7 @@ class SpaceFusion(Estimator):
         return {**self._counts, **self._lost.causes}
 
     def warnings(self) -> list[str]:
-        """What is missing for poses in space, and the remedy."""
+        """Warnings about inputs that poses in space need and that are missing, with the remedy."""
         if not self._has_vertical:
             return [
                 "poses in space need the vertical, and no IMU with an accelerometer and a known mount has measured gravity: no cloud was "
@@ -217,7 +217,7 @@ class SpaceFusion(Estimator):
         return []
 
     def map_points(self) -> Points2:
-        """(M, 2) points of the map seen from above [m]."""
+        """(M, 2) points of the map projected to the plane [m]."""
         return NO_POINTS if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
 
 

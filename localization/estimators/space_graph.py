@@ -33,7 +33,7 @@ _FIRST_POSITION_M, _FIRST_HEADING, _FIRST_TILT = 1e-3, 1e-4, 0.2
 """Sigmas of the first keyframe, which is the origin of the map [m, rad]; gravity measures its roll and pitch."""
 _CORRECTIONS, _BIAS, _ALIGNMENT, _LEVER = (gtsam.symbol(name, 0) for name in "catl")
 _ALIGNMENT_SIGMA, _ANTENNA_HEIGHT_SIGMA_M = 1e3, 1.0
-"""Of x, y, z and yaw of the map among the positions [m, rad]; and of the antenna's height above the ground, around zero."""
+"""Prior sigmas of ``enu_T_map`` (x, y, z, yaw) [m, rad], and of the antenna's height above base_link around its given value [m]."""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ _NO_SIGMA = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class SpaceSmoothing:
-    """What a `SpaceGraphFusion` needs beside its filter."""
+    """Settings of a `SpaceGraphFusion`, without its filter."""
 
     corrections: Corrections
     track_m: float
@@ -137,7 +137,7 @@ class SpaceGraphFusion(Estimator):
         self.odometry.run_deferred()
 
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
-        """The smoothed trajectory seen from above, at the stamps of ``filtered``; None unless smoothing, or with one keyframe."""
+        """The smoothed trajectory projected to the plane, at the stamps of ``filtered``; None unless smoothing, or with one keyframe."""
         self.run_deferred()
         if not self._is_smoothing or filtered is None or len(self._nodes) < 2:
             return None
@@ -197,7 +197,7 @@ class SpaceGraphFusion(Estimator):
         return self.odometry.parameters()
 
     def counts(self) -> Mapping[str, int]:
-        """Those of the filter, and the keyframes."""
+        """Counts of the filter, of keyframes and of positions in the graph."""
         found = {**self.odometry.counts(), "keyframes": len(self.graph.poses)}
         return {**found, "positions": self._n_positions} if self._n_positions else found
 
@@ -207,7 +207,7 @@ class SpaceGraphFusion(Estimator):
         return 0 if self.graph.alignment is None else len(self.graph.positions)
 
     def warnings(self) -> list[str]:
-        """Those of the filter, whether smoothing failed, and positions that could not be used."""
+        """Warnings of the filter, of a failed smoothing, and of positions that could not be used."""
         found = [*self.odometry.warnings(), *([self._failure] if self._failure else [])]
         return found + self._queue.warnings(self._n_positions, len(self.graph.positions) - self._n_positions)
 

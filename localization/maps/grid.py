@@ -26,7 +26,7 @@ _MARGIN_CELLS = 4
 _REDRAWN_CELLS = 0.5
 """A growing grid is drawn anew where a keyframe has moved by more [cells]."""
 _BLOCK_M = 10.0
-"""It grows by blocks of this side [m]."""
+"""Side of the blocks by which a growing grid is extended [m]."""
 _MAX_CELLS = 100_000_000
 """A square of 500 m at 0.05 m; its arrays take 1.7 GB."""
 
@@ -86,7 +86,7 @@ class GrowingGrid:
         self._clear()
 
     def __getstate__(self) -> dict[str, Any]:
-        """It is drawn from the keyframes again."""
+        """Settings alone: the cells are drawn again from the keyframes."""
         return {"resolution": self._resolution, "max_cells": self._max_cells}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

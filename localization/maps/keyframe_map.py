@@ -39,7 +39,7 @@ class KeyframeMap:
     edge_is_loop: NDArray[np.bool_]
     """(E,) whether it is a loop closure."""
     plane: PositionPlane | None = None
-    """Where the map is in the plane of the positions that were fused; None without such."""
+    """Pose of the map in the plane of the fused positions; None without positions."""
 
     def scans(self) -> list[Points2]:
         """The points (n, 2) of each keyframe in its body frame [m]."""

@@ -16,7 +16,7 @@ from motion_models.se2 import Cov3, FloatArray, Pose2
 MAX_SEARCH_ODDS = 5.0
 """Log-odds of a search, at most."""
 _RIVALRY = 20.0
-"""By which the probability of a place falls with its score: a place that scores 0.11 less than the best is one tenth as probable."""
+"""Decay of a place's probability with its score, exp(-20 (best - score)): 0.11 below the best it is one tenth as probable."""
 _MAX_MARGIN, _POINTS = 0.5, 200.0
 _MAX_NEAR_MARGIN = 0.3
 """Margin over the next place, at most, of a search that is narrowed: its window leaves out rivals."""

@@ -1,4 +1,4 @@
-"""Where a map is in the plane of measured positions, as east and north of a GNSS receiver: by the positions that its drive fused."""
+"""Pose of a map in the plane of measured positions (east and north of a GNSS receiver), from the positions that its drive fused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from motion_models.se2 import Cov3, FloatArray, Pose2
 
 
 class PositionFix(NamedTuple):
-    """Where the robot's origin is in a map, by a measured position alone."""
+    """Position of the robot's origin in a map, from one measured position."""
 
     position: FloatArray
     """(2,) [m]."""
@@ -59,7 +59,7 @@ class PositionPlane:
         return PositionFix(q, R.T @ cov @ R + by_plane @ self.covariance @ by_plane.T + 0.5 * (self.antenna @ self.antenna) * np.eye(2))
 
     def as_json(self) -> dict[str, Any]:
-        """As a map file holds it."""
+        """JSON form, as stored in map files."""
         arrays = {name: getattr(self, name).tolist() for name in _SHAPES}
         return {**arrays, "origin": None if self.origin is None else list(self.origin)}
 

@@ -80,7 +80,7 @@ class RecentScans:
         return self._way_m - self._keys[0].way_m if self._keys else 0.0
 
     def clear(self) -> None:
-        """Forget all scans: those to come do not belong together with them."""
+        """Discard all scans: the odometry does not connect them with later ones."""
         self._keys.clear()
 
     def move(self, motion: RecentMotion, points: Points2) -> RecentMotion:

@@ -14,7 +14,7 @@ MEMORY_S = 3.0
 """A sensor is left out while most comparisons of the last seconds contradict it. Signs and units are never off by chance for so long
 (Husky, ACES, fr079, CSAIL: one of 8,964 comparisons)."""
 _MIN_CONTRADICTING = 2.0 / 3.0
-"""At least this share of them."""
+"""Share of the comparisons in `MEMORY_S` that contradict a sensor, from which on it is left out."""
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
 _NS = 1e-9
@@ -24,11 +24,11 @@ class SensorFault(NamedTuple):
     """A kind of fault; each check has its own."""
 
     message: str
-    """What is wrong, and what to do, with places for numbers."""
+    """Template of the warning: fault and remedy, with format fields for numbers."""
     reference: DeadReckoning | None = None
-    """Its sensors are right: the estimate's distance from it inflates the covariance when the fault is found."""
+    """Dead reckoning by sensors without this fault: its distance from the estimate inflates the covariance when the fault is found."""
     is_of_scans: bool = False
-    """Its scans have led the estimate, which is led back to ``reference``."""
+    """Whether the fault is one of scans, which have moved the estimate: it is then moved back to ``reference``."""
     explains: SensorFault | None = None
     """A fault that is no longer reported where this one is."""
 
@@ -39,7 +39,7 @@ class DetectedFault:
 
     fault: SensorFault
     at_s: float
-    """After the first step [s]."""
+    """Time of the fault since the first step [s]."""
     message: str
 
 
@@ -58,7 +58,7 @@ class FaultLog:
         self._revised: dict[SensorFault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
-        """What is declared from now on is of ``step``."""
+        """Begin ``step``: faults declared from now on have its time."""
         if self._start_ns is None:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
         self.now_s, self.has_left_scans_out = (step.end_ns - self._start_ns) * _NS, False
@@ -98,7 +98,7 @@ class FaultLog:
 
 
 class Evidence:
-    """What the comparisons of the last ``memory_s`` [s] show of one fault."""
+    """Comparisons of the last ``memory_s`` [s] that confirm or contradict one fault."""
 
     def __init__(self, memory_s: float = MEMORY_S) -> None:
         self._memory_s = memory_s

@@ -61,14 +61,14 @@ class InnovationWindow(NamedTuple):
     """The innovations of the last seconds."""
 
     bins: list[Bin]
-    """That before the window, and those in it."""
+    """The last bin before the window, then those in it."""
     seconds: float
     innovation: float
     """Their sum [rad, m]."""
     sigmas: float
 
     def explain(self, pair: Pair, causes: Causes) -> tuple[int, str]:
-        """What takes away most of the innovations' chi-square, of the ``causes`` of a ``pair``, and its sentence."""
+        """Index and sentence of the one of ``causes`` of a ``pair`` that reduces the innovations' chi-square most."""
         rows = np.array([(b.innovation, b.variance, b.seconds) for b in self.bins])
         innovation, variance, _ = np.diff(rows, axis=0).T
         X = np.array([b.regressors for b in self.bins[1:]])
@@ -120,7 +120,7 @@ class InnovationWindows:
         return True
 
     def worst(self) -> InnovationWindow | None:
-        """That of the windows that end now whose sum is farthest from zero, in sigmas; None before the first is full."""
+        """The window ending now whose sum of innovations is farthest from zero, in sigmas; None before the shortest window is full."""
         bins, last, worst = list(self.bins), self.bins[-1], None
         for seconds in WINDOWS_S:
             before = max(bisect.bisect_right(bins, last.end_s - seconds, key=_END_S) - 1, 0)

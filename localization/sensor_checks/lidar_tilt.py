@@ -1,4 +1,4 @@
-"""How a 3D LiDAR stands on the ground, by the ground in its clouds.
+"""Roll and pitch of a 3D LiDAR against the ground in its clouds.
 
 Nothing is left out: clouds are matched as if upright, and a tilted mount or a body that sways is reported.
 """

@@ -37,7 +37,7 @@ _MAX_WAY_M, _MAX_TURN_RAD = 0.6, 0.6
 _MIN_MOVED = 0.12
 """Share of a scan on objects that move, from where on they are left out. Healthy drives: at most .09 (fr079), .17 once in ACES."""
 _MIN_MOVED_WITHOUT_GYRO = 0.2
-"""That share for a robot whose wheels alone measure its turns."""
+"""`_MIN_MOVED` for robots without a gyro."""
 _MIN_UNSURE = 0.06
 """Share of a scan on objects that move, from where on it is not sure that the scene is still."""
 _MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
@@ -74,11 +74,11 @@ class _View(NamedTuple):
 
 @dataclass
 class _Lidar:
-    """What one LiDAR has measured."""
+    """Past views of one LiDAR, and evidence of moving objects in them."""
 
     views: deque[_View] = field(default_factory=lambda: deque(maxlen=_MAX_VIEWS))
     standing: _View | None = None
-    """The first since the wheels stand."""
+    """First view since the wheels stopped; None while they turn."""
     shown: int = 0
     """Successive comparisons that showed moving objects."""
     last_s: float = -math.inf
@@ -105,7 +105,7 @@ class MovingObjects(SensorCheck):
         self._next_view: tuple[_Lidar, float, Profile, bool] | None = None
         """LiDAR, time [s] and profile of the last scan, and whether the robot stood: a view once the pose at its step's end is known."""
         self._compared: _View | None = None
-        """With which the last scan was compared."""
+        """View that the last scan was compared with."""
         self._is_unsure = False
         """Objects may move, or the wheels slip."""
         self._suspected: FloatArray | None = None

@@ -1,4 +1,4 @@
-"""What a check may do: the base class of all."""
+"""Base class of the sensor checks."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class _Episode(NamedTuple):
 
 
 class _Reported(NamedTuple):
-    """What was reported of a fault."""
+    """A reported fault: its begin and significance."""
 
     begin_s: float
     sigmas: float

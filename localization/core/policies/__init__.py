@@ -1,1 +1,1 @@
-"""What is not nominal in a step: small objects with a state of their own, used before or after the straight line of the filter."""
+"""Exceptions from the nominal filter step (slip, outliers, open directions, no excitation), one stateful object each."""

@@ -57,7 +57,7 @@ class SweepSlip:
 
 
 class SlipChanges:
-    """How much of the wheels' noise is white, along each axis, by the slip of successive scans.
+    """Share of the wheels' noise that is white, along each axis, from the slip of successive scans.
 
     Slip that lasts is in the twist that a sweep is deskewed with. White slip is not: it bends the scan.
     """

@@ -223,17 +223,17 @@ class Cause:
     negligible: float
     """Smaller sizes are within the accuracy of robot files, mounts and clocks: they are tolerated."""
     inject: Callable[[Hypothesis, float], Hypothesis] = field(repr=False)
-    """What it changes: the hypothesis with a size of this cause added."""
+    """Effect of the cause: returns the hypothesis with a size of this cause added."""
     words: tuple[str, str]
-    """What the robot does at a positive and at a negative size; {} stands for the magnitude with its unit."""
+    """Effect on the robot in words, at a positive and at a negative size; {} is replaced by the magnitude with its unit."""
     correct: Callable[[CorrectionDraft, float], CorrectionDraft] | None = field(default=None, repr=False)
     """Writes a size into a robot file; None where only the models' coefficients hold it, which are matched to the motion."""
     remedy: str = OTHER_REMEDY
-    """What to do; ``{g}`` is the corrected robot's geometry and ``{c}`` its clock."""
+    """Remedy in words; ``{g}`` is replaced by the corrected robot's geometry and ``{c}`` by its clock."""
     applies: Callable[[Setting], bool] = field(default=_always, repr=False)
     """Whether a drive can show it."""
     by_skidding: bool = False
-    """It acts by the friction of wheels that skid: no cause of a robot with casters."""
+    """Whether the cause acts by friction of skidding wheels, and so not on robots with casters."""
     is_shown_by_headings: bool = False
     """Headings alone show it; how far a robot turns has many physical reasons that only positions separate."""
     variants: Callable[[Cause, Setting], tuple[Cause, ...]] = field(default=_itself, repr=False)
@@ -244,15 +244,15 @@ class Cause:
     is_clock: bool = False
     """It shifts samples in time, between which rates have kinks: signatures are differenced to both sides, over a larger step."""
     at_s: float | None = None
-    """For a change: when."""
+    """Time of the change [s]; None for causes of the whole drive."""
     prior_sigma: float = 0.0
-    """How large the size may plausibly be, as a standard deviation; 0 for four times the typical size."""
+    """Standard deviation of the prior of the size; 0 for four times the typical size."""
     limits: tuple[float, float] = (-math.inf, math.inf)
     """Sizes beyond these are not considered, where that is not the same to both sides (see `bounds`)."""
     largest_share: float = 0.0
     """Magnitude beyond which another cause is more likely, where that is not by ``prior_sigma``; 0: by that."""
     axis: str = ""
-    """Where two causes have one id: its axis, in words."""
+    """Axis in words, where two causes share one id."""
     spell: Spell | None = None
     """Part of the drive in which it holds; None for the whole."""
     spell_95: tuple[tuple[float, float], tuple[float, float]] | None = None
