@@ -42,8 +42,10 @@ _FREE_BORDER_CELLS = 2
 beams, are free cells in part: in a corridor of ACES that the map had from its end, 0.29 of the points of the right place lay in such."""
 _SEARCH_POINTS = 150
 """Points of a search: what is aligned afterwards has all."""
-_UNKNOWN_SCORE = 0.4
-"""What a point in unknown space counts, where one on a wall counts 1 and one in free space 0."""
+_UNKNOWN_SCORE, _FREE_SCORE = 0.4, -0.4
+"""What a point in unknown space and one in free space count, where one on a wall counts 1. With 0 in free space, 6 of 12 and 5 of 10 best
+places were right where half of the points are unmapped (fr079, ACES), with -0.4 8 and 6; with -0.8, as `Place.score` has it, 9 and 1:
+walls that a map has by few beams have free cells."""
 _WIDTHS, _SHIFTS = (1, 2, 5, 11), (0.0, 0.5, 2.0, 5.0)
 """Cells that a point can reach from the poses of a block of 1, 2, 4 and 8 cells, and how many of them lie before the cell that it reaches
 from its middle: as many as the block has, and one for the two headings of the third, three for the four of the last, which are a cell
@@ -55,9 +57,9 @@ _SHARE_OF_BEST = 0.85
 _APART_M, _APART_RAD = 0.6, 0.3
 """Poses nearer than both are one place."""
 _MAX_PLACES = 12
-_SEARCH_S, _SEARCH_S_PER_BLOCK = 0.2, 2e-4
-"""Time that a search beside the estimates is given, and for each block of free space [s]: 0.13 to 0.27 ms of CPU are measured for each, on
-six maps and a machine with nine processes on two cores."""
+_SEARCH_S, _SEARCH_S_PER_BLOCK = 0.2, 1.2e-4
+"""Time that a search beside the estimates is given, and for each block of free space [s]: 0.08 and 0.10 ms of CPU are the medians
+of each in fr079 and ACES, 0.19 the most, on a machine with seven processes on two cores."""
 _BLOCK_M, _PADDING = _BLOCK * CELL_M, max(_WIDTHS)
 _NEAR = math.exp(-0.5 * 1.5**2)
 """Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
@@ -139,7 +141,7 @@ class PlaceMap:
         x, y = (self._walls.origin[0] + CELL_M * (np.arange(rows) + 0.5), self._walls.origin[1] + CELL_M * (np.arange(columns) + 0.5))
         centres = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
         is_free = self._grid_values(centres).reshape(rows, columns) == 0
-        scores = np.maximum(fine, np.where(is_free, 0.0, _UNKNOWN_SCORE).astype(fine.dtype))
+        scores = np.where(is_free, np.where(fine > 0.0, fine, _FREE_SCORE), np.maximum(fine, _UNKNOWN_SCORE)).astype(fine.dtype)
         scores = np.pad(scores, _PADDING, constant_values=_UNKNOWN_SCORE)
         return tuple(ndimage.maximum_filter(scores, width, origin=-(width // 2), mode="nearest") for width in _WIDTHS)
 
@@ -178,6 +180,8 @@ class PlaceMap:
         if not len(starts) or not len(turns):
             return []
         poses, scores = self._branch_and_bound(np.ascontiguousarray(turned / CELL_M + _PADDING), starts, turns)
+        if not len(scores):
+            return []
         found = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
         places = [self.align(points, pose) for pose in _distinct(found, scores)]
         return sorted(places, key=lambda place: -place.score)
