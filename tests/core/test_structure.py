@@ -18,7 +18,7 @@ TARGETS = {"functions": 80, "calls a step": 250, "lines of their files": 3_500}
 
 
 def trace():
-    """Of a drive with scans and wheels: in how many steps each code object is called, number of calls in all, and of steps."""
+    """Number of steps in which each code object is called, number of all calls, and number of steps, on a drive with scans and wheels."""
     drive = BUILDINGS["csail"].open().until(30.0)
     pipeline = Pipeline(Trial(make_model("diff_drive", drive.robot), "ekf"), drive.robot, drive.mounts, True)
     steps_with, in_step, n_calls, n_steps = Counter(), set(), 0, -WARM_UP_STEPS
