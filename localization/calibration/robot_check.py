@@ -351,7 +351,8 @@ def _filter_rows(log: Log, run: Run | None) -> list[CheckRow]:
         rows.append(CheckRow("clock of wheels", "0", clock, "cannot be seen", "start, stop and turn quickly a few times."))
     else:
         is_same = abs(offset) <= max(_MAX_CLOCK_S, _SIGMAS * sigma)
-        advice = "" if is_same else f"write clock.wheel_time_offset_s = {offset:.3f}, or let its driver stamp the time of measurement."
+        other = "" if log.sources.lidar and log.sources.imu else f" or clock.{source.lower()}_time_offset_s = {-offset:.3f}"
+        advice = "" if is_same else f"write clock.wheel_time_offset_s = {offset:.3f}{other}, or let drivers stamp the time of measurement."
         rows.append(CheckRow("clock of wheels", "0", clock, "ok" if is_same else "contradiction", advice))
     return rows
 

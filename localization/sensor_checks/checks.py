@@ -10,6 +10,7 @@ import numpy as np
 from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
+from localization.sensor_checks.clocks import ClockCheck
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
@@ -51,6 +52,7 @@ class SensorChecks:
         self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
         self._watching = tuple(check for check in self._applying if not check.is_of_declared_faults)
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
+        self._clocks = ClockCheck(faults)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None
@@ -97,6 +99,7 @@ class SensorChecks:
         residuals, step = estimator.residuals, self._step
         if step is None or residuals is None:
             return
+        self._clocks.add(step, estimator)
         if step.scan is not None:
             self._is_lidar_placed = step.scan.frame_id in self._mounts
         self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)

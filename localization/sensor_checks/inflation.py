@@ -37,6 +37,9 @@ class CovarianceInflation:
         self.possible: FloatArray | None = None
         """(3,) the same while that is not decided: no fault yet."""
 
+        self.late_s = 0.0
+        """By how much the clock of the poses may be off [s]."""
+
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
         self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -93,6 +96,8 @@ class CovarianceInflation:
             A = se2.adjoint(se2.inverse(delta))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
+        if self.late_s and estimate.twist is not None:
+            estimate = _widen(estimate, np.outer(estimate.twist, estimate.twist) * self.late_s**2)
         if estimate.covariance is not None and self.possible is not None:
             estimate = _widen(estimate, np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from localization.sensor_checks.clocks import CLOCKS_APART
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
@@ -86,9 +87,9 @@ _OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_STANDING)
 _OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)
 _OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION, REVERSED_TIMES)
 NAMED: Mapping[Pair, tuple[SensorFault, ...]] = {
-    GYRO_WHEELS: (*_OF_GYRO, *_OF_WHEELS),
+    GYRO_WHEELS: (*_OF_GYRO, *_OF_WHEELS, CLOCKS_APART),
     LIDAR_GYRO: (*_OF_GYRO, *_OF_LIDAR),
-    LIDAR_WHEELS_TURNS: (*_OF_WHEELS, *_OF_LIDAR),
-    LIDAR_WHEELS_WAYS: (*_OF_WHEELS, *_OF_LIDAR),
+    LIDAR_WHEELS_TURNS: (*_OF_WHEELS, *_OF_LIDAR, CLOCKS_APART),
+    LIDAR_WHEELS_WAYS: (*_OF_WHEELS, *_OF_LIDAR, CLOCKS_APART),
 }
 """Faults with a check of their own that explain why a pair differs."""
