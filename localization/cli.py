@@ -27,7 +27,7 @@ _DEFECT = 70
 _INTERRUPTED = 130
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
-    "info": ("Info", "Show what a log holds and what would be used of it."),
+    "info": ("Info", "List the topics of a log and what each is used for."),
     "replay": ("Replay", "Run motion models and estimators over a log and score their trajectories."),
     "compare": ("Compare", "Compare motion models and estimators over many logs."),
     "table": (
@@ -38,10 +38,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
     "weigh": ("Weigh", "Estimate the centre of gravity and an unknown load from how the robot turns."),
     "init": ("Init", "Write a robot file for a new robot from a log and a URDF."),
-    "check": ("Check", "Check whether a robot is wired and described right, by a minute of driving."),
-    "robots": ("Robots", "List the robots that are shipped, with the source of every number."),
+    "check": ("Check", "Check signs, units, clocks and mounts of a robot file against a minute of driving."),
+    "robots": ("Robots", "List the shipped robots, with the source of every number."),
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
-    "map": ("Map", "Show a saved map, in words or in a browser, export it for planners and viewers, or join two."),
+    "map": ("Map", "Print, view or export a saved map, or merge two."),
     "online": ("OnlineCommand", "Run the estimator live on ROS topics, or on a log as it was recorded."),
     "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),
 }

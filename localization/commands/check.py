@@ -29,7 +29,7 @@ _COLOURS = {"ok": "green", "contradiction": "red", "cannot be seen": "yellow"}
 
 @dataclass(frozen=True)
 class Check:
-    """Check whether a robot is wired and described right, by a minute of driving.
+    """Check signs, units, clocks and mounts of a robot file against a minute of driving.
 
     Topics, clocks, signs, units, sides, radius, track, multiplier, mounts, IMU axes and reference: each with a second source and a verdict.
     """

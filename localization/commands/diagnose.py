@@ -90,7 +90,7 @@ class Diagnose:
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write what is printed to this file as well."""
     static: bool = False
-    """Write a report without scripts: smaller by 1.2 MB, with figures as on paper."""
+    """Write a report without scripts, smaller by 1.2 MB, with static figures."""
 
     def run(self, console: Console) -> None:
         """Run the command, with output on ``console``."""

@@ -1,4 +1,4 @@
-"""`skidloc info`: what is in a log, what would be used of it, and what is missing or suspect."""
+"""`skidloc info`: topics of a log, what each is used for, and what is missing or inconsistent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from motion_models.robot_file import load_robot
 
 @dataclass(frozen=True)
 class Info:
-    """Show what a log holds and what would be used of it."""
+    """List the topics of a log and what each is used for."""
 
     log: tyro.conf.Positional[Path]
     """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""

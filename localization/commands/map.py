@@ -109,7 +109,7 @@ class MapMerge:
 
 @dataclass(frozen=True)
 class Map:
-    """Show a saved map, in words or in a browser, export it for planners and viewers, or join two."""
+    """Print, view or export a saved map, or merge two."""
 
     action: tyro.conf.OmitSubcommandPrefixes[
         Annotated[MapInfo, tyro.conf.subcommand("info")]

@@ -73,32 +73,33 @@ class Replay:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     out: Path
-    """New folder for metrics.json, report.html, overview.png, trajectories (TUM) and fused.mcap; its /tf is of the last pair."""
+    """New folder for metrics.json, report.html, overview.png, trajectories (TUM) and fused.mcap, in which /tf is
+    that of the last model and estimator."""
     model: str = "diff_drive,skid_steer"
     """Motion models, separated by commas."""
     estimator: str = "odometry,lidar,ekf"
     """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
     corrections: str = "constant"
-    """What ekf and graph estimate of the motion model, forms separated by commas: none, constant (k and centre of rotation as slowly
-    changing constants), cg_field (their regressions on the centre of gravity, kept from posture to posture), or single ones by name,
-    joined by + (the friction model's: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y; as constant+cg_offset_x)."""
+    """Parameters of the motion model that ekf and graph estimate, one or more forms separated by commas: none; constant (k and centre
+    of rotation, as random walks); cg_field (coefficients of both as functions of the centre of gravity); or parameters by name joined
+    by +, such as constant+cg_offset_x (friction model: mu_ratio, tracked_x, tracked_y, warp, cg_offset_x, cg_offset_y)."""
     reference: str | None = None
-    """Topic of the log, or file (TUM, EuRoC, KITTI, CSV with a header, g2o, GPX, NMEA, .relations), to score against; `none` for no
-    score. Default: the robot file's topic, if any."""
+    """Topic of the log, or file (TUM, EuRoC, KITTI, CSV with a header, g2o, GPX, NMEA, .relations), to score against; `none`: no
+    reference. Default: the reference topic of the robot file, if any."""
     reference_sigma: tuple[float, float] | None = None
-    """Noise of the poses of a reference without covariances [m, deg], as 0.02 0.5: without it the NEES assumes an exact reference."""
+    """Sigmas of position and heading of a reference without covariances [m, deg], such as 0.02 0.5; default: an exact reference."""
     positions: str | None = None
-    """Topic of positions (NavSatFix, poses) that `graph` is to fuse, as GPS: `/fix`; in a `--map` that was built with them they narrow
-    the search. The lever arm of the antenna is
-    --config.estimator.graph.antenna-x-m and -y-m. If they are the reference as well, every second one is fused, and the others score."""
+    """Topic of positions (NavSatFix or poses) that `graph` fuses, such as `/fix`; with a `--map` that was built with positions, they
+    narrow the search. The antenna's lever arm is set by --config.estimator.graph.antenna-x-m and -y-m. If the topic is the reference as
+    well, every second position is fused, and the others are the reference."""
     map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """Map of an earlier drive, by `--save-map`: the estimator `map` is added, whose poses are in that map's frame."""
+    """Map saved by `--save-map`. Adds the estimator `map`, which localizes in it; its poses are in the frame of that map."""
     initial_pose: tuple[float, float, float] | None = None
-    """About where the drive begins in `--map` [m, m, deg], as 3.5 -1.2 90; without it the whole map is searched."""
+    """Approximate first pose in `--map` [m, m, deg], such as 3.5 -1.2 90; without it the whole map is searched."""
     save_map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """New file for the map of the last `graph` pair: `office.skidmap`. `skidloc map` shows and exports it."""
+    """New file for the map of the last `graph` run, such as `office.skidmap`. `skidloc map` shows and exports it."""
     extend_map: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """New file for `--map` with what this drive has found new or changed in it. The map itself stays as it is."""
+    """New file for `--map` extended by the keyframes of this drive that add to it or change it. The file of `--map` is not changed."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: ReplayConfig = field(default_factory=ReplayConfig)
     timing: bool = False
@@ -106,7 +107,7 @@ class Replay:
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a copy of metrics.json to this file as well."""
     static: bool = False
-    """Write a report without scripts: smaller by 1.2 MB, with figures as on paper."""
+    """Write a report without scripts, smaller by 1.2 MB, with static figures."""
 
     def run(self, console: Console) -> None:
         """Run the command, with output on ``console``."""

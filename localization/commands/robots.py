@@ -21,7 +21,7 @@ from motion_models.skid_steer import SkidSteer
 
 @dataclass(frozen=True)
 class Robots:
-    """List the robots that are shipped, with the source of every number."""
+    """List the shipped robots, with the source of every number."""
 
     name: tyro.conf.Positional[str] = ""
     """Robot whose file is printed, with the source of every number; by default all are listed."""
