@@ -33,7 +33,7 @@ from motion_models.slope import SlopeTwist
 _MIN_REPORTED_S = 0.05
 """Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
 _SCAN_WAIT_NS = 1_000_000_000
-"""From the first wheel sample on: a LiDAR that is silent for longer joins a drive that wheels have begun. Scanners have 2 Hz or more."""
+"""Wait for the first scan after the first wheel sample [ns]; later, the drive starts by wheels alone. Scanners have 2 Hz or more."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,15 @@ class StepConfig(Settings):
 
 
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
-"""Yaw: of a heading that may be any, uniform from -pi to pi [rad^2]."""
+"""Upper bounds of the variances of x, y and yaw; yaw: that of a uniform distribution from -pi to pi [rad^2]."""
 _SLOPE_ERROR_S = 5.0
-"""For which errors of a slope's effect last [s]."""
+"""Correlation time of errors of the slope's effect [s]."""
 _MIN_KNOWN_S = 1e-6
 """Least time with wheel data in a step that counts [s]: less than a microsecond is rounding."""
 
 
 class UnknownVelocity:
-    """A constant velocity that no sensor measures, as large as the settings have it, or as the last measured one where that is larger.
+    """Motion by an unmeasured constant velocity, whose sigma is that of the settings or the last measured velocity, if that is larger.
 
     It moves the robot by v t, with the variance sigma^2 t^2: a step from t_0 to t_1 after the last measured pose adds
     sigma^2 (t_1^2 - t_0^2), so that the sum does not depend on how the time is cut into steps.
