@@ -51,7 +51,7 @@ class KernelCacheLocator(caching._CacheLocator):
         """Called by numba for each function that it caches; None for those of others."""
         if py_func.__module__.partition(".")[0] not in _PACKAGES:
             return None
-        classes: list[Any] = caching.CacheImpl._locator_classes
+        classes: list[Any] = [each for each in caching.CacheImpl._locator_classes if each is not cls]
         usual = (each.from_function(py_func, py_file) for each in classes)
         found = next((locator for locator in usual if locator is not None), None)
         return None if found is None else cls(found, fingerprint(py_func.__module__))
@@ -89,6 +89,4 @@ def _modules(module: ModuleType) -> set[str]:
     return {getattr(value, "__module__", None) or "" for value in vars(module).values()}
 
 
-if hasattr(numba.config, "CACHE_LOCATOR_CLASSES"):  # since numba 0.62
-    _usual = numba.config.CACHE_LOCATOR_CLASSES or ",".join(each.__name__ for each in caching.CacheImpl._locator_classes)
-    numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelCacheLocator.__name__},{_usual}"
+caching.CacheImpl._locator_classes.insert(0, KernelCacheLocator)
