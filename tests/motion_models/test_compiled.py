@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numba
 import pytest
 
 from motion_models.compiled import fingerprint
@@ -51,6 +52,7 @@ def _load(folder: Path, name: str, source: str, monkeypatch: pytest.MonkeyPatch)
 def test_kernel_after_a_change_in_another_file_is_compiled_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A subroutine that multiplies, then a class with another name, then nothing."""
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    numba.config.reload_config()  # of other tests' environment
     product = PART.replace("pair.a + pair.b", "pair.a * pair.b")
     for part, found, stored in (
         (PART, 3.0, 0),
