@@ -396,6 +396,10 @@ def describe_p(p: float) -> str:
     return "-" if math.isnan(p) else f"{p:.2g}"
 
 
+_LEAST_REST = 0.15
+"""Share of a row's squares that its causes leave, or explain too much, from which it is given: noise and what is tolerated together."""
+
+
 def describe_row(row: Component) -> str:
     """The causes behind one row of the table of discrepancies, or that there are none."""
     mixed = any(a.is_named for a in row.attributions)
@@ -408,6 +412,8 @@ def describe_row(row: Component) -> str:
         return f"unexplained ({by} and no more)" if by else "unexplained"
     if not by:
         return "several causes together, none of them significant by itself (within tolerance)"
+    rest = 1.0 - sum(a.share for a in row.attributions)
+    by += f", the rest {100 * rest:.0f} %" if abs(rest) >= _LEAST_REST else ""
     return f"{by} (within tolerance)" if row.status == "within tolerance" else by
 
 

@@ -258,7 +258,9 @@ def attribute_rows(
     alone = dataclasses.replace(linearization.noise, correlation=np.eye(len(CHANNELS)))  # a row is tested by itself
     white, white_rest = alone.whiten(first.rows), alone.whiten(rest)
     weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
-    parts = np.nan_to_num(linearization.signatures) * every / linearization.noise.sigmas[..., None]
+    parts = np.nan_to_num(linearization.signatures) * every
+    parts[..., list(chosen)] = _parts_of(np.nan_to_num(first.rows - named), parts[..., list(chosen)])
+    parts /= linearization.noise.sigmas[..., None]
     scaled = np.nan_to_num(first.rows) / linearization.noise.sigmas
     found = {}
     for c, name in enumerate(CHANNELS):
@@ -280,6 +282,13 @@ def attribute_rows(
             component = _attributed(component, listed, every, linearization.causes, chosen, whitened)
         found[name] = component
     return found
+
+
+def _parts_of(change: FloatArray, linear: FloatArray) -> FloatArray:
+    """(M, C, k) what each of k causes changes, so that all of them together change by ``change`` (M, C): their ``linear`` parts (M, C, k),
+    and what these leave of it in proportion to their magnitudes."""
+    size = np.abs(linear)
+    return np.asarray(linear + (change - linear.sum(axis=-1))[..., None] * size / np.maximum(size.sum(axis=-1, keepdims=True), 1e-12))
 
 
 def noise_excess(linearization: Linearization, reference_sigmas: FloatArray | None, known: NDArray[np.bool_], channel: int) -> float:
@@ -304,8 +313,8 @@ def _attributed(
     """A significant row with its causes, strongest first, and its status; ``shares`` (p,) of its squares are 0 for causes that are not
     significant, and ``whitened`` is what is left of it over its noise."""
     by: dict[str, Attribution] = {}
-    for i in np.argsort(-shares):  # of the moments of a change the strongest one counts
-        is_listed = shares[i] >= _MIN_ATTRIBUTED_SHARE or (shares[i] > 0.0 and not by)
+    for i in np.argsort(-np.abs(shares)):  # of the moments of a change the strongest one counts
+        is_listed = abs(shares[i]) >= _MIN_ATTRIBUTED_SHARE or (shares[i] != 0.0 and not by)
         if is_listed and len(by) < _MAX_ATTRIBUTIONS:
             by.setdefault(causes[i].id, Attribution(causes[i].id, float(sizes[i]), float(shares[i]), int(i) in chosen))
     left = max(component.unattributed_rms / max(component.expected_rms, 1e-12), whitened)

@@ -49,6 +49,11 @@ def test_diagnose_hidden_cause_is_named_with_its_size(diagnosed: Diagnosed, caus
     assert first.gain.relative > 0.05
     assert found.gain is not None
     assert found.gain.low > 0.0
+    for row in found.discrepancy.values():  # y.(y - e) / y.y beside 1 - e.e / y.y: they differ by e.(y - e) / y.y (Cauchy-Schwarz)
+        shares = {a.cause: a.share for a in row.attributions if a.is_named}
+        if [*shares] == [first.cause]:
+            left = row.corrected_rms / row.rms
+            assert shares[first.cause] == pytest.approx(1.0 - left**2, abs=left * (1.0 + left))
 
 
 @pytest.mark.extended
