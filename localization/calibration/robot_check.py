@@ -28,6 +28,7 @@ from localization.gyro import GRAVITY_SAMPLES, is_gravity
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
+from localization.logs.topic_roles import CHOSEN_BY
 from localization.pipeline import Trial
 from localization.trajectory import Trajectory
 from motion_models.errors import RobotError
@@ -184,13 +185,6 @@ def _first_minute(log: Log, start_ns: int) -> Iterator[Event]:
 
 def _topic_rows(info: LogInfo) -> list[CheckRow]:
     rates = {topic.topic: topic.rate_hz for topic in info.topics}
-    chosen = {
-        "option": "given",
-        "robot": "named in the robot file",
-        "only": "the only one of its type",
-        "arms": "the arms' joints",
-        "names": "the wheels' by its name",
-    }
     rows = []
     for role in ("wheels", "lidar", "imu"):
         used, name = info.parts[role], {"wheels": "wheels", "lidar": "LiDAR", "imu": "IMU"}[role]
@@ -200,7 +194,7 @@ def _topic_rows(info: LogInfo) -> list[CheckRow]:
             continue
         rate = rates.get(used["topic"])
         text = used["topic"] if rate is None else f"{used['topic']}, {rate:.0f} Hz"
-        rows.append(CheckRow(f"topic of {name}", text, chosen.get(used["chosen_by"], used["chosen_by"]), "ok"))
+        rows.append(CheckRow(f"topic of {name}", text, CHOSEN_BY[used["chosen_by"]], "ok"))
     return rows
 
 

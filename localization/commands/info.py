@@ -14,6 +14,7 @@ from rich.table import Table
 
 from localization.commands.common import print_table, write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
+from localization.logs.topic_roles import CHOSEN_BY
 from localization.output import check_outputs
 from motion_models.prior import prior_notes
 from motion_models.robot_file import load_robot
@@ -56,7 +57,7 @@ def _print(console: Console, info: LogInfo) -> None:
         table.add_row(*map(escape, cells))
     print_table(console, table)
     for part, used in info.parts.items():
-        topic_text = "nothing" if used is None else f"{used['topic']} (chosen by {used['chosen_by']})"
+        topic_text = "not in the log" if used is None else f"{used['topic']} ({CHOSEN_BY[used['chosen_by']]})"
         console.print(f"{part.replace('_', ' ')}: {topic_text}", markup=False)
     console.print(f"can be scored against: {', '.join(info.references) or 'nothing in the log'}", markup=False)
     for frame, mount in info.mounts.items():

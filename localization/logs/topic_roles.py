@@ -55,6 +55,17 @@ class TopicOverrides:
         return self if not reference or self.reference is not None else replace(self, reference=reference)
 
 
+CHOSEN_BY = {
+    "option": "given as an option",
+    "robot": "named in the robot file",
+    "only": "the only one of its type",
+    "names": "of several the wheels' by its name",
+    "points": "of several by name and place of its points",
+    "arms": "the arms' joints",
+}
+"""Why a topic has its role, by `TopicSource.chosen_by`."""
+
+
 @dataclass(frozen=True)
 class TopicSource:
     """A topic in a role."""
@@ -63,8 +74,7 @@ class TopicSource:
     kind: str
     """Its entry in [topics] of the robot file, which sets the message type (`TYPES`)."""
     chosen_by: str
-    """"option", "robot", "only" (the only one of its type in the log), "names" (of several the wheels' by its name) or "points" (by names
-    and places of several)."""
+    """Key of `CHOSEN_BY`."""
     type: str = ""
     """Message type, where it is another than that of ``kind``."""
 
