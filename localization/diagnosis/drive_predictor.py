@@ -448,6 +448,26 @@ def give_columns(predictor: DrivePredictor) -> FloatArray:
     return found
 
 
+def rolling_column(predictor: DrivePredictor) -> FloatArray:
+    """(M, 6, 1) motion by the load that rolling resistance moves against the direction of rolling, which the friction model does not have.
+
+    A wheel that rolls is resisted by a moment f_r N r: its normal force acts f_r r ahead of its axle (Wong 2008, sec. 1.2), so that the
+    axles' loads are those of a centre of gravity so much farther back, 4.3 mm on a Husky; where a robot turns in place both sides cancel.
+    """
+    batch, model = predictor.batch, FrictionModel.from_robot(predictor.drive.robot)
+    params = model.nominal
+    radius, resistance, wheelbase = (params[model.param_names.index(name)] for name in ("wheel_radius", "rolling_resistance", "wheelbase"))
+    back = resistance * radius * np.sign(batch.wheels).mean(axis=1)
+    half = 0.49 * wheelbase  # a centre of gravity over an axle would lift the other one
+    cg = np.column_stack([np.clip(batch.cg[:, 0] - back, -half, half), batch.cg[:, 1]])
+    change = quasi_static_twists(model, params, batch.wheels, cg) - quasi_static_twists(model, params, batch.wheels, batch.cg)
+    found = np.zeros((len(batch.ends), len(CHANNELS), 1))
+    for i, inside in enumerate(batch.intervals()):
+        moved = moved_by(predictor.nominal_twist[inside], batch.dt[inside], change[inside] * batch.dt[inside, None])
+        found[i, :3, 0] = np.trace(moved, axis1=1, axis2=2)
+    return found
+
+
 def _whole(maneuver: Maneuver, path: FloatArray) -> Maneuver:
     """``maneuver`` with the poses (n, 3) of ``path`` at the end of each of its intervals."""
     return dataclasses.replace(maneuver, measured=path, ends=np.arange(1, len(path) + 1), cov=np.zeros((3, 3)))

@@ -13,7 +13,15 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with_sizes
 from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, give_columns, mirrored, relative_speeds, slip_columns
+from localization.diagnosis.drive_predictor import (
+    Baseline,
+    DrivePredictor,
+    give_columns,
+    mirrored,
+    relative_speeds,
+    rolling_column,
+    slip_columns,
+)
 from localization.diagnosis.floor_slope import find_floor_slope
 from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
 from motion_models.base import MotionModel
@@ -321,7 +329,7 @@ def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArr
     if predictor.unmodelled.has_stiffness:
         for cause in (slip_stiffness_cause(predictor.drive.robot), stiffness_exponent_cause()):
             columns.append(predictor.signature(hypothesis, cause, rows)[..., None] * (cause.plausible / FLAT))
-        columns.append(give_columns(predictor) / FLAT)
+        columns += [give_columns(predictor) / FLAT, rolling_column(predictor) / FLAT]
     if predictor.unmodelled.slip_share:
         slips = mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT)
         columns += [slips, slips * relative_speeds(predictor)[:, None, None]]

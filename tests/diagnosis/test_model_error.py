@@ -9,7 +9,7 @@ import pytest
 
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.diagnose import diagnose
-from localization.diagnosis.drive_predictor import mirrored
+from localization.diagnosis.drive_predictor import DrivePredictor, mirrored, rolling_column
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.linearization import regression
 from localization.diagnosis.model_error import cg_error_sigmas
@@ -31,6 +31,21 @@ def test_diagnose_contacts_that_creep_by_rate_are_no_cause() -> None:
     found = diagnosed(_CREEPING, 3)
     assert not found.findings
     assert found.verdict == "consistent"
+
+
+def test_rolling_column_is_a_centre_of_gravity_behind_where_wheels_roll_ahead() -> None:
+    drive = law_drive("husky_a200")
+    predictor = DrivePredictor(drive, make_model("friction", drive.robot), has_inertia=False)
+    back = 0.0263 * drive.robot.geometry.wheel_radius_m
+    moved = predictor.discrepancies(Hypothesis()) - predictor.discrepancies(Hypothesis(cg=(-back, 0.0)))
+    ahead = np.array([(m.wheels > 0.0).all() for m in drive.maneuvers])
+    in_place = np.array([(m.wheels[:, 0] * m.wheels[:, 1] < 0.0).all() for m in drive.maneuvers])
+    assert ahead.any()
+    assert in_place.any()
+    column = rolling_column(predictor)[:, :3, 0]
+    assert np.abs(moved[ahead, 1]).max() > 1e-3
+    assert column[ahead] == pytest.approx(moved[ahead, :3], abs=0.05 * np.abs(moved[ahead, :3]).max())
+    assert np.abs(column[in_place]).max() < 1e-9
 
 
 def test_diagnose_contacts_of_the_model_have_no_note() -> None:
