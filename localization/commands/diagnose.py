@@ -283,8 +283,8 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
             soft_wrap=True,
         )
         for name, c in d.discrepancy.items():
-            if c.status != "noise":
-                console.print(f"{name}: {describe_row(c)}", markup=False, soft_wrap=True)
+            if text := describe_row(c):
+                console.print(f"{name}: {text}", markup=False, soft_wrap=True)
     for line in describe_tolerated(d):
         console.print(f"within tolerance: {line}", markup=False, soft_wrap=True)
     if d.findings:

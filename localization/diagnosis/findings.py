@@ -401,7 +401,9 @@ _LEAST_REST = 0.15
 
 
 def describe_row(row: Component) -> str:
-    """The causes behind one row of the table of discrepancies, or that there are none."""
+    """The causes behind one row of the table of discrepancies, or that there are none; empty for a row that is noise."""
+    if row.status == "noise":
+        return ""
     mixed = any(a.is_named for a in row.attributions)
     by = ", ".join(f"{a.cause} {100 * a.share:.0f} %{' (tolerated)' * (mixed and not a.is_named)}" for a in row.attributions)
     if row.status == "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE:

@@ -93,6 +93,7 @@ def test_mark_trends_contested_finding_makes_row_unexplained() -> None:
 
 def test_describe_row_tolerated_names_cause_and_share() -> None:
     assert describe_row(row("within tolerance")) == "gyro_bias 90 % (within tolerance)"
+    assert describe_row(row("noise")) == ""
 
 
 @pytest.mark.parametrize(
