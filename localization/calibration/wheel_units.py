@@ -123,8 +123,9 @@ def _factors_of_sides(sides: FloatArray, turn: FloatArray) -> FloatArray | None:
         return None
     X, y = sides[known] * (-1.0, 1.0), turn[known]
     y = y - bias_at_rest(X.sum(axis=1), y, _MAX_BIAS * _DEG)
-    squares = [float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=None)[0]) ** 2)) for A in (X, X.sum(axis=1, keepdims=True))]
-    factors = np.linalg.lstsq(X, y, rcond=None)[0]
+    designs = (X, X.sum(axis=1, keepdims=True))
+    fits = [np.linalg.lstsq(A, y, rcond=None)[0] for A in designs]
+    squares, factors = [float(np.sum((y - A @ fit) ** 2)) for A, fit in zip(designs, fits, strict=True)], fits[0]
     is_explained = squares[0] <= min((1.0 - _MIN_CORRELATION**2) * float(y @ y), _MAX_SQUARES * squares[1])
     return np.asarray(factors) if is_explained and factors.min() > 0.0 else None
 

@@ -41,7 +41,7 @@ def test_hills_ramp_has_the_gradient_of_its_height():
 
 
 def test_reckoning_parts_of_a_true_drive_are_zero():
-    """Body motions along their own rotations give the way again, so that each part is only what its name says."""
+    """Body motions along their own rotations give the way again, so that each part has its own error alone."""
     made = rolling_drive(8.0)
     R, ways = made.rotations, made.positions - made.positions[0]
     np.testing.assert_allclose(along(in_body(ways, R), R), ways, atol=1e-4)
