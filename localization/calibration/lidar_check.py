@@ -57,6 +57,11 @@ class LidarFinding:
     clock: Clock | None = None
     """The clocks that are used in place of the robot file's, where that of LiDAR, gyro or wheels is another than the two others'."""
 
+    @property
+    def is_corrected(self) -> bool:
+        """Whether mount or clock are others in what follows; else it is named alone."""
+        return self.mount is not None or self.clock is not None
+
 
 @dataclass
 class _Travel:
@@ -72,9 +77,10 @@ class _Travel:
 class LidarCheck:
     """`add` the events of a drive until `is_done`; then `result` is what they show."""
 
-    def __init__(self, mounts: Mapping[str, Mount], robot: Robot, topic: str, has_gyro: bool = False) -> None:
-        """``topic``: of the scans, for the sentence. ``has_gyro``: one whose turns are to be compared as well."""
-        self._mounts, self._robot, self._topic = mounts, robot, topic
+    def __init__(self, mounts: Mapping[str, Mount], robot: Robot, topic: str, has_gyro: bool = False, is_clock_known: bool = False) -> None:
+        """``topic``: of the scans, for the sentence. ``has_gyro``: one whose turns are to be compared as well. ``is_clock_known``: do not
+        compare clocks."""
+        self._mounts, self._robot, self._topic, self._is_clock_known = mounts, robot, topic, is_clock_known
         self._radius_m = robot.geometry.wheel_radius_m
         self._gyro = GyroHeading(mounts) if has_gyro else None
         self._wheels: list[WheelSample] = []
@@ -167,7 +173,7 @@ class LidarCheck:
         mount, by_turns = self._mounts[frame], self._by_turns(frame)
         by_wheels, by_scans, turns = self._compare(frame)
         direction = _direction(by_wheels, by_scans)
-        if by_turns is not None and by_turns.late_s:
+        if by_turns is not None and by_turns.late_s and not self._is_clock_known:
             return self._other_clock(frame, by_turns)
         if by_turns is not None and by_turns.is_opposite:
             return None if direction is None else self._upside_down(frame, direction)
@@ -218,11 +224,12 @@ class LidarCheck:
         return LidarFinding(text, frame, None, is_certain=True, clock=replace(self._robot.clock, **{key: value}))
 
 
-def check_lidar(log: Log) -> LidarFinding | None:
-    """Compare the first minute of driving; None where the mount agrees, or the drive does not show it."""
+def check_lidar(log: Log, is_clock_known: bool = False) -> LidarFinding | None:
+    """Compare the first minute of driving; None where mount and clock agree, unless that ``is_clock_known``, or the drive does not show
+    it."""
     if log.sources.lidar is None or log.sources.wheels is None or log.wheels_error is not None:
         return None
-    check = LidarCheck(log.mounts, log.robot, log.sources.lidar.topic, has_gyro=log.sources.imu is not None)
+    check = LidarCheck(log.mounts, log.robot, log.sources.lidar.topic, log.sources.imu is not None, is_clock_known)
     for event in log.events():
         check.add(event)
         if check.is_done:
@@ -252,7 +259,7 @@ def open_log_checked(path: Path | str, robot: Robot, topics: TopicOverrides = To
     if found is not None and found.clock is not None:
         log, of_clock = open_log(path, replace(log.robot, clock=found.clock), topics), (found,)
         log.add_notes(wiring.findings)
-        found = check_lidar(log)
+        found = check_lidar(log, is_clock_known=True)
     lidar = (*of_clock, *(() if found is None else (found,)))
     log.add_notes(one.text for one in lidar)
     return CheckedLog(log, wiring, corrected(log.mounts, found), lidar)

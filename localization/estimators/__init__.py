@@ -10,7 +10,7 @@ from localization.core.space import SpaceConfig
 from localization.errors import EstimatorError
 from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.estimator import Estimate, Estimator, LearnedParameter, Residuals
-from localization.estimators.fusion import MAX_LATENCY_S, EkfFusion
+from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap
 from localization.estimators.plane import Plane
@@ -27,7 +27,6 @@ __all__ = [
     "ESTIMATORS_WITH_CORRECTIONS",
     "ESTIMATORS_WITH_MAP",
     "LOCALIZER",
-    "MAX_LATENCY_S",
     "Estimate",
     "Estimator",
     "EstimatorConfig",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -91,6 +91,15 @@ class GyroCalibration(NamedTuple):
         return angle, turn.variance + dt**2 * self.bias_variance + angle**2 * self.scale_variance
 
 
+class ClocksApart(NamedTuple):
+    """Offset of the wheels' stamps that no latency explains, where a single other sensor measures it: either clock may be the one that
+    is off."""
+
+    late_s: float
+    """What happened at t is stamped t + late_s by the wheels [s]."""
+    other: Literal["gyro", "LiDAR"]
+
+
 class Estimator(ABC):
     """State inside; one `step` after the other, then `finish`. The defaults are those of an estimator without map and corrections."""
 
@@ -122,6 +131,11 @@ class Estimator(ABC):
     def clock_offset_s(self) -> float:
         """Estimated offset of the wheels' stamps [s]: what happened at t is stamped t + offset."""
         return 0.0
+
+    @property
+    def clocks_apart(self) -> ClocksApart | None:
+        """Clocks of two sensors alone that are certainly apart; None where they are not, or a third sensor shows whose is off."""
+        return None
 
     @property
     def params(self) -> FloatArray | None:

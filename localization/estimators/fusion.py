@@ -20,6 +20,7 @@ from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
 from localization.estimators.estimator import (
     NO_POINTS,
+    ClocksApart,
     Estimate,
     Estimator,
     GyroCalibration,
@@ -41,7 +42,7 @@ _REPEATED_S = 0.5
 """Scans from one place have the same errors: those of a robot at rest count no more from about this time on [s]."""
 _MIN_CLOCK_OFFSET_S = 0.05
 """Smallest offset of the wheels' clock with a warning [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
-MAX_LATENCY_S = 0.2
+_MAX_LATENCY_S = 0.2
 """Largest offset of the wheels' clock that is a driver's latency [s]: up to 0.18 on the way on fr079, MIT-CSAIL and the Husky outdoors."""
 
 
@@ -183,6 +184,15 @@ class EkfFusion(Estimator):
         return self.state.number("clock")
 
     @property
+    def clocks_apart(self) -> ClocksApart | None:
+        """See `Estimator.clocks_apart`."""
+        offset, sigma = self.clock_offset_s, math.sqrt(self.state.variance("clock"))
+        has_lidar = self._sensor is not None
+        if self._has_gyro == has_lidar or abs(offset) < max(_MAX_LATENCY_S, OUTLIER_SIGMAS * sigma):
+            return None
+        return ClocksApart(offset, "LiDAR" if has_lidar else "gyro")
+
+    @property
     def params(self) -> FloatArray:
         """Parameters of the motion model with their corrections."""
         return np.asarray(self.model.nominal + self.corrections.directions @ self.state["corrections"])
@@ -254,8 +264,7 @@ class EkfFusion(Estimator):
         """A long way by wheels alone, and a clock offset that is large and certain; those of two sensors that no latency explains are
         reported by `sensor_checks.clocks`."""
         offset, sigma = self.clock_offset_s, math.sqrt(self.state.variance("clock"))
-        is_of_two = abs(offset) >= MAX_LATENCY_S and self._has_gyro == (self._sensor is None)
-        if is_of_two or abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
+        if self.clocks_apart is not None or abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
             return self._open_way.warnings()
         others = "LiDAR" if not self._has_gyro else "gyro" if self._sensor is None else "LiDAR or gyro"
         direction = "later" if offset > 0.0 else "earlier"
@@ -279,6 +288,11 @@ class FilteredOdometry(Estimator):
     def clock_offset_s(self) -> float:
         """Estimated offset of the wheels' clock [s]."""
         return self.odometry.clock_offset_s
+
+    @property
+    def clocks_apart(self) -> ClocksApart | None:
+        """See `Estimator.clocks_apart`."""
+        return self.odometry.clocks_apart
 
     @property
     def params(self) -> FloatArray:

@@ -192,7 +192,8 @@ class TopicChooser:
         if have is not None:
             found = f"'{topic}' in {self._log} carries {short_type(have)}, not {short}"
         others = self.of_type(*types)
-        fitting = f"topics of type {short} in it: {', '.join(others)}. Pass {option}."
+        choice = f"{option} {others[0]}" if len(others) == 1 else f"one of them by {option}"
+        fitting = f"topics of type {short} in it: {', '.join(others)}. Pass {choice}."
         if not others:
             fitting = f"it has no topic of type {short}. `skidloc info` lists its topics; {option} names the one to take."
         raise TopicError(f"{found}; {fitting}")

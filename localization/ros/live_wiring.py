@@ -1,21 +1,14 @@
-"""Signs, sides, units and clocks of live wheels and gyro: once the drive shows them, it is estimated anew with the right ones.
-
-Of a driver's odometry its turns are compared. Messages are kept as they came, since the start of the drive, until the sensors agree: what
-is wrong is the way in which they are read.
-"""
+"""Signs, sides, units and clocks of live wheels and gyro, until the sensors agree. Of a driver's odometry its turns are compared."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any
 
 from localization.calibration.wheel_signals import WheelSignals, signals_of_odometry, signals_of_readings
-from localization.calibration.wheel_units import CORRECTED
 from localization.calibration.wheel_wiring import LiveSensors, WiringReport, check_live
 from localization.events import ImuSample, Scan
 from localization.logs.decode import ArmReading, JointReading, OdometryReading
-from localization.ros.transports.transport import Received
 
 _FIRST_NS, _LAST_NS, _LONGER = 6_000_000_000, 120_000_000_000, 1.5
 """From the first motion to the first check and to the last one, and the factor from check to check: turns both ways come within a minute of
@@ -26,19 +19,16 @@ _MOVED = 0.02
 _AGREE = 0.95
 """Correlation of a turn from where on wheels are as the robot file has them, and no more is read: healthy drives have more."""
 _LIDAR_S = 60.0
-_MAX_POINTS, _MAX_BYTES = 2_000_000, 150_000_000
-"""Largest size of the scans, and of the LiDAR's messages, that are kept; beyond, its oldest messages are left out, and wheels and
-gyro bridge them."""
-_NOW = "Corrected from the start of the drive on; write to the robot file:"
+_MAX_POINTS = 2_000_000
+"""Of the scans that are kept; bounds the memory to 100 MB."""
 
 
 class LiveWiring:
-    """`keep` each message and `add` its readings, until `is_done`; then `found` is what contradicts the robot file."""
+    """`add` each reading, until `is_done`; then `found` is what contradicts the robot file."""
 
     def __init__(self, sensors: LiveSensors, joints: tuple[tuple[str, ...], tuple[str, ...]], is_clock_known: bool = False) -> None:
         """``joints``: of the left and right wheels that come. ``is_clock_known``: do not compare the gyro's clock."""
         self._sensors, self._joints, self._is_clock_known = sensors, joints, is_clock_known
-        self._messages = KeptMessages("" if sensors.sources.lidar is None else sensors.sources.lidar.topic)
         self._wheels: deque[JointReading | OdometryReading] = deque()
         self._gyro: deque[ImuSample] = deque()
         self._points = 0
@@ -50,20 +40,9 @@ class LiveWiring:
         """Something was found, the sensors agree, or two minutes of driving have passed."""
 
     @property
-    def messages(self) -> Sequence[Received]:
-        """Since the start of the drive."""
-        return self._messages.in_order()
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        """Sentences on what was found."""
-        return () if self.found is None else tuple(text.replace(CORRECTED, _NOW) for text in self.found.findings)
-
-    def keep(self, received: Received) -> None:
-        """Keep a message, before its readings are added."""
-        self._messages.add(received)
-        if self._moving_ns is None:
-            self._messages.forget(received.received_ns - _STANDING_NS)
+    def has_moved(self) -> bool:
+        """Whether the wheels have turned so far."""
+        return self._moving_ns is not None
 
     def add(self, reading: Any) -> None:
         """Take a ``reading`` of any sensor."""
@@ -124,35 +103,3 @@ def _has_moved(first: JointReading | OdometryReading, sample: JointReading | Odo
 def _forget(readings: deque[Any], before_ns: int) -> None:
     while readings and readings[0].stamp_ns < before_ns:
         readings.popleft()
-
-
-class KeptMessages:
-    """Messages in order of coming; those of the LiDAR, which are large, up to `_MAX_BYTES`."""
-
-    def __init__(self, lidar: str) -> None:
-        """``lidar``: its topic."""
-        self._lidar_topic = lidar
-        self._lidar: deque[Received] = deque()
-        self._others: deque[Received] = deque()
-        self._bytes = 0
-
-    def add(self, received: Received) -> None:
-        """Keep ``received``."""
-        if received.topic != self._lidar_topic:
-            self._others.append(received)
-            return
-        self._lidar.append(received)
-        self._bytes += len(received.data)
-        while self._bytes > _MAX_BYTES:
-            self._bytes -= len(self._lidar.popleft().data)
-
-    def forget(self, before_ns: int) -> None:
-        """Leave out those that were received earlier [ns]."""
-        while self._others and self._others[0].received_ns < before_ns:
-            self._others.popleft()
-        while self._lidar and self._lidar[0].received_ns < before_ns:
-            self._bytes -= len(self._lidar.popleft().data)
-
-    def in_order(self) -> list[Received]:
-        """All, by the time of receiving."""
-        return sorted([*self._others, *self._lidar], key=lambda received: received.received_ns)

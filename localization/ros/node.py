@@ -30,7 +30,7 @@ from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics,
 from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
 from localization.ros.interim_odometry import InterimOdometry
 from localization.ros.jit_warm_up import WarmUp
-from localization.ros.lidar_entrance import LidarEntrance
+from localization.ros.live_entrance import LiveEntrance
 from localization.ros.live_stream import LiveStream, WheelAngles, check_age
 from localization.ros.live_wiring import LiveWiring
 from localization.ros.operator_commands import OperatorCommands
@@ -81,9 +81,8 @@ class Node:
         self._gnss = _gnss(run, transport, self._stats)
         self._problems: set[str] = set()  # that were reported
         self._interim: InterimOdometry | None = None
-        self._entrance: LidarEntrance | None = None
-        self._wiring: LiveWiring | None = None
-        self._wiring_notes: list[str] = []
+        self._entrance: LiveEntrance | None = None
+        self._entrance_notes: list[str] = []
         self._next_status = self._next_path = self._next_map = -float("inf")
         self._newest_ns = 0
         self._begin_ns: int | None = None
@@ -155,9 +154,7 @@ class Node:
             if self.session.head:
                 self._continue_from(self.session.head, discovered.start_ns)
             else:
-                self._check_lidar()
-            if not self.session.head and self._has_wiring():
-                self._check_wiring(is_clock_known=False)
+                self._enter(self._wiring_check(), self._lidar_check())
             if not is_compiled():
                 self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
                 self._interim = InterimOdometry(self._open_stream(MessageStats()), _predictor(self._trial, self._run), is_compiled)
@@ -183,22 +180,27 @@ class Node:
         counts = self._stats if stats is None else stats
         return LiveStream(self._discovered, self._run.robot, counts, self._transport.epoch_ns, is_ros1=self._transport.is_ros1)
 
-    def _check_lidar(self) -> None:
-        """Compare the LiDAR's mount with the wheels on the first metres, where there are both."""
-        if self._sources.lidar is not None and self._sources.wheels is not None:
-            check = LidarCheck(self.session.pipeline.mounts, self._run.robot, self._sources.lidar.topic)
-            self._entrance = LidarEntrance(check)
-
-    def _has_wiring(self) -> bool:
-        """Whether something can contradict the wheels: each other, or a driver's odometry the gyro."""
+    def _wiring_check(self, is_clock_known: bool = False) -> LiveWiring | None:
+        """Of wheels against gyro and LiDAR; None where nothing can contradict the wheels: neither each other, nor a gyro their driver's
+        odometry."""
         wheels = self._sources.wheels
-        return wheels is not None and (wheels.kind == "joint_states" or self._sources.imu is not None)
-
-    def _check_wiring(self, is_clock_known: bool) -> None:
-        """Compare wheels with gyro and LiDAR from here on, until they agree."""
+        if wheels is None or (wheels.kind != "joint_states" and self._sources.imu is None):
+            return None
         sensors = LiveSensors(self._run.robot, self._sources, self.session.pipeline.mounts)
-        self._wiring = LiveWiring(sensors, self._discovered.parts.joints, is_clock_known)
-        self._stream.on_reading = self._wiring.add
+        return LiveWiring(sensors, self._discovered.parts.joints, is_clock_known)
+
+    def _lidar_check(self, is_clock_known: bool = False) -> LidarCheck | None:
+        """Of the LiDAR's mount and clock against wheels and gyro on the first metres; None without wheels or LiDAR."""
+        lidar, has_gyro = self._sources.lidar, self._sources.imu is not None
+        if lidar is None or self._sources.wheels is None:
+            return None
+        return LidarCheck(self.session.pipeline.mounts, self._run.robot, lidar.topic, has_gyro, is_clock_known)
+
+    def _enter(self, wiring: LiveWiring | None, lidar: LidarCheck | None) -> None:
+        """Compare the sensors from here on, until the checks have ended."""
+        topic = "" if self._sources.lidar is None else self._sources.lidar.topic
+        self._entrance = LiveEntrance(wiring, lidar, topic) if wiring is not None or lidar is not None else None
+        self._stream.on_reading = None if self._entrance is None else self._entrance.add
 
     def _subscribe(self) -> None:
         """To what is used from here on; wheels are urgent where every message of them makes a prediction."""
@@ -260,7 +262,9 @@ class Node:
     def restart(self, start: StartPose) -> None:
         """Begin anew at ``start``: with a new map, and nothing learned of the motion model."""
         pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
-        self._entrance = None
+        if self._entrance is not None:  # of the motion from here on
+            self._enter(self._wiring_check(), None)
+            self.session.start_error_m = 0.0
         if self._trial.prior is not None:  # the saved map stays where it is
             start = replace(start, map_T_start=np.zeros(3), map_cov=np.zeros((3, 3)))
         self.session.restart(pipeline, start)
@@ -312,7 +316,7 @@ class Node:
 
     def warnings(self) -> list[str]:
         """Everything that was lost or corrected, as sentences."""
-        return list(dict.fromkeys([*self._wiring_notes, *self._stream.dropped(), *self.session.pipeline.warnings()]))
+        return list(dict.fromkeys([*self._entrance_notes, *self._stream.dropped(), *self.session.pipeline.warnings()]))
 
     @property
     def seconds(self) -> float:
@@ -339,12 +343,12 @@ class Node:
                 self.session.process(position)
             return False
         has_estimate = False
-        if self._wiring is not None:
-            self._wiring.keep(received)
+        if self._entrance is not None:
+            self._entrance.keep(received)
         for event in self._stream.events(received):
             has_estimate |= self._process(event, received)
-        if self._wiring is not None and self._wiring.is_done:
-            self._pass_wiring(self._wiring)
+        if self._entrance is not None and self._entrance.is_done:
+            self._pass_entrance(self._entrance)
         if has_estimate:  # the next scan is farthest now, and does not wait
             self.session.pipeline.run_deferred()
             self.session.save_state(self._head)
@@ -367,55 +371,51 @@ class Node:
             self._check_frames()
         return bool(estimates)
 
-    def _add_to_entrance(self, entrance: LidarEntrance, event: Event) -> None:
-        is_done = entrance.add(event)
-        self.session.start_error_m = 0.0 if is_done else entrance.largest_error_m
-        if is_done:
-            self._pass_entrance(entrance)
+    def _add_to_entrance(self, entrance: LiveEntrance, event: Event) -> None:
+        entrance.add_event(event)
+        self.session.start_error_m = entrance.largest_error_m
 
-    def _pass_entrance(self, entrance: LidarEntrance) -> None:
-        """Go on with the LiDAR's mount as it is, or with the right one: then from the start of the drive on."""
-        self._entrance = None
-        found, events = entrance.result()
-        if found is None:
-            return
-        self._report(found.text)
-        if found.mount is None:
-            return
-        mounts = corrected(self.session.pipeline.mounts, found)
-        self.session.restart(Pipeline(self._trial, self._run.robot, mounts, self.has_lidar, self._run.config), self.session.state.start)
-        for event in events:
-            self.session.pipeline.process(event)
-        self.payloads.mounts = self.session.pipeline.mounts
-        self._doctor.add_mounts(mounts)
-        if self._predictor is not None:
-            self._predictor.stop()
-        if self.session.view is not None:
-            self.session.view.begin(self._run.robot, mounts)
-
-    def _pass_wiring(self, wiring: LiveWiring) -> None:
-        """Go on as the robot file has it, or, from the start of the drive on, with the signs, sides, units and clock that were found."""
-        self._wiring = self._stream.on_reading = None
-        if wiring.found is None:
-            return
-        for text in wiring.texts:
-            self._wiring_notes.append(text)
+    def _pass_entrance(self, entrance: LiveEntrance) -> None:
+        """Go on as robot file and transforms have it, or, from the start of the drive on, with what was found."""
+        self._entrance = self._stream.on_reading = None
+        for text in entrance.texts:
+            self._entrance_notes.append(text)
             self._report(text)
-        state = self.session.state
-        state.wiring = LiveRobot(wiring.found.robot, not wiring.found.is_ambiguous)
-        self._rewire(state.wiring)
-        state.angles = self._stream.wheel_angles
-        pipeline = Pipeline(self._trial, self._run.robot, self.session.pipeline.mounts, self.has_lidar, self._run.config)
-        self.session.restart(pipeline, state.start)
-        self.insert_present_cg()
-        self._check_lidar()
-        if wiring.found.keys:  # what comes next: units after signs
-            self._check_wiring(is_clock_known=any(key.startswith("clock.") for key in wiring.found.keys))
-        for received in wiring.messages:
-            if self._wiring is not None:
-                self._wiring.keep(received)
+        wiring, lidar = entrance.wiring, entrance.lidar
+        if wiring is not None:
+            self._rewire(LiveRobot(wiring.robot, not wiring.is_ambiguous))
+            is_clock_known = any(key.startswith("clock.") for key in wiring.keys)
+            self._begin_anew(self.session.pipeline.mounts)
+            self._enter(  # what comes next: units after signs, the LiDAR after both
+                self._wiring_check(is_clock_known) if wiring.keys else None, None if wiring.is_ambiguous else self._lidar_check()
+            )
+        elif lidar is not None and lidar.is_corrected:
+            is_clock_known = lidar.clock is not None
+            if lidar.clock is not None:
+                self._rewire(LiveRobot(replace(self._run.robot, clock=lidar.clock), self._uses_gyro))
+            self._begin_anew(corrected(self.session.pipeline.mounts, lidar))
+            self._enter(self._wiring_check(is_clock_known), self._lidar_check(is_clock_known=True) if is_clock_known else None)
+        else:
+            return
+        for received in entrance.messages:
+            if self._entrance is not None:
+                self._entrance.keep(received)
             for event in self._stream.events(received):
                 self._process_again(event)
+
+    @property
+    def _uses_gyro(self) -> bool:
+        return self.session.state.wiring is None or self.session.state.wiring.uses_gyro
+
+    def _begin_anew(self, mounts: Mapping[str, Mount]) -> None:
+        """Estimate with ``mounts`` from the start of the drive on, of which the messages come again."""
+        pipeline = Pipeline(self._trial, self._run.robot, mounts, self.has_lidar, self._run.config)
+        self._reopen_stream(pipeline.mounts)
+        self.session.state.angles = self._stream.wheel_angles
+        self.session.restart(pipeline, self.session.state.start)
+        self.session.start_error_m = 0.0
+        self._doctor.add_mounts(pipeline.mounts)
+        self.insert_present_cg()
         if self._predictor is not None:
             self._predictor = _predictor(self._trial, self._run)
         if self.session.view is not None:
@@ -436,10 +436,14 @@ class Node:
         if not wiring.uses_gyro:
             parts = replace(parts, sources=replace(parts.sources, imu=None))
         self._discovered, self._sources = replace(self._discovered, parts=parts), parts.sources
-        self._stats.clear()
+        self.session.state.wiring = wiring
+        self._reopen_stream(self.session.pipeline.mounts)
+
+    def _reopen_stream(self, mounts: Mapping[str, Mount]) -> None:
         loads = self.payloads.loads
+        self._stats.clear()
         self._stream = self._open_stream()
-        self.payloads.loads, self.payloads.mounts = loads, self.session.pipeline.mounts
+        self.payloads.loads, self.payloads.mounts = loads, mounts
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""

@@ -99,7 +99,7 @@ class SensorChecks:
         residuals, step = estimator.residuals, self._step
         if step is None or residuals is None:
             return
-        self._clocks.add(step, estimator)
+        self._clocks.add(estimator)
         if step.scan is not None:
             self._is_lidar_placed = step.scan.frame_id in self._mounts
         self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)

@@ -6,10 +6,8 @@ the one that is off, what is published for t is the pose at t - late: an error o
 
 from __future__ import annotations
 
-from localization.estimators import MAX_LATENCY_S, Estimator
-from localization.events import Step
-from localization.lidar import OUTLIER_SIGMAS
-from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
+from localization.estimators import Estimator
+from localization.sensor_checks.faults import FaultLog, SensorFault
 
 CLOCKS_APART = SensorFault(
     "the wheels' stamps are {seconds:.2f} s {direction} than those of the {other}: the clock of one of both is off, and no third sensor"
@@ -19,32 +17,25 @@ CLOCKS_APART = SensorFault(
 
 
 class ClockCheck:
-    """`add` each step with its estimator: clocks that are apart are declared, and inflate the covariance while the robot moves."""
+    """`add` the estimator after each step: clocks that are apart are declared, and inflate the covariance while the robot moves."""
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults = faults
-        self._has_gyro = self._has_scans = False
+        self._reported_s = 0.0
 
-    def add(self, step: Step, estimator: Estimator) -> None:
-        """Take the clock offset after ``step``."""
-        self._has_gyro, self._has_scans = self._has_gyro or step.turn is not None, self._has_scans or step.scan is not None
-        late, inflation = estimator.clock_offset_s, self._faults.inflation
-        inflation.late_s = 0.0
-        if abs(late) < MAX_LATENCY_S or self._has_gyro == self._has_scans:
+    def add(self, estimator: Estimator) -> None:
+        """Take the clock offset after a step."""
+        apart = estimator.clocks_apart
+        self._faults.inflation.late_s = 0.0 if apart is None else apart.late_s
+        if apart is None or (late_s := round(apart.late_s, 2)) == self._reported_s:
             return
-        _, sigma = estimator.parameters().get("wheel_clock_offset_s", (0.0, abs(late)))
-        if abs(late) < OUTLIER_SIGMAS * sigma:
-            return
-        inflation.late_s = late
-        other, role = ("gyro", "gyro") if self._has_gyro else ("LiDAR", "lidar")
-        direction = "later" if late > 0.0 else "earlier"
+        self._reported_s = late_s
         numbers: dict[str, float | str] = {
-            "other": other,
-            "role": role,
-            "seconds": abs(late),
-            "direction": direction,
-            "late": late,
-            "early": -late,
+            "other": apart.other,
+            "role": apart.other.lower(),
+            "seconds": abs(late_s),
+            "direction": "later" if late_s > 0.0 else "earlier",
+            "late": late_s,
+            "early": -late_s,
         }
-        self._faults.declare(CLOCKS_APART, 0.0, numbers)
-        self._faults.revise(DetectedFault(CLOCKS_APART, 0.0, CLOCKS_APART.message.format(**numbers)))
+        self._faults.update(CLOCKS_APART, 0.0, numbers)

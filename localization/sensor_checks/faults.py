@@ -74,6 +74,11 @@ class FaultLog:
         if fault.reference is not None:
             self.inflation.add_distance_from(fault.reference)
 
+    def update(self, fault: SensorFault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+        """Report ``fault`` with the ``numbers`` of now, whether or not it was reported before."""
+        self.declared.pop(fault, None)
+        self.declare(fault, at_s, numbers)
+
     def revise(self, found: DetectedFault) -> None:
         """Report ``found`` in place of what was reported of the same fault."""
         self._revised[found.fault] = found

@@ -106,7 +106,7 @@ def test_topic_of_the_robot_file_with_wrong_type_is_ignored(tmp_path: Path) -> N
 
 
 def test_topic_missing_error_lists_candidates(tmp_path: Path) -> None:
-    with pytest.raises(TopicError, match=r"no topic '/points' in run\.mcap.*PointCloud2 in it: /ouster/points.*--topic\.points"):
+    with pytest.raises(TopicError, match=r"no topic .* in run\.mcap.*PointCloud2 in it.* Pass --topic\.points /ouster/points\."):
         log_of(tmp_path, {"/joint_states": "joints", "/ouster/points": "points"}, TopicOverrides(points="/points"))
 
 
