@@ -27,10 +27,11 @@ SYSTEMS: Sequence[System] = (
     System("wheels", "wheel odometry, diff_drive", estimator="odometry"),
     System("skidloc ekf", "wheels and LiDAR, live", estimator="ekf"),
     System("skidloc graph", "wheels and LiDAR, live and smoothed", estimator="graph"),
-    System("skidloc ekf, kiss", "wheels and LiDAR, live, KISS-ICP as matcher", estimator="ekf", matcher="kiss"),
+    System("skidloc ekf with KISS-ICP", "wheels and LiDAR, live, KISS-ICP as matcher", estimator="ekf", matcher="kiss"),
     System("KISS-ICP", "LiDAR alone; its own defaults, 3D pipeline on planar scans", peer="kiss"),
     System("KISS-ICP + wheels", "LiDAR, each registration started from wheel odometry", peer="kiss_wheels"),
     System("GenZ-ICP", "LiDAR alone; its interface takes no initial guess", peer="genz"),
     System("small_gicp + wheels", "LiDAR, scan to model as in its examples, started from wheel odometry", peer="gicp"),
     System("Karto (yag_slam)", "wheels and LiDAR, slam_toolbox's matcher and graph: final poses", peer="karto"),
+    System("MRPT icp-slam", "wheels and LiDAR, point map of its example icp-slam_demo_classic.ini: live poses", peer="mrpt"),
 )
