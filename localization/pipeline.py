@@ -24,7 +24,8 @@ from localization.estimators import (
     Plane,
     PriorMap,
     SpaceFusion,
-    SpaceSmoothing,
+    SpaceGraphFusion,
+    SpaceGraphSettings,
     make_estimator,
 )
 from localization.events import Event, ImuSample, PositionSample, Scan, Step
@@ -82,13 +83,13 @@ class Pipeline:
         name = trial.estimator if trial.prior is None else "ekf"
         self.estimator: Estimator
         of_space = robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space
-        smoothing: SpaceSmoothing | None = None
+        graph: SpaceGraphSettings | None = None
         if trial.estimator == "graph":
             corrections = make_corrections(model, trial.corrections)
-            smoothing = SpaceSmoothing(corrections, robot.geometry.track_width_m, config.estimator.graph, is_smoothing)
+            graph = SpaceGraphSettings(corrections, robot.geometry.track_width_m, config.estimator.graph, is_smoothing)
         if is_in_space:
             in_space = SpaceFusion(*of_space)
-            self.estimator = in_space if smoothing is None else smoothing.around(in_space, np.zeros(3))
+            self.estimator = in_space if graph is None else SpaceGraphFusion(in_space, graph, np.zeros(3))
         else:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
@@ -96,7 +97,7 @@ class Pipeline:
         self.plane: Plane | None = None
         """The choice between plane and space; None where there is none."""
         if trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar:
-            self.plane = Plane(*of_space, smoothing)
+            self.plane = Plane(*of_space, graph)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""

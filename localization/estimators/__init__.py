@@ -15,7 +15,7 @@ from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap
 from localization.estimators.plane import Plane
 from localization.estimators.space_fusion import SpaceFusion
-from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceSmoothing
+from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
@@ -38,7 +38,7 @@ __all__ = [
     "Residuals",
     "SpaceFusion",
     "SpaceGraphFusion",
-    "SpaceSmoothing",
+    "SpaceGraphSettings",
     "check_estimator",
     "make_estimator",
 ]

@@ -60,7 +60,7 @@ def merge(first: KeyframeMap, second: KeyframeMap, range_noise_m: float, only_ne
     bent = np.hypot(*(se2.transform(moved, second.poses[keys, :2]) - poses[keys, :2]).T)
     kept = _new_keyframes(places, second, poses) if only_new else np.arange(len(second.poses))
     ties = {i: closures[k] for i, k in enumerate(kept.tolist()) if k in closures}
-    joined = _join(first, second.select(kept), poses[kept], covs[kept], ties)
+    joined = _join(first, places, second.select(kept), poses[kept], covs[kept], ties)
     return Merged(joined, len(keys), errors, bent, len(kept))
 
 
@@ -104,14 +104,19 @@ def _solve(second: KeyframeMap, closures: dict[int, tuple[Pose2, Cov3]]) -> tupl
 
 
 def _join(
-    first: KeyframeMap, second: KeyframeMap, poses: FloatArray, covs: FloatArray, closures: dict[int, tuple[Pose2, Cov3]]
+    first: KeyframeMap,
+    places: PlaceMap,
+    second: KeyframeMap,
+    poses: FloatArray,
+    covs: FloatArray,
+    closures: dict[int, tuple[Pose2, Cov3]],
 ) -> KeyframeMap:
-    """Both as one, tied by ``closures`` to the nearest keyframes of the first."""
+    """Both as one, tied by ``closures`` to the nearest keyframes of the ``first``, of which ``places`` is made."""
     n = len(first.poses)
     nearest = _nearest(first, [pose for pose, _ in closures.values()])
     ties = np.array([se2.between(first.poses[j], pose) for j, (pose, _) in zip(nearest, closures.values(), strict=True)]).reshape(-1, 3)
     information = np.array([np.linalg.inv(cov) for _, cov in closures.values()]).reshape(-1, 3, 3)
-    map_covs = [_at(first.poses[j], first.covariances[j], pose) for j, pose in zip(_nearest(first, poses), poses, strict=True)]
+    map_covs = [places.map_cov(pose) for pose in poses]
     return KeyframeMap(
         stamps_ns=np.r_[first.stamps_ns, second.stamps_ns],
         poses=np.vstack([first.poses, poses]),
@@ -138,9 +143,3 @@ def _new_keyframes(places: PlaceMap, second: KeyframeMap, poses: FloatArray) -> 
 def _nearest(mapped: KeyframeMap, poses: Iterable[Pose2]) -> list[int]:
     """Index of the keyframe of ``mapped`` nearest to each of ``poses`` (3,)."""
     return [int(np.argmin(np.hypot(*(mapped.poses[:, :2] - pose[:2]).T))) for pose in poses]
-
-
-def _at(key: Pose2, cov: Cov3, pose: Pose2) -> Cov3:
-    """``cov`` (3, 3) of ``key`` (3,) as a perturbation of ``pose`` (3,)."""
-    A = se2.adjoint(se2.inverse(se2.between(key, pose)))
-    return np.asarray(A @ cov @ A.T)

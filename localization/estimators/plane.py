@@ -11,7 +11,7 @@ from localization.attitude import AttitudeFilter
 from localization.core.space import SpaceConfig
 from localization.estimators.estimator import Estimate, Estimator
 from localization.estimators.space_fusion import SpaceFusion
-from localization.estimators.space_graph_fusion import SpaceSmoothing
+from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
 from localization.lidar import LidarConfig
 from localization.lifting import Lifting, Pose3
 from motion_models.robot import GyroNoise, Mount
@@ -29,10 +29,10 @@ class Plane:
         mounts: Mapping[str, Mount],
         lidar: LidarConfig,
         config: SpaceConfig,
-        smoothing: SpaceSmoothing | None = None,
+        graph: SpaceGraphSettings | None = None,
     ) -> None:
-        """Arguments are those of `SpaceFusion`; ``smoothing`` is the graph's."""
-        self._of_space, self._lifting, self._smoothing = (gyro, mounts, lidar, config), Lifting(), smoothing
+        """Arguments are those of `SpaceFusion`; ``graph`` are settings of a `SpaceGraphFusion`, None without one."""
+        self._of_space, self._lifting, self._graph = (gyro, mounts, lidar, config), Lifting(), graph
         self._map_T_odom = np.zeros(3)
         self._pose: Pose3 | None = None
         self.has_clouds = False
@@ -46,7 +46,7 @@ class Plane:
             return estimator
         self.left_ns = start_ns
         in_space = SpaceFusion.continuing(estimator, self._pose, *self._of_space)
-        return in_space if self._smoothing is None else self._smoothing.around(in_space, self._map_T_odom)
+        return in_space if self._graph is None else SpaceGraphFusion(in_space, self._graph, self._map_T_odom)
 
     def add(self, estimate: Estimate, attitude: AttitudeFilter | None) -> None:
         """Lift the ``estimate`` of the estimator in the plane."""

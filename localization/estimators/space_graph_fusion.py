@@ -36,7 +36,7 @@ _NO_SIGMA = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class SpaceSmoothing:
+class SpaceGraphSettings:
     """Settings of a `SpaceGraphFusion`, without its filter."""
 
     corrections: Corrections
@@ -46,10 +46,6 @@ class SpaceSmoothing:
     is_smoothing: bool
     """`finish` is to give the smoothed trajectory; memory then grows with the drive, 424 bytes a step."""
 
-    def around(self, in_space: SpaceFusion, map_T_odom: Pose2) -> SpaceGraphFusion:
-        """The graph behind the filter ``in_space``; ``map_T_odom`` (3,) stays as a graph in the plane has left it."""
-        return SpaceGraphFusion(in_space, self, map_T_odom)
-
 
 class SpaceGraphFusion(Estimator):
     """`SpaceFusion`, whose keyframes a `SpaceGraph` smooths at the end; its live poses are the filter's.
@@ -58,12 +54,13 @@ class SpaceGraphFusion(Estimator):
     graph has no loops of its own.
     """
 
-    def __init__(self, odometry: SpaceFusion, smoothing: SpaceSmoothing, map_T_odom: Pose2) -> None:
-        corrections, track_m = smoothing.corrections, smoothing.track_m
+    def __init__(self, odometry: SpaceFusion, settings: SpaceGraphSettings, map_T_odom: Pose2) -> None:
+        """``odometry``: the filter whose keyframes are smoothed; ``map_T_odom`` (3,): as a graph in the plane has left it."""
+        corrections, track_m = settings.corrections, settings.track_m
         self.odometry, self._corrections = odometry, corrections
-        self._config, self._is_smoothing = smoothing.config, smoothing.is_smoothing
+        self._config, self._is_smoothing = settings.config, settings.is_smoothing
         self._map_T_odom = map_T_odom
-        lever = np.array([smoothing.config.antenna_x_m, smoothing.config.antenna_y_m, 0.0])
+        lever = np.array([settings.config.antenna_x_m, settings.config.antenna_y_m, 0.0])
         self.graph = SpaceGraph(block_diag(corrections.cov, _NO_SIGMA**2), odometry.accelerometer_sigma, lever=lever)
         self._queue = PositionQueue()
         self._excitation = Excitation(track_m, corrections.min_track_over_radius)

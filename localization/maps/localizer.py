@@ -236,7 +236,7 @@ class Localizer:
 
     def _is_beyond_fix(self, pose: Pose2) -> bool:
         """Whether a measured position contradicts ``pose`` (3,) of the map."""
-        return self._fix is not None and self._fix.square(pose[:2], _SAME_COV[:2, :2]) > OUTLIER_SIGMAS**2
+        return self._fix is not None and self._fix.squared_mahalanobis(pose[:2], _SAME_COV[:2, :2]) > OUTLIER_SIGMAS**2
 
     def _is_outlier(self, measured: Pose2, cov: Cov3) -> bool:
         return mahalanobis(self.pose, measured, cov) > OUTLIER_SIGMAS**2

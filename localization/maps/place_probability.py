@@ -75,7 +75,7 @@ def weigh(places: Sequence[Place], n_points: int, weights: Weights = SEARCH_WEIG
 def with_fix(found: Sequence[PlaceHypothesis], fix: PositionFix) -> list[PlaceHypothesis]:
     """``found`` near a measured position, by Bayes: probabilities times the density of ``fix`` at each place. That none of them is right
     has the mean density over the window of 3 sigma that was searched."""
-    densities = np.exp([-0.5 * fix.square(place.pose[:2], np.zeros((2, 2))) for place in found])
+    densities = np.exp([-0.5 * fix.squared_mahalanobis(place.pose[:2], np.zeros((2, 2))) for place in found])
     elsewhere = 2.0 * math.pi * math.sqrt(float(np.linalg.det(fix.cov))) / (36.0 * float(np.trace(fix.cov)))
     products = densities * [place.probability for place in found]
     total = products.sum() + elsewhere * (1.0 - sum(place.probability for place in found))

@@ -28,8 +28,8 @@ class PositionFix(NamedTuple):
         """(2, 2) of where the robot is now [m^2]."""
         return self.measured_cov + 0.5 * self.way_m**2 * np.eye(2)
 
-    def square(self, position: FloatArray, cov: FloatArray) -> float:
-        """Squared distance of a ``position`` (2,) with ``cov`` (2, 2) [sigma^2]."""
+    def squared_mahalanobis(self, position: FloatArray, cov: FloatArray) -> float:
+        """Squared Mahalanobis distance (x - p)^T (C + P)^-1 (x - p) of a ``position`` (2,) with ``cov`` (2, 2) from this one [-]."""
         off = position - self.position
         return float(off @ np.linalg.solve(self.cov + cov, off))
 
