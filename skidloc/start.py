@@ -26,9 +26,7 @@ def clash() -> str | None:
 
 def main() -> int:
     """Run the command line; returns its exit code, 2 where the installation is damaged."""
-    problem = clash()
-    if problem is not None:
-        print(f"skidloc: {problem}", file=sys.stderr)
+    if _is_damaged():
         return 2
     from localization.cli import main as run
 
@@ -36,10 +34,19 @@ def main() -> int:
 
 
 def node() -> int:
-    """Run the managed node; returns its exit code, 2 for bad input."""
+    """Run the managed node; returns its exit code, 2 for bad input and where the installation is damaged."""
+    if _is_damaged():
+        return 2
     from localization.blas_threads import use_one_blas_thread
 
     use_one_blas_thread()
     from localization.ros.lifecycle import main as run
 
     return run()
+
+
+def _is_damaged() -> bool:
+    problem = clash()
+    if problem is not None:
+        print(f"skidloc: {problem}", file=sys.stderr)
+    return problem is not None

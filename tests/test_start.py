@@ -7,15 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from skidloc.start import clash
 
 
-def test_start_beside_a_foreign_localization_names_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("start", ["main", "node"])
+def test_start_beside_a_foreign_localization_names_it(start: str, tmp_path: Path) -> None:
     info = tmp_path / "localization-0.1.7.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: localization\nVersion: 0.1.7\n")
     (info / "RECORD").write_text("localization/__init__.py,,\n")
-    code = f"import sys; sys.path.append({str(tmp_path)!r}); from skidloc.start import main; sys.exit(main())"
+    code = f"import sys; sys.path.append({str(tmp_path)!r}); from skidloc import start; sys.exit(start.{start}())"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ended.returncode == 2
     assert "pip uninstall localization" in ended.stderr
