@@ -202,7 +202,8 @@ class Localizer:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
         likely, cov = self._align(points), self._cov
         place = likely or self.places.align(points, self.pose, cov)
-        self.is_outside = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
+        is_unmapped = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
+        self.is_outside = is_unmapped and (likely is None or is_narrow(cov))  # what a search finds likely is where the map has walls
         if likely is None:
             self._is_doubtful |= place.contradicting >= _CONTRADICTING_SHARE
         if likely is None or self.is_outside:
