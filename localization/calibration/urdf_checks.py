@@ -58,6 +58,11 @@ def check_urdf(urdf: WheelGeometry, values: Mapping[str, float], measured: Wheel
     if len(urdf.left) != len(urdf.right):
         left, right = ", ".join(urdf.left), ", ".join(urdf.right)
         found.missing.append(f"wheels: {left} on the left, but {right} on the right; the models here have as many on both sides.")
+    if urdf.off_axis:
+        where = "not about the axes of their joints"
+        found.contradictions.append(
+            Contradiction("wheels", f"the URDF's shapes of {first_names(urdf.off_axis)}", where, "joints are taken")
+        )
     _check_axes(found, urdf, measured)
     _check_radii(found, urdf, values)
     if TRACKS not in urdf.kinds:  # of tracks no sprocket need be in the middle

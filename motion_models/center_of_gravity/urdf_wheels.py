@@ -45,6 +45,8 @@ _ALONG = 0.9
 """Component of a unit axis from which it lies along a coordinate axis (25 degrees: cambered wheels count)."""
 _SAME_M = 0.02
 """Wheels whose x differs by less stand on one axle, and within half of it of the middle plane on no side [m]."""
+_ECCENTRIC = 0.5
+"""Distance of a shape's centre from its joint's axis over its radius beyond which it is no wheel there: its place is a mistake."""
 _SMALL = 0.6
 """Radius over that of the largest wheels below which wheels are casters; driven wheels of one robot reach 0.7 (tractors)."""
 _SAME_RADIUS = 1.1
@@ -71,6 +73,8 @@ class _Wheel(NamedTuple):
     """[m]; NaN without a cylinder or sphere."""
     axis: FloatArray
     """(3,) in the body frame."""
+    is_off_axis: bool
+    """Whether its shape does not turn about its middle: its place is that of the joint."""
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,8 @@ class WheelGeometry:
     """Different radii of the wheels' shapes [m]."""
     axes: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """Axis of each wheel that turns in the body frame."""
+    off_axis: tuple[str, ...] = ()
+    """Wheels whose shapes do not turn about their middles; their contacts are taken below their joints."""
     kinds: tuple[str, ...] = ()
     """Words for what no differential drive of wheels is: mecanum, omni, tracks, casters, steered wheels."""
     casters: tuple[str, ...] = ()
@@ -181,6 +187,7 @@ def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> Whee
         has_shapes=bool(radii),
         radii=tuple(sorted(set(radii))),
         axes={w.name: (float(w.axis[0]), float(w.axis[1]), float(w.axis[2])) for w in driven if np.isfinite(w.axis).all()},
+        off_axis=tuple(wheel.name for wheel in driven if wheel.is_off_axis),
         kinds=tuple(dict.fromkeys((*kinds, *([CASTERS] if passive else [])))),
         casters=tuple(wheel.name for wheel in passive),
         has_names=found.has_names,
@@ -313,7 +320,7 @@ class _Finder:
         return np.asarray(self._poses[joint.child][0] @ joint.axis)
 
     def _wheel(self, joint: Joint) -> _Wheel:
-        """A wheel with the largest shape of its link or of one that is fixed to it."""
+        """A wheel with the largest shape of its link or of one that is fixed to it, if that turns about its middle."""
         rigid = {joint.child}
         for other in self._urdf.joints:
             if other.kind == "fixed" and other.parent in rigid:
@@ -321,7 +328,10 @@ class _Finder:
         link = max(rigid, key=lambda name: (self._shapes.get(name, (0.0, None))[0], name == joint.child))
         radius, center = self._shapes.get(link, (math.nan, np.zeros(3)))
         rotation, translation = self._poses[link]
-        return _Wheel(joint.name, translation + rotation @ center, radius, self._axis(joint))
+        axis, hub = self._axis(joint), self._poses[joint.child][1]
+        place = translation + rotation @ center
+        is_off_axis = bool(np.linalg.norm(np.cross(axis, place - hub)) > _ECCENTRIC * radius)  # False without an axis
+        return _Wheel(joint.name, hub if is_off_axis else place, radius, axis, is_off_axis)
 
 
 def _turns(joint: Joint) -> bool:

@@ -369,6 +369,10 @@ KINDS = {
         )
     ),
     "wheels that are fixed": Kind(urdf(wheels(kind="fixed"))),
+    "shapes at their joints' origins again": Kind(
+        urdf("".join(wheel(n, x, y, shape=CYLINDER.replace("<origin", f'<origin xyz="{x} {y} 0"')) for n, (x, y) in FOUR.items())),
+        named=("not about the axes of their joints",),
+    ),
     "ackermann": Kind(
         urdf(
             wheels(of("rear")),
