@@ -58,6 +58,8 @@ class Clock:
     """By how much the LiDAR's stamps are late [s]."""
     gyro_time_offset_s: float = 0.0
     """By how much the IMU's stamps are late [s]."""
+    sigma_s: float = 0.0
+    """By how much all stamps, so corrected, may be off [s]: the poses' covariance has the way in that time."""
 
 
 @dataclass(frozen=True)

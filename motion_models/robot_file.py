@@ -209,6 +209,8 @@ def _clock(data: Mapping[str, Any], source: str) -> Clock:
             raise RobotError(
                 f"{source}: clock.{entry} is {value:g} s; it must be at most {_LARGEST_CLOCK_OFFSET_S:g}. Synchronize the clocks."
             )
+    if clock.sigma_s < 0.0:
+        raise RobotError(f"{source}: clock.sigma_s is {clock.sigma_s:g} s; it must be at least 0.")
     return clock
 
 

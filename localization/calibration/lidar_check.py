@@ -2,7 +2,8 @@
 
 A turned LiDAR travels in another direction than the wheels, and turns alike; wheels that count backwards turn the other way as well. That
 decides between the two. Healthy mounts are recognised after a metre of driving. One that turns opposite to wheels and gyro is upside down;
-of the three sensors one may turn later than the two others, by another clock. With a gyro the drive is read until it has turned.
+of the three sensors one may turn later than the two others, by another clock; wheels that turn later than a LiDAR alone are brought to its
+clock, and the covariance has the way in that time. The drive is read until it has turned.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.calibration.lidar_turns import GyroHeading, LidarTurns, compare_turns
+from localization.calibration.lidar_turns import GyroHeading, LidarTurns, compare_clocks, compare_turns
 from localization.calibration.wheel_units import CORRECTED
 from localization.calibration.wheel_wiring import WiringReport, open_checked
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.lidar import LidarConfig
 from localization.logs import Log, TopicOverrides, open_log
+from localization.sensor_checks.clocks import apart_message
 from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models import se2
 from motion_models.robot import Clock, Mount, Robot
@@ -55,7 +57,8 @@ class LidarFinding:
     is_certain: bool = False
     """More driving would not change it."""
     clock: Clock | None = None
-    """The clocks that are used in place of the robot file's, where that of LiDAR, gyro or wheels is another than the two others'."""
+    """The clocks that are used in place of the robot file's, where that of LiDAR, gyro or wheels is another than the two others', or where
+    those of wheels and LiDAR are apart."""
 
     @property
     def is_corrected(self) -> bool:
@@ -136,7 +139,7 @@ class LidarCheck:
 
     def _is_healthy(self, frame: str) -> bool:
         direction = _direction(*self._compare(frame)[:2])
-        is_known = self._gyro is None or self._by_turns(frame) is not None
+        is_known = self._is_clock_known or (self._wheels_late_s(frame) if self._gyro is None else self._by_turns(frame)) is not None
         return direction is not None and abs(direction) <= _MAX_SLIDE_RAD and is_known
 
     def _by_turns(self, frame: str) -> LidarTurns | None:
@@ -145,6 +148,13 @@ class LidarCheck:
             return None
         t, ways = _ways(self._wheels, self._radius_m)
         return compare_turns(self._travels[frame].rows, (t, ways[:, 1] - ways[:, 0]), self._gyro, self._wheels[0].stamp_ns)
+
+    def _wheels_late_s(self, frame: str) -> float | None:
+        """Against the LiDAR's stamps [s], without a gyro; None where turns do not show it."""
+        if len(self._wheels) < 2:
+            return None
+        t, ways = _ways(self._wheels, self._radius_m)
+        return compare_clocks(self._travels[frame].rows, (t, ways[:, 1] - ways[:, 0]), self._wheels[0].stamp_ns)
 
     def _is_contradicted(self, frame: str) -> bool:
         by_wheels, by_scans, _ = self._compare(frame)
@@ -175,6 +185,8 @@ class LidarCheck:
         direction = _direction(by_wheels, by_scans)
         if by_turns is not None and by_turns.late_s and not self._is_clock_known:
             return self._other_clock(frame, by_turns)
+        if self._gyro is None and not self._is_clock_known and (late_s := self._wheels_late_s(frame)):
+            return self._clocks_apart(frame, late_s)
         if by_turns is not None and by_turns.is_opposite:
             return None if direction is None else self._upside_down(frame, direction)
         if direction is None or abs(direction) <= _MAX_SLIDE_RAD:
@@ -222,6 +234,13 @@ class LidarCheck:
             f" the clocks of two computers, or stamps of arrival. {CORRECTED} clock.{key} = {value:g}, or synchronize the clocks."
         )
         return LidarFinding(text, frame, None, is_certain=True, clock=replace(self._robot.clock, **{key: value}))
+
+    def _clocks_apart(self, frame: str, late_s: float) -> LidarFinding:
+        """Wheels and LiDAR alone: the wheels' stamps are later by ``late_s`` [s]."""
+        clock = self._robot.clock
+        right = replace(clock, wheel_time_offset_s=round(clock.wheel_time_offset_s + late_s, 2), sigma_s=abs(late_s))
+        text = apart_message("LiDAR", late_s, right.wheel_time_offset_s, round(clock.lidar_time_offset_s - late_s, 2))
+        return LidarFinding(text, frame, None, is_certain=True, clock=right)
 
 
 def check_lidar(log: Log, is_clock_known: bool = False) -> LidarFinding | None:

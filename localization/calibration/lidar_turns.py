@@ -1,4 +1,5 @@
-"""Turns by scans, wheels and gyro against each other: a LiDAR upside down, or one of the three with another clock than both others."""
+"""Turns by scans, wheels and gyro against each other: a LiDAR upside down, or one of the three with another clock than both others; without
+a gyro, two clocks that are apart."""
 
 from __future__ import annotations
 
@@ -23,9 +24,14 @@ step [s]. Clocks that are further apart are set by the times of recording."""
 _SAME_CLOCK_S = 0.1
 """Largest offset between two sensors that agree."""
 _CLEARER = 3.0
-"""How many times nearer to 1 the correlation with an offset is than that without."""
+"""How many times nearer to 1 the correlation with an offset is than that without, or that with any other one."""
+_MIN_APART_S = 0.2
+"""Smallest offset of two sensors alone that is named [s], and from which on offsets are others: smaller ones the filter learns without an
+error. Wheels are up to 0.17 s off on fr079, ACES and MIT-CSAIL."""
 
 
+Rows = Sequence[tuple[int, int, Pose2]]
+"""Begin and end [ns] of intervals, and the motion (3,) in each."""
 Track = tuple[FloatArray, FloatArray]
 """Times (n,) [s] and headings (n,) [rad]."""
 Sensor = Literal["lidar", "gyro", "wheel"]
@@ -43,13 +49,15 @@ class LidarTurns(NamedTuple):
 
 
 class _Offset(NamedTuple):
-    """Offset of a sensor's stamps against the gyro's, at which their turns are most alike."""
+    """Offset of a sensor's stamps against those of another, at which their turns are most alike."""
 
     late_s: float
     likeness: float
     """Correlation about zero there, of the larger size of all offsets."""
     is_clear: bool
     """Whether it is clearly larger than without an offset."""
+    is_only: bool
+    """Whether it is clearly larger than with any offset `_MIN_APART_S` away."""
 
 
 class GyroHeading:
@@ -77,14 +85,25 @@ class GyroHeading:
         return t, np.r_[0.0, np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t))][: len(t)]
 
 
-def compare_turns(rows: Sequence[tuple[int, int, Pose2]], wheels: Track, gyro: GyroHeading, origin_ns: int) -> LidarTurns | None:
+def compare_clocks(rows: Rows, wheels: Track, origin_ns: int) -> float | None:
+    """By how much the wheels' stamps are later than the scans' [s], by their turns; 0 for a latency, which the filter learns. None where
+    the turns so far show no single offset. Arguments as of `compare_turns`."""
+    edges, scans = _turns_by_scans(rows, origin_ns)
+    if len(scans) < _MIN_INTERVALS or np.abs(scans).sum() < _MIN_TURN_RAD:
+        return None
+    offset = _offset(scans, wheels, edges)
+    if offset.likeness < _SURE_LIKENESS or not offset.is_only:
+        return None
+    return -round(offset.late_s, 2) if abs(offset.late_s) >= _MIN_APART_S else 0.0
+
+
+def compare_turns(rows: Rows, wheels: Track, gyro: GyroHeading, origin_ns: int) -> LidarTurns | None:
     """``rows``: begin and end [ns] of intervals and the motion (3,) by scans. ``wheels``: times (n,) [s] after ``origin_ns`` and right less
     left way (n,) [m]. None for too few turns; nothing is shown where wheels and gyro do not agree."""
     heading = gyro.since(origin_ns)
     if not len(heading[0]):
         return None
-    edges = np.array([[begin - origin_ns, end - origin_ns] for begin, end, _ in rows]).reshape(-1, 2) * 1e-9
-    scans = np.array([delta[2] for _, _, delta in rows])
+    edges, scans = _turns_by_scans(rows, origin_ns)
     by_wheels = _turns(wheels, edges, 0.0)
     by_gyro = _turns(heading, edges, 0.0)
     known = np.isfinite(by_wheels) & np.isfinite(by_gyro)
@@ -94,6 +113,12 @@ def compare_turns(rows: Sequence[tuple[int, int, Pose2]], wheels: Track, gyro: G
     if wheels_offset.likeness < _SURE_LIKENESS or abs(scans_offset.likeness) < _SURE_LIKENESS:
         return LidarTurns()
     return LidarTurns(scans_offset.likeness < 0.0, *_odd_clock(wheels_offset, scans_offset))
+
+
+def _turns_by_scans(rows: Rows, origin_ns: int) -> tuple[NDArray[np.float64], FloatArray]:
+    """Begin and end (N, 2) of the intervals after ``origin_ns`` [s], and the turns (N,) in them [rad]."""
+    edges = np.array([[begin - origin_ns, end - origin_ns] for begin, end, _ in rows]).reshape(-1, 2) * 1e-9
+    return edges, np.array([delta[2] for _, _, delta in rows])
 
 
 def _odd_clock(wheels: _Offset, scans: _Offset) -> tuple[Sensor, float]:
@@ -114,8 +139,9 @@ def _offset(turns: FloatArray, heading: Track, edges: NDArray[np.float64]) -> _O
     offsets = np.arange(-round(_MAX_LATE_S / _STEP_S), round(_MAX_LATE_S / _STEP_S) + 1) * _STEP_S
     found = np.array([_likeness(_turns(heading, edges, late), turns) for late in offsets])
     best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])
-    is_clear = 1.0 - abs(at_zero) > _CLEARER * (1.0 - abs(found[best]))
-    return _Offset(float(offsets[best]), float(found[best]), is_clear)
+    others = np.abs(found)[np.abs(offsets - offsets[best]) > _MIN_APART_S]
+    is_clear, is_only = (1.0 - other > _CLEARER * (1.0 - abs(found[best])) for other in (abs(at_zero), others.max()))
+    return _Offset(float(offsets[best]), float(found[best]), is_clear, bool(is_only))
 
 
 def _turns(heading: Track, edges: NDArray[np.float64], late_s: float) -> FloatArray:

@@ -293,10 +293,9 @@ def _lidar_rows(checked: CheckedLog, signals: WheelSignals, motion: LidarMotion 
     if log.sources.lidar is None:
         return []
     name, frame = "mount of LiDAR", log.frames.get(log.sources.lidar.topic, "")
+    source = f"turns by LiDAR{', wheels and gyro' if log.sources.imu is not None else ' and wheels'}"
     rows = [
-        CheckRow(
-            "clocks", "as in the robot file", "turns by LiDAR, wheels and gyro", "contradiction", found.text.replace(CORRECTED, _IN_FILE)
-        )
+        CheckRow("clocks", "as in the robot file", source, "contradiction", found.text.replace(CORRECTED, _IN_FILE))
         for found in checked.lidar
         if found.clock is not None
     ]

@@ -34,7 +34,8 @@ from motion_models.se2 import Pose2
 class SensorChecks:
     """`apply` to each step before the estimator, `inflate` its estimate afterwards."""
 
-    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig) -> None:
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, clock_sigma_s: float = 0.0) -> None:
+        """``clock_sigma_s``: by how much the clock of the poses may be off [s]."""
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
@@ -52,7 +53,7 @@ class SensorChecks:
         self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
         self._watching = tuple(check for check in self._applying if not check.is_of_declared_faults)
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
-        self._clocks = ClockCheck(faults)
+        self._clocks = ClockCheck(faults, clock_sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None

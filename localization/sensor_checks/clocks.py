@@ -6,6 +6,8 @@ the one that is off, what is published for t is the pose at t - late: an error o
 
 from __future__ import annotations
 
+from typing import Literal
+
 from localization.estimators import Estimator
 from localization.sensor_checks.faults import FaultLog, SensorFault
 
@@ -16,26 +18,32 @@ CLOCKS_APART = SensorFault(
 )
 
 
+def _numbers(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: float, other_s: float) -> dict[str, float | str]:
+    direction = "later" if late_s > 0.0 else "earlier"
+    return {"other": other, "role": other.lower(), "seconds": abs(late_s), "direction": direction, "late": wheels_s, "early": other_s}
+
+
+def apart_message(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: float, other_s: float) -> str:
+    """That the wheels' stamps are later than the ``other`` sensor's by ``late_s`` [s]; ``wheels_s`` and ``other_s`` are the offsets that
+    correct either [s]."""
+    return CLOCKS_APART.message.format(**_numbers(other, late_s, wheels_s, other_s))
+
+
 class ClockCheck:
     """`add` the estimator after each step: clocks that are apart are declared, and inflate the covariance while the robot moves."""
 
-    def __init__(self, faults: FaultLog) -> None:
-        self._faults = faults
+    def __init__(self, faults: FaultLog, sigma_s: float) -> None:
+        """``sigma_s``: by how much the clock of the poses may be off, whatever the drive shows [s]."""
+        self._faults, self._sigma_s = faults, sigma_s
+        self._faults.inflation.late_s = sigma_s
         self._reported_s = 0.0
 
     def add(self, estimator: Estimator) -> None:
         """Take the clock offset after a step."""
         apart = estimator.clocks_apart
-        self._faults.inflation.late_s = 0.0 if apart is None else apart.late_s
-        if apart is None or (late_s := round(apart.late_s, 2)) == self._reported_s:
+        late_s = 0.0 if apart is None else round(apart.late_s, 2)
+        self._faults.inflation.late_s = max(self._sigma_s, abs(late_s))
+        if apart is None or late_s == self._reported_s:
             return
         self._reported_s = late_s
-        numbers: dict[str, float | str] = {
-            "other": apart.other,
-            "role": apart.other.lower(),
-            "seconds": abs(late_s),
-            "direction": "later" if late_s > 0.0 else "earlier",
-            "late": late_s,
-            "early": -late_s,
-        }
-        self._faults.update(CLOCKS_APART, 0.0, numbers)
+        self._faults.update(CLOCKS_APART, 0.0, _numbers(apart.other, late_s, late_s, -late_s))

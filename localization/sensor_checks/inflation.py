@@ -36,7 +36,6 @@ class CovarianceInflation:
         """(3,) difference of wheels and scans while objects move in these."""
         self.possible: FloatArray | None = None
         """(3,) the same while that is not decided: no fault yet."""
-
         self.late_s = 0.0
         """By how much the clock of the poses may be off [s]."""
 

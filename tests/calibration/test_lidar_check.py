@@ -6,17 +6,20 @@ import dataclasses
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from localization.calibration.lidar_check import check_lidar, corrected
+from localization.calibration.lidar_check import check_lidar, corrected, open_log_checked
 from localization.evaluation.references import reference_track
 from localization.evaluation.scores import score
 from localization.events import ImuSample, WheelSample
 from localization.log_replay import replay
 from localization.logs import Log, open_log
 from localization.pipeline import Trial
+from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
+from tests.helpers.entrance_drives import Publishing, Vehicle, drive, write
 from tests.helpers.extended import cases
 from tests.helpers.online import ROBOT, drive_log
 
@@ -81,3 +84,22 @@ def test_lidar_yaw_without_a_turn_names_both_causes(monkeypatch: pytest.MonkeyPa
     assert found is not None
     assert found.mount is None
     assert "or all wheels count backwards" in found.text
+
+
+@pytest.mark.extended
+def test_lidar_clock_apart_from_wheels_alone_is_in_the_covariance(tmp_path: Path) -> None:
+    """From the first metre on; which of both clocks is off, no third sensor shows."""
+    vehicle = Vehicle(scan_hz=8.0, imu_hz=0.0, seed=5)
+    motion = drive(vehicle)
+    checked = open_log_checked(write(tmp_path / "log.mcap", vehicle, motion, Publishing(offsets_s={"/scan": 0.4})), vehicle.robot())
+    assert checked.log.robot.clock.wheel_time_offset_s == pytest.approx(-0.4, abs=0.03)
+    trial = Trial(make_model("skid_steer", checked.log.robot), "ekf")
+    (run,) = replay(checked.log.events(), [trial], checked.log.robot, checked.mounts, has_lidar=True)
+    truth, found = motion.trajectory(), run.trajectory
+    inside = (found.stamps_ns >= truth.stamps_ns[0]) & (found.stamps_ns <= truth.stamps_ns[-1])
+    true = truth.at(found.stamps_ns[inside])
+    errors = np.linalg.norm((found.poses[inside] - se2.between(true[0], true))[:, :2], axis=1)
+    assert found.covariances is not None
+    sigmas = np.sqrt(np.trace(found.covariances[inside][:, :2, :2], axis1=1, axis2=2))
+    assert (errors > 0.1).any()
+    assert ((errors > 5.0 * sigmas) & (errors > 0.1)).mean() < 0.03  # where it begins to move, 0.4 s before that is measured

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from localization.calibration.lidar_turns import GyroHeading, LidarTurns, compare_turns
+from localization.calibration.lidar_turns import GyroHeading, LidarTurns, compare_clocks, compare_turns
 from localization.events import ImuSample
 
 S = 1_000_000_000
@@ -63,3 +65,25 @@ def test_lidar_is_not_blamed_where_wheels_and_gyro_disagree() -> None:
 
 def test_lidar_turns_too_few_show_nothing() -> None:
     assert _compared(seconds=4.0) is None
+
+
+def _wheels_late_s(late_s: float, heading: Callable[[np.ndarray], np.ndarray] = np.sin, seconds: float = 30.0) -> float | None:
+    rng, t, ends = np.random.default_rng(1), np.arange(-2.0, seconds, 0.02), np.arange(0.5, seconds - 2.0, 0.5)
+    turns = heading(ends) - heading(ends - 0.5) + 0.003 * rng.normal(size=len(ends))
+    rows = [(round((end - 0.5) * S), round(end * S), np.array([0.1, 0.0, turn])) for end, turn in zip(ends, turns, strict=True)]
+    return compare_clocks(rows, (t, 0.7 * heading(t - late_s)), 0)
+
+
+@pytest.mark.parametrize("late_s", [0.5, -0.25, 1.2])
+def test_clocks_of_wheels_and_lidar_alone_are_measured_by_turns(late_s: float) -> None:
+    assert _wheels_late_s(late_s) == pytest.approx(late_s, abs=0.03)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.15, -0.15])
+def test_clocks_of_wheels_and_lidar_within_latencies_are_left_to_the_filter(late_s: float) -> None:
+    assert _wheels_late_s(late_s) == 0.0
+
+
+def test_clocks_are_unknown_while_the_turn_rate_is_constant() -> None:
+    assert _wheels_late_s(0.5, lambda t: 0.4 * t) is None
+    assert _wheels_late_s(0.5, seconds=6.0) is None

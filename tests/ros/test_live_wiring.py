@@ -82,6 +82,12 @@ LIVE = {
     "driver that turns the other way": (SCANNING, Publishing(forms="odometry", gyro=-1.0), "imu.rate_unit_rad_s = -1", 0.03),
     "LiDAR upside down": (SCANNING, Publishing(lidar_flip=True), "'laser' is mounted upside down", 0.03),
     "LiDAR 0.35 s late": (SCANNING, Publishing(offsets_s={"/scan": 0.35}), "clock.lidar_time_offset_s = 0.3", 0.03),
+    "LiDAR 0.4 s late, no gyro": (
+        Vehicle(scan_hz=8.0, imu_hz=0.0, seed=5),
+        Publishing(offsets_s={"/scan": 0.4}),
+        "no third sensor shows which",
+        0.4,
+    ),
     "swapped by the gyro alone": (Vehicle(seed=5), Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]])), "swapped, or", math.inf),
 }
 
@@ -109,7 +115,11 @@ def test_live_node_with_wrong_wiring_goes_back_to_the_start_of_the_drive(name: s
     transport = LogTransport(write(tmp_path / "log.mcap", vehicle, motion, how))
     node = started(vehicle, transport, reports)
     node.spin(transport.is_empty)
-    named = [report for report in reports if "write to the robot file" in report or "in the log decides" in report or "upside" in report]
+    named = [
+        report
+        for report in reports
+        if "write to the robot file" in report or "in the log decides" in report or "upside" in report or "third" in report
+    ]
     assert words in " ".join(named)
     assert set(named) <= set(node.warnings())
     live = track(transport)
