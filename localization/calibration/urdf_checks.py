@@ -82,7 +82,7 @@ def _check_axes(found: Findings, urdf: WheelGeometry, measured: WheelSides | Non
         )
         return
     opposite = [name for name, axis in urdf.axes.items() if axis[1] < 0.0]
-    if not opposite or len(opposite) == len(urdf.axes):
+    if not opposite:
         return
     by_log = "cannot decide"
     if measured is not None:

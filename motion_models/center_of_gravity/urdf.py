@@ -196,7 +196,7 @@ def _joint(element: ET.Element, source: str, links: Mapping[str, Link]) -> Joint
     name, kind = _name(element, source), element.get("type", "")
     where = f"{source}: joint '{name}'"
     if kind not in (*_MOVING, "fixed"):
-        raise RobotError(f"{where} is of type '{kind}'; a centre of gravity can be had for fixed, {', '.join(_MOVING)}.")
+        raise RobotError(f"{where} is of type '{kind}'; the types that are known here are fixed, {', '.join(_MOVING)}.")
     ends: list[str] = []
     for end in ("parent", "child"):
         reference = element.find(end)

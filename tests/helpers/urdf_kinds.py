@@ -311,6 +311,7 @@ KINDS = {
     "axis to the right": Kind(
         urdf(wheels(of("left")), wheels(of("right"), axis="0 -1 0")), named=("sign", "front_right_wheel, rear_right_wheel")
     ),
+    "all axes to the right": Kind(urdf(wheels(axis="0 -1 0")), named=("sign", "front_left_wheel, rear_left_wheel, front_right")),
     "z up wheel frames": Kind(urdf(wheels(rpy="-1.5708 0 0", axis="0 0 1", shape=CYLINDER.replace('rpy="1.5708 0 0"', "")))),
     "z up wheel frames, mirrored": Kind(
         urdf(wheels(of("left"), rpy="-1.5708 0 0", axis="0 0 1"), wheels(of("right"), rpy="1.5708 0 0", axis="0 0 -1")),
