@@ -138,12 +138,12 @@ def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: Candida
     after = predictor_after(predictor, candidate.corrected, predictor.model.name)
     held = candidate.held[predictor.batch.owner]
     rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
-    found = _compared_rows(rows[0][held], rows[1][held], noise.sigmas[held])
+    found = _compared_rows(rows[0][held], rows[1][held], noise.sigmas[held], noise.weights[held])
     if found is None or drive.kind == "log":
         return found
     weight = np.array([1.0, 1.0, 0.5 * drive.robot.geometry.track_width_m])
     before, now = (np.nansum((r[held, :3] * weight) ** 2, axis=1) for r in rows)
-    odometry = _compared(before, now, np.zeros(len(before)))
+    odometry = _compared(before, now, np.zeros(len(before)), noise.weights[held])
     return found if odometry is None else dataclasses.replace(found, replays={"odometry": odometry})
 
 
@@ -156,7 +156,9 @@ def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidat
     after = DrivePredictor(drive, make_model(name, new), has_inertia=predictor.has_inertia, baseline=predictor.baseline)
     of_marker = _of_reference(with_sizes(candidate.sizes), drive.is_lidar_reference)
     first, second = _paired(predictor.drive, drive, candidate.held)
-    found = _compared_rows(predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second], noise.sigmas[first])
+    weights = noise.weights[first]
+    rows = predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second]
+    found = _compared_rows(*rows, noise.sigmas[first], weights)
     if found is None or not drive.has_headings:  # chords between positions are no poses to compare with
         return found
     start_ns = int(predictor.drive.spans_ns[candidate.held, 0].min()) - _LEAD_NS
@@ -165,7 +167,7 @@ def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidat
         turn_m = 0.5 * robot.geometry.track_width_m
         errors.append({run.estimator: _window_error(run, cut, windows, turn_m) for run in reader.runs(robot, name, start_ns)})
     variances = _window_noise(noise, first, 0.5 * old.geometry.track_width_m)
-    compared = {estimator: _compared(errors[0][estimator], errors[1][estimator], variances) for estimator in errors[0]}
+    compared = {estimator: _compared(errors[0][estimator], errors[1][estimator], variances, weights) for estimator in errors[0]}
     return dataclasses.replace(found, replays={estimator: one for estimator, one in compared.items() if one is not None})
 
 
@@ -184,22 +186,30 @@ def _first_half_sizes(predictor: DrivePredictor, linearization: Linearization, n
     return dict(zip(causes, (float(v) for v in sizes), strict=True))
 
 
-def _compared_rows(before: FloatArray, after: FloatArray, sigmas: FloatArray) -> HandoverCheck | None:
+def _compared_rows(before: FloatArray, after: FloatArray, sigmas: FloatArray, weights: FloatArray) -> HandoverCheck | None:
     """Discrepancies ``before`` and ``after`` (M, 6) of windows that were held out; None where nothing was measured in both.
 
     The gain is the share by which errors over their noise ``sigmas`` (M, 6) shrink in the components that the file changes: the scatter of
-    the others, and of a component that is measured less well, would hide it.
+    the others, and of a component that is measured less well, would hide it. Windows count by the ``weights`` (M,) of the noise, as in the
+    fit: one in which the reference jumps is as far off by any file, and would decide alone.
     """
     shown = [c for c in range(4) if all(np.isfinite(r[:, c]).any() for r in (before, after))]
     if not shown:
         return None
-    before_rms, after_rms = ({CHANNELS[c]: float(np.sqrt(np.nanmean(r[:, c] ** 2))) for c in shown} for r in (before, after))
+    before_rms, after_rms = ({CHANNELS[c]: _root_mean(r[:, c] ** 2, weights) for c in shown} for r in (before, after))
     moved = np.nan_to_num(np.abs(after - before) / sigmas)
     changed = [c for c in shown if moved[:, c].max() > _LEAST_CHANGE] or shown
-    squares = [np.sum(np.nan_to_num(r[:, changed] / sigmas[:, changed]) ** 2, axis=1) for r in (before, after)]
+    scale = weights[:, None] / sigmas[:, changed]
+    squares = [np.sum(np.nan_to_num(r[:, changed] * scale) ** 2, axis=1) for r in (before, after)]
     first, second = (s / max(float(squares[0].mean()), 1e-12) for s in squares)
     gain = root_mean_gain(first, second, np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
     return HandoverCheck(before_rms, after_rms, len(before), gain)
+
+
+def _root_mean(squares: FloatArray, weights: FloatArray) -> float:
+    """Root of the mean of ``squares`` (n,) where these are known, by the squares of the windows' ``weights`` (n,)."""
+    known = np.isfinite(squares)
+    return math.sqrt(float(np.average(squares[known], weights=weights[known] ** 2)))
 
 
 def _of_sensors(hypothesis: Hypothesis) -> Hypothesis:
@@ -214,13 +224,13 @@ def _of_reference(hypothesis: Hypothesis, is_lidar_reference: bool) -> Hypothesi
     return Hypothesis(lidar_offset=hypothesis.lidar_offset, lidar_time_offset_s=hypothesis.lidar_time_offset_s)
 
 
-def _compared(before: FloatArray, after: FloatArray, noise: FloatArray) -> Replayed | None:
+def _compared(before: FloatArray, after: FloatArray, noise: FloatArray, weights: FloatArray) -> Replayed | None:
     """Squared errors (W,) of one estimator in the same windows with both files, and the variance of their noise (W,), where both runs
-    cover the windows; None where none do."""
+    cover the windows, which count by their ``weights`` (W,); None where none do."""
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
-    return Replayed(*(math.sqrt(float(squares[known].mean())) for squares in (before, after, noise)))
+    return Replayed(*(_root_mean(squares[known], weights[known]) for squares in (before, after, noise)))
 
 
 def _paired(before: Drive, after: Drive, held: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:

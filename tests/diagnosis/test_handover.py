@@ -1,0 +1,32 @@
+"""What is written must be better on windows that were held out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Hypothesis
+from localization.diagnosis.drive_predictor import DrivePredictor
+from localization.diagnosis.handover import check_findings
+from localization.diagnosis.linearization import TOLERANCE, linearize
+from motion_models.registry import make_model
+from tests.helpers.law_drives import law_drive, measured_under
+
+
+def test_check_findings_jump_of_the_reference_does_not_decide() -> None:
+    """Wheels 2 % larger, and one window held out in which the reference jumps by a metre, as far off by any file."""
+    drive = law_drive("husky_a200")
+    model = make_model("friction", drive.robot)
+    larger = Hypothesis(left_radius_scale=0.02, right_radius_scale=0.02)
+    *others, last = measured_under(drive, model, larger, np.random.default_rng(0)).maneuvers
+    jump = dataclasses.replace(last, measured=last.measured + np.array([1.0, 0.0, 0.0]))
+    predictor = DrivePredictor(dataclasses.replace(drive, maneuvers=(*others, jump)), model, has_inertia=False)
+    state = linearize(predictor, (CAUSES["wheel_radius_scale"],), {}, TOLERANCE)
+    found = check_findings(predictor, state, ["wheel_radius_scale"])
+    assert found is not None
+    assert found.is_better
+    assert found.after["x"] < 0.5 * found.before["x"]
+    assert found.after["x"] == pytest.approx(0.0, abs=0.01)
