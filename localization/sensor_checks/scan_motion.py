@@ -8,6 +8,7 @@ Sensor checks compare it with the other sensors; it is never fused.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -98,11 +99,27 @@ def profile_of(scan: Scan, mount: Mount, config: LidarConfig) -> Profile | None:
     if not scan.is_planar:
         sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
         return make_profile(sweep.project(sweep.points) - center, center)
-    points = scan.points @ mount.rotation().T
-    at_body = points + np.array([mount.x, mount.y, mount.z])
-    r2 = np.einsum("ni,ni->n", at_body, at_body)
-    is_within = (r2 >= config.min_range_m**2) & (r2 <= config.max_range_m**2)  # NaN is not
-    return make_profile(points[is_within, :2], center)
+    points = scan.points @ rotation_of(mount).T
+    n = _keep_within(points, (mount.x, mount.y, mount.z), config.min_range_m**2, config.max_range_m**2)
+    return make_profile(points[:n, :2], center)
+
+
+@lru_cache(maxsize=16)
+def rotation_of(mount: Mount) -> FloatArray:
+    """(3, 3) `Mount.rotation`, which is not to be changed."""
+    return mount.rotation()
+
+
+@kernel
+def _keep_within(points: FloatArray, sensor: Triple, least: float, most: float) -> int:
+    """Move those ``points`` (N, 3) about the ``sensor`` to the front whose squared distance from the body is from ``least`` to ``most``
+    [m^2]; their number. NaN is not."""
+    n = 0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0] + sensor[0], points[i, 1] + sensor[1], points[i, 2] + sensor[2]
+        if least <= x * x + y * y + z * z <= most:
+            points[n, 0], points[n, 1], n = points[i, 0], points[i, 1], n + 1
+    return n
 
 
 def make_profile(points: Points2, center: FloatArray) -> Profile | None:
@@ -180,14 +197,16 @@ def _connect(surface: FloatArray, ranges: FloatArray) -> None:
 @kernel
 def _correlate(a: FloatArray, b: FloatArray) -> float:
     """Turn [rad] from profile ``a`` to ``b``, log-ranges (180,), at their least mean difference; NaN where they share too few bearings."""
-    best, turn = np.inf, np.nan
-    for shift in range(-_MAX_TURN_BINS, _MAX_TURN_BINS + 1):
-        n, cost = 0, 0.0
-        for i in range(BEARINGS):
+    best, turn, most = np.inf, np.nan, min(_count(a), _count(b))
+    for k in range(2 * _MAX_TURN_BINS + 1):
+        shift = (k + 1) // 2 if k % 2 else -(k // 2)  # the smallest first
+        n, cost, i = 0, 0.0, 0
+        while i < BEARINGS and cost < most * best:  # else its mean cannot be less
             difference = abs(a[i] - b[(i - shift) % BEARINGS])
             if not math.isnan(difference):
                 n += 1
                 cost += difference
+            i += 1
         if n >= _MIN_BEARINGS and cost / n < best:
             best, turn = cost / n, shift * _BIN_RAD
     return turn

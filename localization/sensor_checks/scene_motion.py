@@ -104,7 +104,7 @@ def _add_near(surface: FloatArray, normals: FloatArray, points: Points2, x: Trip
         nx, ny = normals[k, 0], normals[k, 1]
         dx, dy = wx - surface[k, 0], wy - surface[k, 1]
         r = nx * dx + ny * dy
-        if not abs(r) < width * (_STATIC_M + _STATIC_SHARE * math.hypot(wx, wy)) or abs(dx) + abs(dy) > _MAX_DISTANCE_M:
+        if not abs(r) < width * (_STATIC_M + _STATIC_SHARE * math.sqrt(wx * wx + wy * wy)) or abs(dx) + abs(dy) > _MAX_DISTANCE_M:
             continue
         bx, by = c * nx + s * ny, -s * nx + c * ny
         J = (bx, by, px * by - py * bx)
@@ -126,7 +126,7 @@ def _label(reference: Profile, points: Points2, x: Triple, labels: Labels) -> tu
         wx, wy = x[0] + c * points[i, 0] - s * points[i, 1], x[1] + s * points[i, 0] + c * points[i, 1]
         if math.isnan(wx):
             continue
-        distance, k = math.hypot(wx, wy), bearing_bin(wx, wy)
+        distance, k = math.sqrt(wx * wx + wy * wy), bearing_bin(wx, wy)
         nearest, tolerance = math.inf, _STATIC_M + _STATIC_SHARE * distance
         for m in range(k - 1, k + 2):
             m = m % BEARINGS
@@ -136,8 +136,10 @@ def _label(reference: Profile, points: Points2, x: Triple, labels: Labels) -> tu
             nearest = min(nearest, ranges[m])
             dx, dy = wx - surface[m, 0], wy - surface[m, 1]
             off = abs(normals[m, 0] * dx + normals[m, 1] * dy)
-            if math.hypot(dx, dy) < tolerance or (off < tolerance and abs(dx) + abs(dy) < 3.0 * tolerance + 0.05 * distance):
+            is_near = dx * dx + dy * dy < tolerance * tolerance
+            if is_near or (off < tolerance and abs(dx) + abs(dy) < 3.0 * tolerance + 0.05 * distance):
                 labels[i] = STILL
+                break
         if labels[i] != STILL and distance < nearest - _FREE_M - _FREE_SHARE * nearest:
             labels[i] = MOVED
             moved += 1
