@@ -255,6 +255,15 @@ class Step:
         D = self.predicted.d_cg
         return np.asarray(self.predicted.cov + D @ self.cg_cov @ D.T)
 
+    def without_scan(self) -> Step:
+        """The step whose scan is not used."""
+        return self if self.scan is None else replace(self, scan=None, is_scan_excluded=True)
+
+    def without_wheels(self, unknown: FloatArray) -> Step:
+        """The step whose wheels are not used: ``unknown`` (3, 3) is added to the covariance of its motion, its twist is by the gyro."""
+        motion = replace(self.predicted, cov=self.predicted.cov + unknown)
+        return replace(self, predicted=motion, twist=turn_twist(self.turn), is_standing=False, has_wheels=False)
+
     @property
     def twist_change(self) -> FloatArray:
         """(3,) by the wheels from the mean of the step to its end; zero where they are not used."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,18 +12,16 @@ from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.clocks import ClockCheck
+from localization.sensor_checks.contradictions import Contradictions, GyroRate
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MovingObjects
 from localization.sensor_checks.own_body import OwnBody
-from localization.sensor_checks.sensor_check import SensorCheck
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
-from localization.sensor_checks.travel_direction import TravelDirection
-from localization.sensor_checks.turn_rates import GyroRate, TurnRates
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
@@ -40,32 +39,17 @@ class SensorChecks:
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
         self._moving, self._sweep_times = MovingObjects(faults, window), SweepTimes(faults)
-        self._checks: tuple[SensorCheck, ...] = (
-            OwnBody(faults),
-            GyroRate(faults),
-            TurnRates(faults, step_config),
-            TravelDirection(faults),
-            Standstill(faults, window, step_config),
-            self._sweep_times,
-            self._moving,
-        )
-        self._preparing, self._comparing = self._that_override("prepare"), self._that_override("compare")
-        self._applying, self._comparing_estimates = self._that_override("apply"), self._that_override("compare_estimate")
-        self._watching = tuple(check for check in self._applying if not check.is_of_declared_faults)
+        self._own_body, self._contradictions, self._gyro_rate = OwnBody(faults), Contradictions(faults), GyroRate(faults)
+        self._standstill = Standstill(faults, window, step_config)
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
         self._clocks = ClockCheck(faults, clock_sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
         self._step: Step | None = None
         self._pose: Pose2 | None = None
 
-    def _that_override(self, method: str) -> tuple[SensorCheck, ...]:
-        """The checks with a ``method`` of their own."""
-        return tuple(check for check in self._checks if getattr(type(check), method) is not getattr(SensorCheck, method))
-
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
-        for check in self._checks:
-            check.insert_imu(sample)
+        self._standstill.insert_imu(sample)
 
     def correct(self, scan: Scan) -> Scan:
         """``scan`` with the times of its points as they were found to be."""
@@ -78,15 +62,19 @@ class SensorChecks:
         self._faults.start_step(step)
         if step.scan is not None and not step.scan.is_planar:
             self._tilt.add(step.scan)
-        for check in self._preparing:
-            step = check.prepare(step)
+        step = self._own_body.remove(step)
         self._inflation.add_step(step)
         if self._window.add(step, self._faults.now_s):
-            agreements = [check.compare(self._window) for check in self._comparing]
-            if all(agreements):
+            agree = self._contradictions.compare(self._window)
+            if self._sweep_times.compare(self._window) and agree:
                 self._inflation.restart()
-        for check in self._applying if self._faults.declared else self._watching:
-            step = check.apply(step)
+        excluded = self._contradictions.excluded if self._faults.declared else ()
+        step = self._gyro_rate.apply(step)
+        step = replace(step, turn=None) if "gyro" in excluded else step
+        step = step.without_scan() if "LiDAR" in excluded else step
+        step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
+        step = self._sweep_times.apply(step)
+        step = self._moving.apply(step)
         if self._faults.has_left_scans_out:
             step = self._inflation.lead_back(step)
         self._step = step
@@ -112,8 +100,9 @@ class SensorChecks:
         before, self._pose = self._pose, estimate.pose if estimate.odometry is None else estimate.odometry[0]
         delta = np.zeros(3) if before is None else se2.between(before, self._pose)
         if before is not None and self._step is not None:
-            for check in self._comparing_estimates:
-                check.compare_estimate(self._step, delta, estimate.nis)
+            if estimate.nis is not None:
+                self._standstill.restart()
+            self._moving.compare_estimate(delta, estimate.nis)
             self._consistency.compare_estimate(delta, estimate.nis)
         inflated = self._inflation.inflate(estimate, delta)
         scan = None if self._step is None else self._step.scan

@@ -10,14 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
+from localization.sensor_checks.contradictions import LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, explain
-from localization.sensor_checks.sensor_check import SensorCheck, without_scan
 from localization.sensor_checks.standstill import WHEELS_STANDING
-from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
-from localization.sensor_checks.turn_rates import LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from localization.sensor_checks.window import BIN_S, Window
 from localization.trajectory import BoolArray
 from motion_models import se2
@@ -86,7 +84,7 @@ class _Lidar:
     is_active: bool = False
 
 
-class MovingObjects(SensorCheck):
+class MovingObjects:
     """Where part of a scene moves and the rest agrees with wheels and gyro, the rest alone is matched.
 
     A scan is compared with one from before under the motion by wheels and gyro. Where one other motion explains all of it, as with wheels
@@ -162,12 +160,12 @@ class MovingObjects(SensorCheck):
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
                 step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
         elif lidar.is_active:
-            step = without_scan(step)
+            step = step.without_scan()
         if is_due:
             self._next_view = lidar, now_s, profile, step.is_standing
         return step
 
-    def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
+    def compare_estimate(self, delta: FloatArray, nis: float | None) -> None:
         """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
         self._poses = np.array([self._poses[0], se2.compose(self._estimated, delta)])
         self._is_by_scans |= nis is not None
@@ -332,5 +330,5 @@ def _with_still(step: Step, is_still: BoolArray) -> Step:
     """``step`` whose scan has the points ``is_still`` (N,) alone; without it where these are too few."""
     scan = step.scan
     if scan is None or is_still.sum() < _MIN_POINTS:
-        return without_scan(step)
+        return step.without_scan()
     return replace(step, scan=scan.select(is_still), is_scan_partial=True)

@@ -9,7 +9,6 @@ import numpy as np
 
 from localization.events import Scan, Step
 from localization.sensor_checks.faults import FaultLog, SensorFault
-from localization.sensor_checks.sensor_check import SensorCheck
 from localization.trajectory import BoolArray
 from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray
@@ -33,15 +32,15 @@ _MIN_BODY_TRAVEL_M, _MIN_BODY_TURN_RAD = 1.5, 0.4
 that is hit at a right angle; 0.4 rad change these by 8 %."""
 
 
-class OwnBody(SensorCheck):
+class OwnBody:
     """Leaves out the points of the robot itself."""
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults = faults
         self._filters: dict[str, OwnBodyFilter] = {}  # by the LiDAR's frame
 
-    def prepare(self, step: Step) -> Step:
-        """``step`` without these points."""
+    def remove(self, step: Step) -> Step:
+        """``step`` without the points of the robot itself."""
         for each in self._filters.values():
             each.add_motion(step.predicted.delta)
         if step.scan is None:

@@ -6,19 +6,19 @@ import math
 from collections.abc import Mapping
 
 from localization.sensor_checks.clocks import CLOCKS_APART
-from localization.sensor_checks.faults import SensorFault
-from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
-from localization.sensor_checks.standstill import WHEELS_STANDING
-from localization.sensor_checks.sweep_times import REVERSED_TIMES
-from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
-from localization.sensor_checks.turn_rates import (
+from localization.sensor_checks.contradictions import (
     GYRO_OPPOSITE,
     GYRO_RATE,
     GYRO_STUCK,
     GYRO_UNIT,
+    LIDAR_DIRECTION,
     LIDAR_OPPOSITE,
     WHEELS_OPPOSITE,
 )
+from localization.sensor_checks.faults import SensorFault
+from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
+from localization.sensor_checks.standstill import WHEELS_STANDING
+from localization.sensor_checks.sweep_times import REVERSED_TIMES
 
 _FLOOR_RAD = 0.01
 """Turn of a standing robot that no model has: tyres that relax, someone who leans on it [rad]."""

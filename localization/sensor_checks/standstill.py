@@ -10,7 +10,6 @@ import numpy as np
 
 from localization.events import ImuSample, Step
 from localization.sensor_checks.faults import FaultLog, SensorFault
-from localization.sensor_checks.sensor_check import SensorCheck, without_wheels
 from localization.sensor_checks.window import Bins, Window
 from localization.synchronizer import StepConfig, UnknownVelocity
 from motion_models.se2 import FloatArray
@@ -38,7 +37,7 @@ _SHAKE_S = 2.0
 _NS = 1e-9
 
 
-class Standstill(SensorCheck):
+class Standstill:
     """Such wheels count as unknown, for as long as that lasts.
 
     Objects that move around a standing robot look like its own motion. Where there is a gyro or an IMU, one must confirm the LiDAR, once
@@ -58,11 +57,13 @@ class Standstill(SensorCheck):
         """Specific force shows whether the robot moves."""
         self._shaking.setdefault(sample.frame_id, ShakeDetector()).insert(sample)
 
-    def apply(self, step: Step) -> Step:
-        """``step`` with unknown wheels where another sensor shows motion."""
+    def apply(self, step: Step, *, is_contradicted: bool) -> Step:
+        """``step`` with unknown wheels where these ``is_contradicted``, or stand while another sensor shows motion."""
         if not step.is_standing:
             self._turned_s = self._stood_s = self._trusted_s = self._rested_s = 0.0
             self._is_confirmed = False
+            if is_contradicted and step.has_wheels:
+                return step.without_wheels(self._velocity.increment(step.duration, has_turn=step.turn is not None))
             self._velocity.lasted_s = 0.0
             if step.has_wheels:
                 self._velocity.measured = step.twist
@@ -84,13 +85,11 @@ class Standstill(SensorCheck):
         unknown_s = step.duration
         if moving:
             unknown_s, self._trusted_s = unknown_s + self._trusted_s, 0.0
-        return without_wheels(step, self._velocity.increment(unknown_s, has_turn=step.turn is not None))
+        return step.without_wheels(self._velocity.increment(unknown_s, has_turn=step.turn is not None))
 
-    def compare_estimate(self, step: Step, delta: FloatArray, nis: float | None) -> None:
-        """A matched scan measured the pose."""
-        if nis is not None:
-            self._velocity.lasted_s = 0.0
-            self._trusted_s = 0.0
+    def restart(self) -> None:
+        """A matched scan measured the pose: what is unknown counts from here on."""
+        self._velocity.lasted_s = self._trusted_s = 0.0
 
     def _is_at_rest(self, step: Step) -> bool:
         """Whether wheels, gyro and IMU measure in ``step`` what they do on a robot at rest."""

@@ -17,7 +17,6 @@ import numpy as np
 from localization.events import Scan, Step
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.scan_motion import BEARINGS, Profile, bearing_bins
-from localization.sensor_checks.sensor_check import SensorCheck
 from localization.sensor_checks.window import Window
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2, Twist2
@@ -47,7 +46,7 @@ class _TimedProfile(NamedTuple):
     """(180, 2) derivative of the deskewed points by the factor on their times [m]."""
 
 
-class SweepTimes(SensorCheck):
+class SweepTimes:
     """Turns the times of points round where the scans show that they are reversed; decides once in a drive."""
 
     def __init__(self, faults: FaultLog) -> None:

@@ -45,11 +45,6 @@ class Bins(NamedTuple):
         """Columns of ``rows`` (n, 9)."""
         return cls(rows, rows[:, 0], rows[:, 1:4], rows[:, 4], rows[:, 5:8], rows[:, 8])
 
-    @property
-    def turn_rates(self) -> FloatArray:
-        """(3, n) by wheels, gyro and LiDAR [rad/s]."""
-        return self.rows[:, [3, 4, 7]].T / self.durations_s
-
 
 class Window:
     """`add` each step. The LiDAR's motion is that of `scan_motion`, which uses neither the filter nor the other sensors."""

@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from localization.sensor_checks import SensorChecks, checks, turn_rates
+from localization.events import ImuSample, Step
+from localization.sensor_checks import SensorChecks, checks, contradictions
 from localization.sensor_checks.faults import SensorFault
-from localization.sensor_checks.sensor_check import SensorCheck
 from tests.helpers import fault_drives, moving_scenes
 from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, named_faults, without_gyro
 from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
@@ -107,25 +107,41 @@ def _table_of_pairs(only: str) -> Iterator[str]:
         yield f"| {place} | {name} | {' | '.join(cells)} | {known} |"
 
 
-def _no_fault_of_turns(fault: SensorFault) -> Any:
-    """Turn rates without one of their faults."""
-    find = turn_rates._find_faults
-    return lambda: mock.patch.object(turn_rates, "_find_faults", lambda *a: {f: v for f, v in find(*a).items() if f is not fault})
+def _no_symptom(fault: SensorFault) -> Any:
+    """Contradictions without one of their faults."""
+    others = tuple(symptom for symptom in contradictions.SYMPTOMS if symptom.fault is not fault)
+    return lambda: mock.patch.object(contradictions, "SYMPTOMS", others)
+
+
+class _NoCheck:
+    """A check that leaves steps as they are."""
+
+    def remove(self, step: Step) -> Step:
+        return step
+
+    def apply(self, step: Step, *, is_contradicted: bool = False) -> Step:
+        return step
+
+    def restart(self) -> None:
+        """A matched scan."""
+
+    def insert_imu(self, sample: ImuSample) -> None:
+        """An IMU."""
 
 
 def _no_check(name: str) -> Any:
-    return lambda: mock.patch.object(checks, name, return_value=SensorCheck())
+    return lambda: mock.patch.object(checks, name, return_value=_NoCheck())
 
 
 _WITHOUT = {
-    "gyro opposite": _no_fault_of_turns(turn_rates.GYRO_OPPOSITE),
+    "gyro opposite": _no_symptom(contradictions.GYRO_OPPOSITE),
     "gyro in deg/s": _no_check("GyroRate"),
     "gyro glitches": _no_check("GyroRate"),
-    "gyro stuck": lambda: mock.patch.object(turn_rates, "_is_constant", return_value=False),
-    "sides swapped": _no_fault_of_turns(turn_rates.WHEELS_OPPOSITE),
+    "gyro stuck": lambda: mock.patch.object(contradictions, "is_repeating", return_value=False),
+    "sides swapped": _no_symptom(contradictions.WHEELS_OPPOSITE),
     "encoders": _no_check("Standstill"),
-    "LiDAR upside down": _no_fault_of_turns(turn_rates.LIDAR_OPPOSITE),
-    "LiDAR yaw": _no_check("TravelDirection"),
+    "LiDAR upside down": _no_symptom(contradictions.LIDAR_OPPOSITE),
+    "LiDAR yaw": _no_symptom(contradictions.LIDAR_DIRECTION),
     "beams on the robot": _no_check("OwnBody"),
 }
 """What is left out for the faults whose names begin so."""

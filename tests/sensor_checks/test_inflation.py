@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.estimators import Estimate
-from localization.sensor_checks.travel_direction import LIDAR_DIRECTION
+from localization.sensor_checks.contradictions import LIDAR_DIRECTION
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.checked_drive import SPEED, CheckedDrive, turned

@@ -25,7 +25,7 @@ def test_window_without_scans_has_bins_of_a_quarter_of_a_second() -> None:
     window = Window({}, LidarConfig())
     ends = [k for k in range(40) if window.add(step(k), (k + 1) * STEP_S)]
     assert ends == list(range(3 * MIN_BINS - 1, 40, 3))
-    np.testing.assert_allclose(window.bins.turn_rates, np.tile([[0.2], [0.3], [np.nan]], 13))
+    np.testing.assert_allclose(window.bins.rows[:, [3, 4, 7]].T / window.bins.durations_s, np.tile([[0.2], [0.3], [np.nan]], 13))
     assert window.end_s - window.begin_s == pytest.approx(39 * STEP_S)
     for k in range(40, 400):
         window.add(step(k), (k + 1) * STEP_S)
@@ -46,4 +46,4 @@ def test_window_bin_without_gyro_or_wheels_has_unknown_rates() -> None:
     window = Window({}, LidarConfig())
     for k in range(6):
         window.add(step(k, has_gyro=k != 1, has_wheels=k != 4), (k + 1) * STEP_S)
-    np.testing.assert_allclose(window.bins.turn_rates[:2], [[0.2, np.nan], [np.nan, 0.3]])
+    np.testing.assert_allclose((window.bins.rows[:, 3:5].T / window.bins.durations_s), [[0.2, np.nan], [np.nan, 0.3]])

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
 
+from localization.sensor_checks.contradictions import (
+    GYRO_OPPOSITE,
+    GYRO_RATE,
+    GYRO_STUCK,
+    GYRO_UNIT,
+    LIDAR_DIRECTION,
+    LIDAR_OPPOSITE,
+    WHEELS_OPPOSITE,
+)
 from localization.sensor_checks.faults import SensorFault
-from localization.sensor_checks.turn_rates import GYRO_OPPOSITE, GYRO_RATE, GYRO_STUCK, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE
-from tests.helpers.checked_drive import CheckedDrive
+from tests.helpers.checked_drive import CheckedDrive, turned
+from tests.helpers.event_faults import turn_scans, without_gyro
+from tests.helpers.fault_drives import in_room, run
 
 
 @pytest.mark.parametrize(
@@ -104,3 +115,25 @@ def test_gyro_is_used_while_the_wheels_read_zero_and_the_robot_spins() -> None:
     checks = robot.drive(5.0)
     assert GYRO_RATE not in checks.found
     assert all(step.turn is not None for step in robot.applied)
+
+
+@pytest.mark.parametrize(("degrees", "correction"), [(20.0, -20.0), (-30.0, 30.0), (170.0, -170.0)])
+def test_lidar_whose_mount_is_turned_is_left_out(degrees: float, correction: float) -> None:
+    robot = CheckedDrive(scan=lambda points: turned(points, degrees))
+    checks = robot.drive()
+    assert list(checks.found) == [LIDAR_DIRECTION]
+    found = re.search(r"yaw of its frame by ([-+0-9]+) deg", checks.warnings()[0])
+    assert found is not None
+    assert float(found[1]) == pytest.approx(correction, abs=2.0)
+    assert robot.applied[-1].scan is None
+    assert robot.applied[-1].is_scan_excluded
+    assert robot.applied[-1].turn is not None
+
+
+@pytest.mark.extended
+def test_lidar_whose_mount_is_turned_is_found_on_a_drive_of_curves() -> None:
+    """From where on it is, the covariance has what it was off by."""
+    outcome = run(in_room(1), without_gyro(turn_scans(25.0)))
+    assert any("the robot travels 2" in warning and "to the left" in warning for warning in outcome.warnings)
+    error, sigma = outcome.last
+    assert error < 3.0 * sigma

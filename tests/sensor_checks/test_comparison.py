@@ -1,0 +1,72 @@
+"""Scale and direction of one sensor against another, with their errors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, WAY, Comparison, Gain
+from localization.sensor_checks.window import Bins
+
+_TURNS = [[0.0] * 7, [0.07] * 24, [0.07] * 12 + [-0.05] * 12]
+"""Ahead; an arc of 1 m, in which slides look like another direction; and an S [rad]."""
+
+
+def _gain_of_ways(rng: np.random.Generator, degrees: float, noise_m: float, turns: list[float], slide_m_per_rad: float) -> Gain:
+    """Of wheels that travel 7 cm ahead and turn by ``turns`` [rad] in each bin, and scans with noise, in the direction ``degrees``, of a
+    robot that slides in turns."""
+    turn, noise = np.array(turns), noise_m * rng.normal(size=(2, len(turns)))
+    ways = (0.07 + 1j * slide_m_per_rad * turn) * np.exp(1j * math.radians(degrees)) + noise[0] + 1j * noise[1]
+    rows = np.zeros((len(turn), 9))
+    rows[:, 0], rows[:, 1], rows[:, 3], rows[:, 5], rows[:, 6] = 0.25, 0.07, turn, ways.real, ways.imag
+    return Comparison(WAY, "wheels", "LiDAR").gain(Bins.of(rows))
+
+
+def _gain_of_turns(wheels: np.ndarray, gyro: np.ndarray) -> Gain:
+    """Of turns (n,) in bins of a quarter of a second [rad]."""
+    rows = np.full((len(wheels), 9), np.nan)
+    rows[:, 0], rows[:, 3], rows[:, 4] = 0.25, wheels, gyro
+    return Comparison(TURN, "wheels", "gyro").gain(Bins.of(rows))
+
+
+@pytest.mark.parametrize("noise_m", [0.005, 0.02, 0.06])
+def test_direction_accuses_no_noise_of_its_own(noise_m: float) -> None:
+    """Short bins with scans as noisy as their way: hardly any window is beyond a limit that the true direction is on."""
+    rng = np.random.default_rng(0)
+    found = [_gain_of_ways(rng, math.degrees(SLIDE_RAD), noise_m, turns, 0.5 * rng.normal()) for _ in range(1000) for turns in _TURNS]
+    assert sum(abs(gain.angle) - gain.bound > SLIDE_RAD for gain in found) <= 0.002 * len(found)
+
+
+@pytest.mark.parametrize("turns", [_TURNS[0], _TURNS[2]], ids=["straight", "curves"])
+def test_direction_of_a_turned_lidar_is_certain(turns: list[float]) -> None:
+    gain = _gain_of_ways(np.random.default_rng(1), 26.0, 0.005, turns, 0.5)
+    assert gain.angle - gain.bound > SLIDE_RAD
+    assert not gain.is_equal
+    assert math.degrees(gain.angle) == pytest.approx(26.0, abs=math.degrees(gain.bound))
+
+
+def test_sign_of_turns_is_hardly_ever_wrong_by_chance() -> None:
+    """Noise of both sensors that has nothing to do with each other, and a gyro's bias."""
+    rng = np.random.default_rng(2)
+    found = [_gain_of_turns(*(0.005 * rng.normal(size=(2, 24)) + [[0.0], [0.006 * rng.normal()]])) for _ in range(3000)]
+    assert sum(abs(gain.angle) - gain.bound > OPPOSITE_RAD for gain in found) <= 0.002 * len(found)
+    assert sum(gain.is_equal for gain in found) <= 0.002 * len(found)
+
+
+@pytest.mark.parametrize("rate", [lambda t: 0.3 * np.sin(t), lambda t: 0.3 + 0.0 * t], ids=["S", "arc"])
+@pytest.mark.parametrize(("factor", "is_opposite", "is_equal"), [(1.0, False, True), (-1.0, True, False), (57.3, False, False)])
+def test_gain_of_a_gyro_with_a_bias_is_its_factor(rate, factor: float, is_opposite: bool, is_equal: bool) -> None:
+    turns = 0.25 * rate(0.25 * np.arange(24.0))
+    noise = 0.002 * np.random.default_rng(3).normal(size=24)
+    gain = _gain_of_turns(turns, factor * (turns + 0.25 * 0.01 + noise))
+    assert gain.scale == pytest.approx(abs(factor), rel=0.15)
+    assert (abs(gain.angle) - gain.bound > OPPOSITE_RAD) == is_opposite
+    assert gain.is_equal == is_equal
+
+
+def test_gain_is_unknown_where_the_difference_is_an_offset() -> None:
+    """A gyro whose bias is 6 deg/s: no scale and no direction."""
+    turns = 0.05 * np.sin(0.25 * np.arange(24.0))
+    assert math.isinf(_gain_of_turns(turns, turns + 0.25 * 0.1).bound)
