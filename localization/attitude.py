@@ -212,7 +212,7 @@ class AttitudeFilter:
 
     def _set_scale(self, scale: float) -> None:
         mount = self._mounts[self._frame or ""]
-        rotation, place = np.ascontiguousarray(mount.rotation()), np.array([mount.x, mount.y, mount.z])
+        rotation, place = np.ascontiguousarray(mount.rotation), np.array([mount.x, mount.y, mount.z])
         self._imu = self._imu._replace(rotation=rotation, place=place, scale=scale)
 
     def advance(self, end_ns: int, dt_s: FloatArray, rates: FloatArray) -> Tilt | None:

@@ -29,7 +29,7 @@ class BodyRates:
     def insert(self, sample: ImuSample) -> None:
         """Take the next sample of the first IMU whose mount is known; one that does not come after the newest changes nothing."""
         if self._frame is None and sample.frame_id in self._mounts:
-            self._frame, self._rotation = sample.frame_id, self._mounts[sample.frame_id].rotation()
+            self._frame, self._rotation = sample.frame_id, self._mounts[sample.frame_id].rotation
         if sample.frame_id != self._frame or (self._stamps and sample.stamp_ns <= self._stamps[-1]):
             return
         if self._stamps and sample.stamp_ns - self._stamps[-1] > _MAX_GAP_NS:

@@ -201,7 +201,7 @@ class GyroBuffer:
 
     def _begin(self, sample: ImuSample) -> None:
         mount = self._mounts.get(sample.frame_id, Mount())
-        self._frame, self._up = sample.frame_id, mount.rotation()[2]
+        self._frame, self._up = sample.frame_id, mount.rotation[2]
         self._axis, self._force = self._up, np.zeros(3)
         self._contradicts, self._sign, self._n_force = False, 1.0, 0
         self._agreement = self._turned = 0.0

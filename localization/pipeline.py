@@ -28,7 +28,7 @@ from localization.estimators import (
     SpaceGraphSettings,
     make_estimator,
 )
-from localization.events import Event, ImuSample, PositionSample, Scan, Step
+from localization.events import Event, ImuSample, PositionSample, Scan
 from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
@@ -133,7 +133,7 @@ class Pipeline:
 
     def _estimates(self, is_last: bool) -> Iterator[Estimate]:
         while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
-            self._calibrate()
+            self.run_deferred()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
             if self.plane is not None and self.plane.has_clouds:
@@ -143,25 +143,18 @@ class Pipeline:
                 self.plane.add(estimate, self.attitude)
             self.checks.compare_residuals(self.estimator)
             estimate = self.checks.inflate(estimate)
-            self._feed_back(step, is_scan_matched=estimate.nis is not None)
+            if estimate.nis is not None:
+                self.synchronizer.restart_gap()
+            self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
+            if step.duration > 0.0:
+                self.wheel_twist = step.twist if step.has_wheels else None
             yield estimate  # publish
 
-    def _calibrate(self) -> None:
-        """Predict with the corrections and the clock offset that the estimator has, once its deferred work is done."""
-        self.run_deferred()
-        self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
-
-    def _feed_back(self, step: Step, is_scan_matched: bool) -> None:
-        """Pass the estimated clock offset to the synchronizer, which waits for data by it; a matched scan restarts a wheel gap."""
-        if is_scan_matched:
-            self.synchronizer.restart_gap()
-        self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
-        if step.duration > 0.0:
-            self.wheel_twist = step.twist if step.has_wheels else None
-
     def run_deferred(self) -> None:
-        """Do the work that published estimates need not wait for. Left out, the next `process` does it first."""
+        """Do the work that published estimates need not wait for, and predict with what it has corrected. Left out, the next `process`
+        does it first."""
         self.estimator.run_deferred()
+        self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
 
     def finish(self) -> list[Estimate]:
         """The estimates that still waited for events when these ended."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,7 @@ class Mount:
     yaw: float = 0.0
     """[rad]"""
 
+    @cached_property
     def rotation(self) -> FloatArray:
         """(3, 3) matrix that takes vectors of the sensor's frame into the body frame."""
         cr, sr = math.cos(self.roll), math.sin(self.roll)

@@ -45,7 +45,7 @@ def downhill(t, degrees):
 def drive(made, mount, degrees, seconds=20.0, start_s=0.0, frame="imu", unit=1.0, gravity=GRAVITY, off=None, shake=0.0):
     """Feed ``made`` with an IMU at ``mount`` that truly stands turned by the rotation ``off`` more; the tilt of each step, by time."""
     rng = np.random.default_rng(5)
-    R = mount.rotation() if off is None else off @ mount.rotation()
+    R = mount.rotation if off is None else off @ mount.rotation
     place, found, steps = np.array([mount.x, mount.y, mount.z]), {}, round(STEP_S * HZ)
     for i in range(round(start_s * HZ), round(seconds * HZ) + 1):
         t, h = i / HZ, 1e-4

@@ -74,7 +74,7 @@ class GyroHeading:
         """Take the next sample; those of other frames than the first's are left out."""
         if self._frame is None:
             self._frame = sample.frame_id
-            self._up = self._mounts.get(sample.frame_id, Mount()).rotation()[2]
+            self._up = self._mounts.get(sample.frame_id, Mount()).rotation[2]
         if sample.frame_id == self._frame:
             self._stamps.append(sample.stamp_ns)
             self._rates.append(float(self._up @ sample.angular_velocity))

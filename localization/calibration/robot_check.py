@@ -377,7 +377,7 @@ def _imu_rows(log: Log) -> list[CheckRow]:
             break
     if not samples:
         return []
-    force = mount.rotation() @ np.mean([sample.linear_acceleration for sample in samples], axis=0)
+    force = mount.rotation @ np.mean([sample.linear_acceleration for sample in samples], axis=0)
     size = float(np.linalg.norm(force))
     value = f"{frame}: roll {math.degrees(mount.roll):.0f}, pitch {math.degrees(mount.pitch):.0f} deg"
     if not is_gravity(size):

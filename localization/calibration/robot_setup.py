@@ -104,7 +104,7 @@ def _motion(path: Path, draft: Draft, survey: Survey, wheels: list[str]) -> Whee
         return None
     imu = draft.topics.get("imu")
     mount = survey.mounts.get(survey.frames.get(imu or "", ""), Mount())
-    return read_motion(path, states, topic, None if imu is None else (imu, mount.rotation()[2]), wheels)
+    return read_motion(path, states, topic, None if imu is None else (imu, mount.rotation[2]), wheels)
 
 
 def _read_urdf(path: Path) -> str:

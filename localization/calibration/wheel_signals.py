@@ -249,7 +249,7 @@ def _gyro(samples: Sequence[ImuSample], mounts: Mapping[str, Mount], edges: Floa
     """Yaw rate (n,) about the body's z axis, or about gravity where the mount contradicts it; whether it does not."""
     frame = samples[0].frame_id
     samples = [sample for sample in samples if sample.frame_id == frame]
-    up = mounts.get(frame, Mount()).rotation()[2]
+    up = mounts.get(frame, Mount()).rotation[2]
     force = np.mean([sample.linear_acceleration for sample in samples[:GRAVITY_SAMPLES]], axis=0)
     size = float(np.linalg.norm(force))
     is_upright = not is_gravity(size) or float(force @ up) / size >= math.cos(MAX_MOUNT_ERROR_RAD)

@@ -169,7 +169,7 @@ class ImuRecord:
         self.gyro.insert(sample)
         self.stamps.append(sample.stamp_ns)
         mount = self._mounts.get(sample.frame_id, Mount())
-        rotation = mount.rotation()
+        rotation = mount.rotation
         self._at = np.array([mount.x, mount.y])
         self.forces.append(rotation @ sample.linear_acceleration)
         self._rates.append(float(rotation[2] @ sample.angular_velocity))

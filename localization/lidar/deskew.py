@@ -33,7 +33,7 @@ class Sweep:
         is_finite = np.isfinite(points).all(axis=1)
         if not is_finite.all():
             points, times = points[is_finite], times[is_finite] if len(times) else times
-        return cls(points @ mount.rotation().T + (mount.x, mount.y, mount.z), times, scan.is_planar)
+        return cls(points @ mount.rotation.T + (mount.x, mount.y, mount.z), times, scan.is_planar)
 
     def within(self, min_range_m: float, max_range_m: float) -> Sweep:
         """The points whose distance from the body's origin is in this range [m]."""

@@ -82,7 +82,10 @@ class ScanMatchingSensor:
             self._begin(deskewed)
             self.moved.begin(scan)
             return None, ""
-        found = self._match(self._matcher, deskewed, offset)
+        guess = None
+        if self._kiss is not None:
+            guess = self._kiss.align(deskewed.points, self._prior, prior_error_at_points(deskewed.planar, self._cov))
+        found = self._matcher.match(deskewed.planar, self._prior, self._cov, guess, offset)
         if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
             self._scan, self._matcher.is_new_place = None, False
             return None, "moved"
@@ -166,12 +169,6 @@ class ScanMatchingSensor:
         self._matcher = ScanMatcher(c, choose_cell(c, scan.planar))
         if c.matcher == "kiss" or not scan.sweep.is_planar:
             self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
-
-    def _match(self, matcher: ScanMatcher, scan: _Scan, offset: Tangent2) -> ScanMatch | None:
-        if self._kiss is None:
-            return matcher.match(scan.planar, self._prior, self._cov, offset=offset)
-        guess = self._kiss.align(scan.points, self._prior, prior_error_at_points(scan.planar, self._cov))
-        return matcher.match(scan.planar, self._prior, self._cov, guess, offset)
 
     def _mount(self, frame: str) -> Mount:
         """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""

@@ -104,7 +104,7 @@ class Payloads:
         arms, place = self._robot.arms, np.array(load.position_m)
         if frame == "base_link" or frame in self.mounts:
             mount = self.mounts.get(frame, Mount())
-            return np.asarray(np.array([mount.x, mount.y, mount.z]) + mount.rotation() @ place)
+            return np.asarray(np.array([mount.x, mount.y, mount.z]) + mount.rotation @ place)
         if arms is None:
             raise RobotError(f"no frame '{frame}' is fixed to the body; there are {', '.join(sorted({'base_link', *self.mounts}))}.")
         if frame not in self._arms:

@@ -77,7 +77,7 @@ class RerunView:
         self._static("world/robot/outline", rr.Boxes3D(half_sizes=[half], centers=[[0.0, 0.0, half[2]]], colors=[_BLUE]))
         self._static("world/robot/ahead", rr.Arrows3D(vectors=[[1.5 * half[0], 0.0, 0.0]], colors=[_BLUE]))
         for frame, mount in mounts.items():
-            rotation = mount.rotation()
+            rotation = mount.rotation
             self._static(_frame(frame), rr.Transform3D(translation=[mount.x, mount.y, mount.z], mat3x3=rotation))
         self._static("estimate/twist", rr.SeriesLines(names=["vx [m/s]", "vy [m/s]", "wz [rad/s]"], colors=[_BLUE, _GREEN, _RED]))
         self._static("estimate/sigma", rr.SeriesLines(names=["position [m]", "heading [rad]"], colors=[_BLUE, _RED]))

@@ -53,7 +53,7 @@ class SensorChecks:
 
     def correct(self, scan: Scan) -> Scan:
         """``scan`` with the times of its points as they were found to be."""
-        return self._sweep_times.correct(scan)
+        return replace(scan, offsets=-scan.offsets) if self._sweep_times.is_reversed and scan.is_planar else scan
 
     def apply(self, step: Step) -> Step:
         """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain."""
@@ -64,16 +64,18 @@ class SensorChecks:
             self._tilt.add(step.scan)
         step = self._own_body.remove(step)
         self._inflation.add_step(step)
+        was_reversed = self._sweep_times.is_reversed
         if self._window.add(step, self._faults.now_s):
             agree = self._contradictions.compare(self._window)
             if self._sweep_times.compare(self._window) and agree:
                 self._inflation.restart()
+        if self._sweep_times.is_reversed and not was_reversed:
+            step = replace(step, restarts_map=True)  # without the scans that were distorted
         excluded = self._contradictions.excluded if self._faults.declared else ()
         step = self._gyro_rate.apply(step)
         step = replace(step, turn=None) if "gyro" in excluded else step
         step = step.without_scan() if "LiDAR" in excluded else step
         step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
-        step = self._sweep_times.apply(step)
         step = self._moving.apply(step)
         if self._faults.has_left_scans_out:
             step = self._inflation.lead_back(step)

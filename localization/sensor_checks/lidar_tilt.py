@@ -41,7 +41,7 @@ class LidarTilt:
             return
         self._next_ns, self._frame = scan.stamp_ns + _PERIOD_NS, scan.frame_id
         mount = self._mounts.get(scan.frame_id, Mount())
-        points = scan.points[:: 1 + len(scan.points) // _MAX_POINTS] @ mount.rotation().T + [mount.x, mount.y, mount.z]
+        points = scan.points[:: 1 + len(scan.points) // _MAX_POINTS] @ mount.rotation.T + [mount.x, mount.y, mount.z]
         points = points[np.hypot(points[:, 0], points[:, 1]) < _MAX_RANGE_M]
         plane = fit_ground(points)
         if plane is None:

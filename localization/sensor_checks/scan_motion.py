@@ -8,7 +8,6 @@ Sensor checks compare it with the other sensors; it is never fused.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -99,15 +98,9 @@ def profile_of(scan: Scan, mount: Mount, config: LidarConfig) -> Profile | None:
     if not scan.is_planar:
         sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
         return make_profile(sweep.project(sweep.points) - center, center)
-    points = scan.points @ rotation_of(mount).T
+    points = scan.points @ mount.rotation.T
     n = _keep_within(points, (mount.x, mount.y, mount.z), config.min_range_m**2, config.max_range_m**2)
     return make_profile(points[:n, :2], center)
-
-
-@lru_cache(maxsize=16)
-def rotation_of(mount: Mount) -> FloatArray:
-    """(3, 3) `Mount.rotation`, which is not to be changed."""
-    return mount.rotation()
 
 
 @kernel

@@ -9,12 +9,12 @@ distortion are by the LiDAR alone: signs of wheels and gyro do not matter.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from localization.events import Scan, Step
+from localization.events import Scan
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.scan_motion import BEARINGS, Profile, bearing_bins
 from localization.sensor_checks.window import Window
@@ -47,27 +47,16 @@ class _TimedProfile(NamedTuple):
 
 
 class SweepTimes:
-    """Turns the times of points round where the scans show that they are reversed; decides once in a drive."""
+    """Decides once in a drive whether the times of points are reversed."""
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults = faults
         self._last: tuple[Scan, Profile] | None = None  # scan at the end of the last bin
         self._before: _TimedProfile | None = None  # that at the end of the bin before
         self._factor = _WeightedMean()
-        self._is_decided = self._is_map_distorted = False
+        self._is_decided = False
         self.is_reversed = False
         """The sweep goes the other way than the scans' times have it."""
-
-    def correct(self, scan: Scan) -> Scan:
-        """``scan`` with the times that its points have been found to have."""
-        return replace(scan, offsets=-scan.offsets) if self.is_reversed and scan.is_planar else scan
-
-    def apply(self, step: Step) -> Step:
-        """``step`` that begins a map without distorted scans, once."""
-        if not self._is_map_distorted:
-            return step
-        self._is_map_distorted = False
-        return replace(step, restarts_map=True)
 
     def compare(self, window: Window) -> bool:
         """Take the scan that ended a bin; False while the times are likelier reversed than not."""
@@ -96,7 +85,7 @@ class SweepTimes:
         sigmas = self._factor.mean / self._factor.sigma
         self._is_decided = abs(sigmas) > _SIGMAS
         if self._is_decided and sigmas < 0.0:
-            self.is_reversed = self._is_map_distorted = True
+            self.is_reversed = True
             self._faults.declare(REVERSED_TIMES, self._faults.now_s, {"sigmas": -sigmas})
         return sigmas > 0.0
 

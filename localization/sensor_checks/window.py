@@ -11,7 +11,7 @@ import numpy as np
 
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig
-from localization.sensor_checks.scan_motion import Profile, ScanOdometry, profile_of, rotation_of
+from localization.sensor_checks.scan_motion import Profile, ScanOdometry, profile_of
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray, Points2
@@ -94,7 +94,7 @@ class Window:
 
     def points_about_lidar(self, scan: Scan) -> Points2:
         """(N, 2) all points of a planar ``scan`` about its LiDAR, in the body's axes."""
-        R = rotation_of(self._mounts.get(scan.frame_id, Mount()))
+        R = self._mounts.get(scan.frame_id, Mount()).rotation
         return np.ascontiguousarray(scan.points[:, :2] @ R[:2, :2].T)
 
 

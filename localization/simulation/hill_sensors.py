@@ -46,7 +46,7 @@ def ring_ranges(
     across = np.cos(elevations)[None]
     parts = np.cos(azimuths)[:, None] * across, np.sin(azimuths)[:, None] * across
     local = np.stack([*parts, np.broadcast_to(np.sin(elevations), parts[0].shape)], axis=-1)
-    directions = np.ascontiguousarray(np.einsum("nij,nrj->nri", rotations @ mount.rotation(), local))
+    directions = np.ascontiguousarray(np.einsum("nij,nrj->nri", rotations @ mount.rotation, local))
     origins, ranges = positions + rotations @ np.array([mount.x, mount.y, mount.z]), np.empty(directions.shape[:2])
     cast_rays(origins, directions, longest_m, grid, ranges)
     cast_at_ground(origins, directions, longest_m, waves, ranges)

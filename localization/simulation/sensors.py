@@ -166,7 +166,7 @@ class ImuSensor:
         self._config, self._mount, self._tilt, self._start_ns, self._rng = config, mount, tilt, start_ns, rng
         self.waves = NO_WAVES
         """(n, 4) hills below the robot (`simulation.terrain`); none on a plane."""
-        self._bias = rng.normal(0.0, config.gyro_bias_sigma, 3) + mount.rotation().T @ np.array([0.0, 0.0, gyro_bias])
+        self._bias = rng.normal(0.0, config.gyro_bias_sigma, 3) + mount.rotation.T @ np.array([0.0, 0.0, gyro_bias])
         rate_sigma, force_sigma = (noise * math.sqrt(config.rate_hz) for noise in (config.gyro_noise, config.force_noise))
         self._sigmas = rate_sigma, force_sigma
         self.layout = message_templates.imu(topic, frame, rate_sigma**2, force_sigma**2)
@@ -182,7 +182,7 @@ class ImuSensor:
             rates, force = imu_motion(track, seconds(ticks), period, self._mount, self.waves)
         else:
             rates, force = self._level_motion(track, seconds(ticks), period)
-        body_R_imu = self._mount.rotation()
+        body_R_imu = self._mount.rotation
         bias = self._bias + np.cumsum(self._rng.normal(0.0, self._config.gyro_bias_walk * math.sqrt(period), (n, 3)), axis=0)
         self._bias = bias[-1]
         turning = (1.0 + self._config.gyro_scale) * rates

@@ -244,7 +244,7 @@ def _origin(element: ET.Element, where: str) -> tuple[FloatArray, FloatArray]:
     if origin is None:
         return np.eye(3), np.zeros(3)
     roll, pitch, yaw = _numbers(origin, "rpy", 3, "0 0 0", where)
-    return Mount(roll=roll, pitch=pitch, yaw=yaw).rotation(), np.array(_numbers(origin, "xyz", 3, "0 0 0", where))
+    return Mount(roll=roll, pitch=pitch, yaw=yaw).rotation, np.array(_numbers(origin, "xyz", 3, "0 0 0", where))
 
 
 def _numbers(element: ET.Element, attribute: str, count: int, default: str | None, where: str) -> list[float]:

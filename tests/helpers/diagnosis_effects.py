@@ -83,7 +83,7 @@ class ChangedLog:
     def events(self) -> Iterator[Event]:
         for event in self._log.events():
             if isinstance(event, ImuSample):
-                rotation = self._log.mounts.get(event.frame_id, Mount()).rotation()
+                rotation = self._log.mounts.get(event.frame_id, Mount()).rotation
                 more = self._size * float((rotation @ event.linear_acceleration)[0])
                 event = dataclasses.replace(event, angular_velocity=event.angular_velocity + more * rotation[2])
             yield event

@@ -146,4 +146,4 @@ def run(drive: FaultDrive, fault: EventFault | None = None, model: str = "diff_d
 
 def upright_axis(drive: FaultDrive) -> int:
     """Axis of the IMU that is upright: 0, 1 or 2."""
-    return int(np.argmax(np.abs(drive.mounts["imu_link"].rotation()[2]))) if "imu_link" in drive.mounts else 2
+    return int(np.argmax(np.abs(drive.mounts["imu_link"].rotation[2]))) if "imu_link" in drive.mounts else 2

@@ -30,7 +30,7 @@ def test_deskew_moves_each_point_by_its_own_time() -> None:
     scan = Scan(0, rng.normal(size=(50, 3)), np.sort(rng.uniform(0.02, 0.1, 50)))
     mount = Mount(x=0.3, y=-0.1, z=0.5, yaw=0.2)
     found = Sweep.from_scan(scan, mount).deskew(twist)
-    body = scan.points @ mount.rotation().T + [0.3, -0.1, 0.5]
+    body = scan.points @ mount.rotation.T + [0.3, -0.1, 0.5]
     middle = 0.5 * (scan.offsets[0] + scan.offsets[-1])
     expected = [se2.transform(se2.exp((t - middle) * twist), p[:2]) for t, p in zip(scan.offsets, body, strict=True)]
     np.testing.assert_allclose(found[:, :2], expected, atol=1e-12)

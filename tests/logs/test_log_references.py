@@ -182,7 +182,7 @@ def test_transforms_leading_slashes_of_tf1_are_ignored(tmp_path: Path) -> None:
 def test_mount_angles_of_any_rotation_give_it_back(tmp_path: Path, angles: tuple[float, float, float]) -> None:
     roll, pitch, yaw = angles
     mount = mounts_of(tmp_path, [("base_link", "imu", (0.0, 0.0, 0.0), bags.quaternion(yaw, pitch, roll))])["imu"]
-    np.testing.assert_allclose(mount.rotation(), Mount(roll=roll, pitch=pitch, yaw=yaw).rotation(), atol=1e-8)
+    np.testing.assert_allclose(mount.rotation, Mount(roll=roll, pitch=pitch, yaw=yaw).rotation, atol=1e-8)
 
 
 def test_mount_of_identity_has_no_negative_zeros() -> None:

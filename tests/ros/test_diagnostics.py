@@ -148,7 +148,7 @@ def test_doctor_explained_drive_names_contradictions_as_well(tmp_path: Path) -> 
     path = bag(tmp_path / "drive.mcap", {"wheel_radius_difference": -0.02}, 3, "husky_a200", dataclasses.replace(tour, phases=phases))
     log, turn = open_log(path, robot), np.array([0.0, 0.0, 0.3])
     events = [
-        dataclasses.replace(e, angular_velocity=e.angular_velocity + log.mounts[e.frame_id].rotation().T @ turn)
+        dataclasses.replace(e, angular_velocity=e.angular_velocity + log.mounts[e.frame_id].rotation.T @ turn)
         if isinstance(e, ImuSample) and e.stamp_ns < log.start_ns + 5 * 10**9
         else e
         for e in log.events()

@@ -273,8 +273,8 @@ def test_imu_off_centre_measures_gravity_turning_and_lever_arm():
 def test_imu_mounted_on_its_side_measures_in_its_own_axes():
     mount = load_robot("husky_a200").mounts["imu_link"]
     rate, force = quiet_imu(mount).messages(moving_track(twist=(0, 0, 0.7)))[150].parts
-    np.testing.assert_allclose(mount.rotation() @ rate, [0, 0, 0.7], atol=1e-9)
-    np.testing.assert_allclose((mount.rotation() @ force)[2], 9.81, atol=1e-9)
+    np.testing.assert_allclose(mount.rotation @ rate, [0, 0, 0.7], atol=1e-9)
+    np.testing.assert_allclose((mount.rotation @ force)[2], 9.81, atol=1e-9)
     assert force[1] == pytest.approx(9.81, abs=1e-6)  # gravity on its +y
 
 
@@ -330,7 +330,7 @@ def test_quaternion_of_mount_matches_its_rotation():
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    np.testing.assert_allclose(matrix, mount.rotation(), atol=1e-12)
+    np.testing.assert_allclose(matrix, mount.rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", WORLDS)
