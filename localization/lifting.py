@@ -39,9 +39,8 @@ class Pose3:
     def from_above(self) -> tuple[Pose2, Cov3]:
         """The planar pose (3,) below it, and the covariance (3, 3) of its right perturbation."""
         yaw = math.atan2(self.rotation[1, 0], self.rotation[0, 0])
-        c, s = math.cos(yaw), math.sin(yaw)
-        to_body = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        return np.array([self.position[0], self.position[1], yaw]), to_body @ self.covariance[np.ix_(_PLANAR, _PLANAR)] @ to_body.T
+        planar = self.covariance[np.ix_(_PLANAR, _PLANAR)]
+        return np.array([self.position[0], self.position[1], yaw]), se2.rotate_covariance(planar, -yaw)
 
     def moved(self, delta: Pose2, cov: Cov3) -> Pose3:
         """The pose after a planar motion (3,) in the body's plane, whose right perturbation has ``cov`` (3, 3)."""

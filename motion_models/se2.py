@@ -353,6 +353,19 @@ def adjoint(pose: ArrayLike) -> FloatArray:
     return np.asarray(_adjoint(pose))
 
 
+def rotation(yaw: ArrayLike) -> FloatArray:
+    """(..., 2, 2) rotation by ``yaw`` [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def rotate_covariance(cov: FloatArray, yaw: float) -> Cov3:
+    """(3, 3) covariance of x, y, yaw in other axes, of which those of ``cov`` (3, 3) are turned by ``yaw`` [rad]: by its heading, that of a
+    right perturbation in the world's axes."""
+    R = adjoint(np.array([0.0, 0.0, yaw]))
+    return np.asarray(R @ cov @ R.T)
+
+
 @gufunc("(n)->(n,n)")
 def _right_jacobian(v: FloatArray, out: FloatArray) -> None:
     fill_right_jacobian(triple(v), out)

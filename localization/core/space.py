@@ -17,7 +17,7 @@ from localization.bounded_settings import Settings, at_least
 from localization.core.filter import Measurement, Transition
 from localization.core.state import Group, Layout, Perturbation, State, Vector
 from localization.events import BodyTurn, Gravity, Step
-from motion_models import se3
+from motion_models import se2, se3
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 from motion_models.se3 import Transform3
@@ -90,7 +90,7 @@ def lift(planar: FloatArray) -> Transform3:
     """(4, 4) of a planar motion (3,)."""
     x, y, yaw = planar.tolist()
     out = np.eye(4)
-    out[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    out[:2, :2] = se2.rotation(yaw)
     out[0, 3], out[1, 3] = x, y
     return out
 

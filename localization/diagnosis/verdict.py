@@ -107,9 +107,7 @@ def _moved(twist: FloatArray, dt: FloatArray, increments: FloatArray, middle: in
     lever = np.array([[1.0, 0.0, -at[1]], [0.0, 1.0, at[0]]])  # motion of the antenna by one of the body, in its frame
     moved = np.zeros((3, 3, increments.shape[1]))
     for n, pose, by in ((middle, poses[0], by_middle[0]), (len(dt), poses[1], by_end[0])):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        turn = np.array([[c, -s], [s, c]])
-        moved += np.einsum("ij,jkm->ikm", by @ turn @ lever, moved_by(twist[:n], dt[:n], increments[:n]))
+        moved += np.einsum("ij,jkm->ikm", by @ se2.rotation(pose[2]) @ lever, moved_by(twist[:n], dt[:n], increments[:n]))
     return moved
 
 

@@ -78,7 +78,7 @@ def search(image: LikelihoodImage, points: Points2, prior: Pose2, cov: Cov3, lim
 
     ``cov`` (3, 3) is that of the prior's right perturbation. Every score counts as the log-likelihood of N / 6 independent points.
     """
-    world = _to_world(prior[2], cov)
+    world = se2.rotate_covariance(cov, prior[2])
     half = np.minimum(3.0 * np.sqrt(np.diag(world)), limit)
     reach = float(np.quantile(np.hypot(points[:, 0], points[:, 1]), 0.8))
     yaw_step = max(image.cell / max(reach, 1e-3), _MIN_YAW_STEP_RAD)
@@ -143,13 +143,6 @@ def _pick(prior: Pose2, shifts: FloatArray, scores: FloatArray, n: int, informat
     rival = float(scores[is_elsewhere].max()) if is_elsewhere.any() else 0.0
     margin = n / CORRELATED_BEAMS * math.log(max(float(scores[best]), 1e-6) / max(rival, 1e-6))
     return SearchResult(prior + shifts[best], float(scores[best]), rival, margin)
-
-
-def _to_world(yaw: float, cov: Cov3) -> FloatArray:
-    """``cov`` (3, 3) of a right perturbation, along the world's axes."""
-    R = np.eye(3)
-    R[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
-    return np.asarray(R @ cov @ R.T)
 
 
 def _turned_points(points: Points2, prior: Pose2, yaws: FloatArray) -> FloatArray:

@@ -48,6 +48,7 @@ from localization.errors import OutputError
 from localization.lifting import Pose3, quaternion
 from localization.logs.message_templates import STORE, Message, MessageLayout, Template, store_ros1
 from localization.output import output_errors, refuse_existing
+from motion_models import se2
 from motion_models.se2 import FloatArray
 
 UNKNOWN_VARIANCE = 1e6
@@ -269,9 +270,7 @@ def odom_axes(covariance: FloatArray, theta: float) -> FloatArray:
 
     To first order, compose(pose, exp(e)) moves x, y by R(theta) e_xy and the yaw by e_theta.
     """
-    c, s = math.cos(theta), math.sin(theta)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    turned: FloatArray = turn @ covariance @ turn.T
+    turned = se2.rotate_covariance(covariance, theta)
     return (turned + turned.T) / 2
 
 

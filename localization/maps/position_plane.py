@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -52,8 +51,7 @@ class PositionPlane:
 
         With T = ``plane_T_map`` = (R, t) and q = R^T (p - t), a right perturbation (u, a) of T moves q by -u - a J q, J = (0 -1; 1 0).
         """
-        c, s = math.cos(self.plane_T_map[2]), math.sin(self.plane_T_map[2])
-        R = np.array([[c, -s], [s, c]])
+        R = se2.rotation(self.plane_T_map[2])
         q = np.asarray(se2.transform(se2.inverse(self.plane_T_map), position))
         by_plane = -np.array([[1.0, 0.0, -q[1]], [0.0, 1.0, q[0]]])
         return PositionFix(q, R.T @ cov @ R + by_plane @ self.covariance @ by_plane.T + 0.5 * (self.antenna @ self.antenna) * np.eye(2))

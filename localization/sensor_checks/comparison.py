@@ -45,8 +45,10 @@ class Quantity:
     """Of `Bins.rows`: what the offset is proportional to."""
     offset_sigma: float
     """Standard deviation of the offset: of a bias [rad/s], of a slide [m/rad]."""
+    noise: float
+    """Standard deviation of a bin's motion along each axis, as a rule [rad, m]: the prior of the offset has its weight by it."""
     min_noise: float
-    """Least standard deviation of a bin's motion along each axis [rad, m]."""
+    """The least one [rad, m]: what bins scatter by is at least this."""
     min_size: float
     """Least motion in a bin that counts [rad, m]."""
     max_ratio: float
@@ -57,9 +59,10 @@ class Quantity:
     """Directions that are no farther apart are equal [rad]."""
 
 
-TURN = Quantity({"wheels": (3,), "gyro": (4,), "LiDAR": (7,)}, 0, 0.025, 5e-4, 0.0, math.inf, MIN_BINS, OPPOSITE_RAD)
-"""The bias: five prior sigmas of the shipped robots. The noise: half of a cheap gyro's 0.002 rad/s/sqrt(Hz) in a quarter of a second."""
-WAY = Quantity({"wheels": (1, 2), "LiDAR": (5, 6)}, 3, 0.5, 0.005, 0.05, _MAX_RATIO, 6, SLIDE_RAD)
+TURN = Quantity({"wheels": (3,), "gyro": (4,), "LiDAR": (7,)}, 0, 0.025, 5e-3, 5e-4, 0.0, math.inf, MIN_BINS, OPPOSITE_RAD)
+"""The bias: five prior sigmas of the shipped robots. The noise: 0.3 deg of a scan's turn; the least one half of a cheap gyro's 0.002
+rad/s/sqrt(Hz) in a quarter of a second."""
+WAY = Quantity({"wheels": (1, 2), "LiDAR": (5, 6)}, 3, 0.5, 5e-3, 5e-3, 0.05, 2.0, 6, SLIDE_RAD)
 """The slide: half the length of a robot a radian. The noise: a quarter of a range's."""
 
 
@@ -86,7 +89,7 @@ class Comparison(NamedTuple):
         """How the second sensor relates to the first over all ``bins``."""
         quantity = self.quantity
         a, b = bins.rows[:, quantity.columns[self.first]], bins.rows[:, quantity.columns[self.second]]
-        limits = quantity.offset_sigma, quantity.min_noise, quantity.min_size, quantity.max_ratio
+        limits = quantity.offset_sigma, quantity.noise, quantity.min_noise, quantity.min_size, quantity.max_ratio
         n, alpha, sigma = _fit(a, b, bins.rows[:, quantity.offset_column], *limits)
         bound = float(stdtrit(n - 2, _CONFIDENCE)) * sigma / abs(alpha) if n >= quantity.min_bins and alpha else math.inf
         scale, angle, most = abs(alpha), math.atan2(alpha.imag, alpha.real), quantity.max_angle
@@ -96,7 +99,7 @@ class Comparison(NamedTuple):
 
 @kernel
 def _fit(
-    a: FloatArray, b: FloatArray, u: FloatArray, offset_sigma: float, min_noise: float, min_size: float, max_ratio: float
+    a: FloatArray, b: FloatArray, u: FloatArray, offset_sigma: float, noise: float, min_noise: float, min_size: float, max_ratio: float
 ) -> tuple[int, complex, float]:
     """Number of bins that count, alpha of the motions ``a`` and ``b`` (n, 1 or 2) with offsets along ``u`` (n,), and the standard error of
     alpha along each axis. 0 bins where beta is farther from 0 than two of its sigmas, or alpha beyond ``max_ratio``: what differs then
@@ -113,13 +116,11 @@ def _fit(
         au, ab, ub = au + first.conjugate() * u[k], ab + first.conjugate() * second, ub + u[k] * second
     if n < 3 or aa == 0.0:
         return 0, 0j, 0.0
-    variance, information, determinant, alpha, beta = min_noise**2, 0.0, 0.0, 0j, 0j
-    for _ in range(2):  # the prior's weight is by the scatter that the first solution leaves
-        information = uu + variance / offset_sigma**2
-        determinant = aa * information - abs(au) ** 2
-        alpha, beta = (information * ab - au * ub) / determinant, (aa * ub - au.conjugate() * ab) / determinant
-        square = bb - (alpha.conjugate() * ab + beta.conjugate() * ub).real  # of residuals and prior
-        variance = max(square / (axes * (n - 2)), min_noise**2)
-    is_offset = abs(beta) > 2.0 * offset_sigma * max(abs(alpha), 1.0)  # another unit is one of the bias as well
+    information = uu + (noise / offset_sigma) ** 2
+    determinant = aa * information - abs(au) ** 2
+    alpha, beta = (information * ab - au * ub) / determinant, (aa * ub - au.conjugate() * ab) / determinant
+    square = bb - (alpha.conjugate() * ab + beta.conjugate() * ub).real  # of residuals and prior
+    variance = max(square / (axes * (n - 2)), min_noise**2)
+    is_offset = abs(beta) > 2.0 * offset_sigma * max(abs(alpha) / _MAX_RATIO, 1.0)  # another unit is one of the bias as well
     is_direction = not is_offset and 1.0 <= max_ratio * abs(alpha) <= max_ratio**2
     return n if is_direction else 0, alpha, math.sqrt(variance * information / determinant)

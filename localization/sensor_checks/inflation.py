@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Literal
 
@@ -111,9 +110,9 @@ class CovarianceInflation:
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
-        world = _turn(self.total, float(smoothed.poses[-1, 2]))
+        world = se2.rotate_covariance(self.total, float(smoothed.poses[-1, 2]))
         for i in np.flatnonzero(smoothed.stamps_ns >= self._since_ns):
-            covariances[i] += _turn(world, -float(smoothed.poses[i, 2]))
+            covariances[i] += se2.rotate_covariance(world, -float(smoothed.poses[i, 2]))
         return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
 
     @property
@@ -128,9 +127,3 @@ def _widen(estimate: Estimate, spread: Cov3) -> Estimate:
     if odometry is not None and odometry[1] is not None:
         odometry = odometry[0], odometry[1] + spread
     return replace(estimate, covariance=None if estimate.covariance is None else estimate.covariance + spread, odometry=odometry)
-
-
-def _turn(cov: Cov3, angle: float) -> Cov3:
-    c, s = math.cos(angle), math.sin(angle)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(R @ cov @ R.T)

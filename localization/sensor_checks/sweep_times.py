@@ -141,7 +141,7 @@ def _fit_factor(a: _TimedProfile, b: _TimedProfile, body_a_T_b: Pose2) -> tuple[
 def _linearize(a: _TimedProfile, b: _TimedProfile, a_T_b: Pose2, factor: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distances r (180,) [m] of the points of ``b`` from the lines of ``a``, their derivative (180, 4) by ``a_T_b`` (3,) and the factor,
     and weights (180,); 0 where a point has no line."""
-    R = np.array([[math.cos(a_T_b[2]), -math.sin(a_T_b[2])], [math.sin(a_T_b[2]), math.cos(a_T_b[2])]])
+    R = se2.rotation(a_T_b[2])
     turned = (b.profile.points + factor * b.skew) @ R.T
     moved = turned + a_T_b[:2]
     k = bearing_bins(moved)

@@ -139,7 +139,7 @@ def _chords(motions: Motions, middle: IntArray, end: IntArray) -> tuple[FloatArr
     to the positions ``middle`` and ``end`` (C,)."""
     poses, P = motions.poses, motions.covs
     by_middle, by_end = chord_jacobians(poses[middle, :2], poses[end, :2])
-    by_middle, by_end = by_middle @ _turn(poses[middle, 2]), by_end @ _turn(poses[end, 2])
+    by_middle, by_end = by_middle @ se2.rotation(poses[middle, 2]), by_end @ se2.rotation(poses[end, 2])
     d = by_middle @ motions.derivatives[middle, :2] + by_end @ motions.derivatives[end, :2]
     # the end's perturbation is the middle's, moved there, and that of the way between: Cov(middle, end) = P_middle A^T
     A = se2.adjoint(se2.inverse(se2.between(poses[middle], poses[end])))
@@ -147,12 +147,6 @@ def _chords(motions: Motions, middle: IntArray, end: IntArray) -> tuple[FloatArr
     mixed = by_middle @ cross @ np.swapaxes(by_end, 1, 2)
     own = [g @ P[i][:, :2, :2] @ np.swapaxes(g, 1, 2) for g, i in ((by_middle, middle), (by_end, end))]
     return chord_poses(poses[middle, :2], poses[end, :2]), d, own[0] + own[1] + mixed + np.swapaxes(mixed, 1, 2)
-
-
-def _turn(yaws: FloatArray) -> FloatArray:
-    """(C, 2, 2) rotations by ``yaws`` (C,)."""
-    c, s = np.cos(yaws), np.sin(yaws)
-    return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
 def series_of(batch: Batch) -> SampleSeries:

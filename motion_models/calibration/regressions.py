@@ -26,7 +26,7 @@ from scipy import stats
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray, adjoint, between, inverse, wrap_angle
+from motion_models.se2 import FloatArray, adjoint, between, inverse, rotation, wrap_angle
 from motion_models.text_files import check_file
 
 COLUMNS = ("cg_x_m", "cg_y_m", "rotation_ratio", "cor_x_m", "cor_y_m")
@@ -336,7 +336,7 @@ def _final_point(start_T_end: FloatArray) -> tuple[FloatArray, FloatArray]:
     by_cot = np.array([-y, x]) / 2.0
     cot_by_theta = -0.5 / math.sin(theta / 2.0) ** 2
     by_position = np.array([[1.0, -cot], [cot, 1.0]]) / 2.0
-    return value, np.column_stack([by_position @ _rotation(theta), by_cot * cot_by_theta])
+    return value, np.column_stack([by_position @ rotation(theta), by_cot * cot_by_theta])
 
 
 def center_of_arc(world_T_body: ArrayLike, cov: ArrayLike) -> CenterOfRotation:
@@ -400,7 +400,7 @@ def _residuals(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Whitened error (n, 3) of the poses, its derivative (n, 3) by the true headings and (n, 3, 4) by c and w."""
     n = poses.shape[0]
-    turn = _rotation(heading)  # (n, 2, 2) world_R_body
+    turn = rotation(heading)  # (n, 2, 2) world_R_body
     body = np.einsum("kji,kj->ki", turn, poses[:, :2] - fixed)  # the fixed point is at -body in the body frame
     error = np.column_stack([body + center, wrap_angle(poses[:, 2] - heading)])
     by_heading = np.column_stack([body[:, 1], -body[:, 0], -np.ones(n)])
@@ -408,8 +408,3 @@ def _residuals(
     by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0
     by_point[:, :2, 2:] = -np.swapaxes(turn, -1, -2)
     return np.einsum("kij,kj->ki", whiten, error), np.einsum("kij,kj->ki", whiten, by_heading), whiten @ by_point
-
-
-def _rotation(theta: ArrayLike) -> FloatArray:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

@@ -11,8 +11,7 @@ from motion_models.se3 import Transform3
 
 def transform_point(a_T_b: Pose2, point: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """``point`` (2,) of frame b in frame a, with its Jacobians by the pose (2, 3) and by the point (2, 2)."""
-    c, s = np.cos(a_T_b[2]), np.sin(a_T_b[2])
-    R = np.array([[c, -s], [s, c]])
+    R = se2.rotation(a_T_b[2])
     return se2.transform(a_T_b, point), np.column_stack([R, R @ [-point[1], point[0]]]), R
 
 
