@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
-from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, WAY, Comparison, Gain, Sensor
+from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, WAY, Comparison, Gain, Quantity, Sensor
 from localization.sensor_checks.faults import MEMORY_S, Evidence, FaultLog, SensorFault
 from localization.sensor_checks.window import WINDOW_BINS, Bins, Window
 
@@ -126,11 +126,14 @@ class Contradictions:
     def compare(self, window: Window) -> bool:
         """Declare faults that last; whether turns of two sensors are equal, ways are where there are scans, and nothing contradicts."""
         gains = {comparison: comparison.gain(window.bins) for comparison in _COMPARISONS}
-        equal = {comparison for comparison, gain in gains.items() if gain.is_equal}
-        agree = any(each.quantity is TURN for each in equal) and (_WAYS in equal or not window.has_scans)
+        equal: dict[Quantity, set[Sensor]] = {TURN: set(), WAY: set()}  # sensors that agree with another one
+        for comparison, gain in gains.items():
+            if gain.is_equal:
+                equal[comparison.quantity] |= {comparison.first, comparison.second}
+        agree = bool(equal[TURN]) and (bool(equal[WAY]) or not window.has_scans)
         for symptom, evidence in zip(SYMPTOMS, self._evidence, strict=True):
             is_shown = symptom.is_shown(gains)
-            is_refuted = any(symptom.sensor in each and each.quantity is symptom.comparison.quantity for each in equal)
+            is_refuted = symptom.sensor in equal[symptom.comparison.quantity]
             evidence.add(True if is_shown else False if is_refuted else None, window.end_s, window.begin_s)
             if is_shown and evidence.is_lasting and evidence.is_majority:
                 self._faults.declare(symptom.fault, evidence.since_s, _numbers(symptom, gains))
