@@ -119,13 +119,14 @@ def _off(truth: np.ndarray, pose: np.ndarray) -> tuple[float, bool]:
 def starts(
     maps: dict[str, KeyframeMap], map_name: str, name: str, n: int, seconds: float
 ) -> list[tuple[Start, list[Moment], list[Search]]]:
-    """``n`` starts in each half of building ``name``, in the map of the other half of ``map_name``."""
-    found, rng = [], np.random.default_rng(1)
-    for i in (0, 1):
-        places = RecordedSearches(maps[map_name].select(halves(maps[map_name])[i][::_MAP_STRIDE]), 0.02)
-        keyframes, scans = maps[name], maps[name].scans()
-        ids = halves(keyframes)[1 - i]
-        for k in rng.integers(ids[0], ids[-1] - 20, size=n):
+    """``n`` starts in each half of building ``name`` in turn, in the map of the other half of ``map_name``: the first of them do not depend
+    on ``n``."""
+    found, rng, keyframes = [], np.random.default_rng(1), maps[name]
+    sides = [RecordedSearches(maps[map_name].select(half[::_MAP_STRIDE]), 0.02) for half in halves(maps[map_name])]
+    scans, driven = keyframes.scans(), halves(keyframes)[::-1]
+    for _ in range(n):
+        for places, ids in zip(sides, driven, strict=True):
+            k = rng.integers(ids[0], ids[-1] - 20)
             until = keyframes.stamps_ns[k] + seconds * 1e9
             way = np.array([j for j in ids if j >= k and keyframes.stamps_ns[j] <= until])
             found.append(run_start(places, keyframes, scans, way, name, name == map_name))
