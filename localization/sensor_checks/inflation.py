@@ -106,7 +106,10 @@ class CovarianceInflation:
         return _widen(estimate, spread)
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
-        """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
+        """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes; and with the way in the time by
+        which the poses' clock may be off."""
+        if self.late_s and smoothed.covariances is not None:
+            smoothed = _widen_by_way(smoothed, self.late_s)
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
@@ -127,3 +130,15 @@ def _widen(estimate: Estimate, spread: Cov3) -> Estimate:
     if odometry is not None and odometry[1] is not None:
         odometry = odometry[0], odometry[1] + spread
     return replace(estimate, covariance=None if estimate.covariance is None else estimate.covariance + spread, odometry=odometry)
+
+
+def _widen_by_way(trajectory: Trajectory, late_s: float) -> Trajectory:
+    """``trajectory`` whose covariances have the longer one of the ways in the ``late_s`` [s] before and after each pose."""
+    assert trajectory.covariances is not None
+    stamps, shift_ns = trajectory.stamps_ns, round(late_s * 1e9)
+    before, after = (
+        se2.local(trajectory.poses, trajectory.at(np.clip(stamps + shift, stamps[0], stamps[-1]))) for shift in (-shift_ns, shift_ns)
+    )
+    is_longer = np.hypot(*after[:, :2].T) > np.hypot(*before[:, :2].T)
+    way = np.where(is_longer[:, None], after, before)
+    return Trajectory(stamps, trajectory.poses, trajectory.covariances + way[:, :, None] * way[:, None, :])

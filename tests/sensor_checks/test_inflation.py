@@ -9,6 +9,7 @@ import pytest
 
 from localization.estimators import Estimate
 from localization.sensor_checks.contradictions import LIDAR_DIRECTION
+from localization.sensor_checks.inflation import CovarianceInflation
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.checked_drive import SPEED, CheckedDrive, turned
@@ -38,3 +39,15 @@ def test_fault_inflates_the_covariance_by_what_it_has_done() -> None:
     assert inflated.covariances is not None
     np.testing.assert_allclose(inflated.covariances[-1], end.covariance, atol=1e-9)
     np.testing.assert_allclose(inflated.covariances[0], 1e-6 * np.eye(3))
+
+
+def test_smoothed_trajectory_of_an_uncertain_clock_has_the_way_in_that_time() -> None:
+    """Ahead at 1 m/s after a second at rest: where the motion begins, the way is that afterwards."""
+    t = np.arange(0.0, 5.0, 0.1)
+    poses = np.column_stack([np.maximum(t - 1.0, 0.0), 0.0 * t, 0.0 * t])
+    inflation = CovarianceInflation()
+    inflation.late_s = 0.5
+    found = inflation.inflate_trajectory(Trajectory(np.round(t * 1e9).astype(int), poses, np.zeros((len(t), 3, 3)))).covariances
+    assert found is not None
+    np.testing.assert_allclose(np.sqrt(found[[0, 10, 30], 0, 0]), [0.0, 0.5, 0.5], atol=1e-6)
+    assert not found[:, 1:].any()
