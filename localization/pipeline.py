@@ -86,7 +86,8 @@ class Pipeline:
         graph: SpaceGraphSettings | None = None
         if trial.estimator == "graph":
             corrections = make_corrections(model, trial.corrections)
-            graph = SpaceGraphSettings(corrections, robot.geometry.track_width_m, config.estimator.graph, is_smoothing)
+            of_graph = config.estimator.graph, is_smoothing, config.estimator.lidar.range_noise_m
+            graph = SpaceGraphSettings(corrections, robot.geometry.track_width_m, *of_graph)
         if is_in_space:
             in_space = SpaceFusion(*of_space)
             self.estimator = in_space if graph is None else SpaceGraphFusion(in_space, graph, np.zeros(3))

@@ -63,6 +63,8 @@ class GraphConfig(Settings):
     """x of the antenna of `--positions` in base_link, ahead [m]: prior mean of the lever arm, with a sigma of 0.5 m."""
     antenna_y_m: Signed = 0.0
     """y of the antenna of `--positions` in base_link, to the left [m]: prior mean of the lever arm, with a sigma of 0.5 m."""
+    cloud_loops: bool = False
+    """Clouds of a 3D LiDAR close loops of the smoothed trajectory where the robot has left the plane, by map-closures (extra `loops`)."""
 
 
 class GraphFusion(FilteredOdometry):

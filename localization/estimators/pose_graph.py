@@ -30,7 +30,7 @@ from motion_models.se2 import Cov3, FloatArray, Pose2
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
 _FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])
 """The first keyframe is the origin of the map [m, m, rad]."""
-_CAUCHY = 1.0
+CAUCHY = 1.0
 """Scale of the robust loss of loop closures [sigma]."""
 _HUBER = 1.345
 """Scale of the robust loss of wheels and positions [sigma]: 95 % efficiency on Gaussian noise (Huber 1981)."""
@@ -194,7 +194,7 @@ class PoseGraph:
         for between in update.betweens:
             noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
-                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
+                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), noise)
             a, b = (gtsam.symbol("x", i) for i in (between.a, between.b))
             factors.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(*between.delta), noise))
         if update.alignment is not None:

@@ -21,7 +21,7 @@ from localization.core.state import State
 from localization.estimators.estimator import NO_POINTS, Estimate, Estimator, twist_at_end
 from localization.events import Gravity, Step
 from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size, key_scan_noise
-from localization.lidar.cloud_map import CloudMap, thin
+from localization.lidar.cloud_map import SYSTEMATIC_COV, CloudMap, thin
 from localization.lifting import Pose3, aligning
 from motion_models import se3
 from motion_models.robot import GyroNoise, Mount
@@ -33,11 +33,6 @@ _BIAS_SIGMA = 0.01
 """Sigma of the biases of a gyro's axes that are not zeroed [rad/s]."""
 _MIN_POINTS_MAPPED = 50
 """Points with a surface in the submap, below which a cloud is lost. The first cloud of a standing robot has surfaces for a sixth of it."""
-
-_SYSTEMATIC_COV = np.diag([1.5e-3, 1.5e-3, 1.5e-3, 2e-4, 2e-4, 2e-4]) ** 2
-"""Covariance of errors that all points of a cloud share, which no residual shows: ground that is not plane within the pooled voxels, and
-motion that changes within a sweep. Clouds matched to maps of true poses err by .5 to 1.4 mm and .04 to .35 mrad beyond their noise
-[m^2, rad^2]."""
 
 
 class SpaceFusion(Estimator):
@@ -79,6 +74,11 @@ class SpaceFusion(Estimator):
     def accelerometer_sigma(self) -> float:
         """Sigma of the accelerometer's bias before any measurement [m/s^2]."""
         return self._config.accelerometer_m_s2
+
+    @property
+    def cloud(self) -> FloatArray | None:
+        """(N, 3) of the last step, deskewed and thinned, in the body frame [m]; None where there is none, and after `run_deferred`."""
+        return self._cloud
 
     def start_key(self) -> None:
         """Clone the pose as the last keyframe, the variable "key", which all later measurements update as well."""
@@ -150,7 +150,7 @@ class SpaceFusion(Estimator):
             return None
         self._lost.add_matched(step.end_ns)
         self._counts["matched"] += 1
-        cov = match.cov + _SYSTEMATIC_COV
+        cov = match.cov + SYSTEMATIC_COV
         if self._cloud_cov is None:  # the first cloud errs as this one does
             self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(0.0, key_scan_noise(cov, 1.0))))
         self._cloud_cov = cov

@@ -19,7 +19,8 @@ import numpy as np
 
 from localization.core.measurements.position import predict_position_in_space
 from localization.core.space import lift
-from localization.estimators.pose_graph import LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor
+from localization.estimators.pose_graph import CAUCHY, LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor
+from localization.lidar.cloud_loops import CloudLoop
 from motion_models import se2, se3
 from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import FloatArray
@@ -83,6 +84,7 @@ class SpaceGraph:
     betweens: list[Between] = field(default_factory=list)
     gravities: list[GravityMeasurement] = field(default_factory=list)
     positions: list[SpacePosition] = field(default_factory=list)
+    loops: list[CloudLoop] = field(default_factory=list)
     alignment: FloatArray | None = None
     """(4,) initial value of ``enu_T_map``, x, y, z and yaw; without it positions are left out."""
     lever: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -92,12 +94,33 @@ class SpaceGraph:
         """Poses (K, 4, 4), their covariances (K, 6, 6) and the corrections (c,). Raises `EstimatorError` where there is no solution."""
         graph, values = self._factors()
         with check_solvable():
+            if self.loops:  # a robust loss does not feel what is hundreds of its scales away
+                closed, _ = self._factors()
+                self._add_loops(closed, is_robust=False)
+                values = levenberg_marquardt(closed, values)
+                self._add_loops(graph, is_robust=True)
             values = levenberg_marquardt(graph, values)
             linear = graph.linearize(values)
-            marginals = gtsam.Marginals(linear, linear.optimize())
+            marginals = self._marginals = gtsam.Marginals(linear, linear.optimize())
             covs = [marginals.marginalCovariance(gtsam.symbol("x", k))[np.ix_(_SWAP, _SWAP)] for k in range(len(self.poses))]
-        found = np.array([values.atPose3(gtsam.symbol("x", k)).matrix() for k in range(len(self.poses))])
+        found = self._smoothed = np.array([values.atPose3(gtsam.symbol("x", k)).matrix() for k in range(len(self.poses))])
         return found, np.array(covs), np.asarray(values.atVector(_CORRECTIONS))
+
+    def relative_cov(self, a: int, b: int) -> FloatArray:
+        """(6, 6) covariance of the right perturbation of the motion from keyframe ``a`` to ``b``, as last smoothed."""
+        keys = [gtsam.symbol("x", k) for k in (a, b)]
+        joint = self._marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+        cov = np.block([[joint.at(i, j)[np.ix_(_SWAP, _SWAP)] for j in keys] for i in keys])
+        J = np.hstack([-se3.adjoint(se3.inverse(self._smoothed[b]) @ self._smoothed[a]), np.eye(6)])
+        return np.asarray(J @ cov @ J.T)
+
+    def _add_loops(self, graph: gtsam.NonlinearFactorGraph, is_robust: bool) -> None:
+        for loop in self.loops:
+            noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(loop.cov[np.ix_(_SWAP, _SWAP)])
+            if is_robust:
+                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), noise)
+            ends = gtsam.symbol("x", loop.a), gtsam.symbol("x", loop.b)
+            graph.add(gtsam.BetweenFactorPose3(*ends, gtsam.Pose3(loop.delta), noise))
 
     def _factors(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         graph, values, c = gtsam.NonlinearFactorGraph(), gtsam.Values(), len(self.prior_cov)

@@ -22,6 +22,7 @@ from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from localization.events import PositionSample, Step
 from localization.lidar import LostScans
+from localization.lidar.cloud_loops import find_loops, make_map_closures
 from localization.lifting import Pose3, SpaceTable, Trajectory3
 from localization.trajectory import Trajectory
 from motion_models import se2, se3
@@ -44,14 +45,20 @@ class SpaceGraphSettings:
     """Track width of the robot [m]."""
     config: GraphConfig
     is_smoothing: bool
-    """`finish` is to give the smoothed trajectory; memory then grows with the drive, 424 bytes a step."""
+    """`finish` is to give the smoothed trajectory; memory then grows with the drive, 424 bytes a step, and with loops 40 kB a keyframe."""
+    range_noise_m: float
+    """Sigma of a range [m]."""
+
+    def __post_init__(self) -> None:
+        if self.config.cloud_loops:
+            make_map_closures(1.0)  # an extra that is missing is said before the drive
 
 
 class SpaceGraphFusion(Estimator):
     """`SpaceFusion`, whose keyframes a `SpaceGraph` smooths at the end; its live poses are the filter's.
 
-    The filter's submap grows with the drive and is never left, so that a place that is visited again is matched by the filter itself: the
-    graph has no loops of its own.
+    The filter's submap grows with the drive and is never left, so that a place that is visited again is matched by the filter itself. Where
+    drift exceeds what matching bridges, loops by map-closures tie the keyframes (`GraphConfig.cloud_loops`).
     """
 
     def __init__(self, odometry: SpaceFusion, settings: SpaceGraphSettings, map_T_odom: Pose2) -> None:
@@ -67,6 +74,8 @@ class SpaceGraphFusion(Estimator):
         self._wheels = MotionPreintegration(len(corrections.names))
         self._stamps_ns, self._poses, self._covs_since = array("q"), array("d"), array("d")
         self._nodes: list[int] = []
+        self._range_noise_m = settings.range_noise_m
+        self._clouds: list[FloatArray | None] = []  # of keyframes, in the body frame, if loops are to be closed
         self._smoothed: Trajectory3 | None = None
         self._failure = ""
 
@@ -121,6 +130,9 @@ class SpaceGraphFusion(Estimator):
         self.graph.poses.append(state["pose"])
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
+            if self._config.cloud_loops:
+                cloud = self.odometry.cloud
+                self._clouds.append(None if cloud is None else cloud.astype(np.float32))
         self._wheels = MotionPreintegration(len(self._corrections.names))
         self.odometry.start_key()
 
@@ -141,6 +153,9 @@ class SpaceGraphFusion(Estimator):
         self._align()
         try:
             poses, covs, _ = self.graph.smooth()
+            self.graph.loops = find_loops(self._clouds, poses, self.graph.relative_cov, self._range_noise_m)
+            if self.graph.loops:
+                poses, covs, _ = self.graph.smooth()
         except EstimatorError as error:
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
@@ -196,6 +211,8 @@ class SpaceGraphFusion(Estimator):
     def counts(self) -> Mapping[str, int]:
         """Counts of the filter, of keyframes and of positions in the graph."""
         found = {**self.odometry.counts(), "keyframes": len(self.graph.poses)}
+        if self._config.cloud_loops:
+            found["loops"] = len(self.graph.loops)
         return {**found, "positions": self._n_positions} if self._n_positions else found
 
     @property
