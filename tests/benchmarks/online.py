@@ -144,15 +144,31 @@ class OverDds(NamedTuple):
     """Scans."""
 
 
+_DOMAIN = "97"
+
+
 def over_dds(path: Path, estimator: str, folder: Path, share: float = 1.0) -> OverDds:
     """A minute of ``path`` on DDS, with the node, once it has compiled, confined to a ``share`` of a core."""
-    domain = "97"
-    peer = start_peer(path, domain)
-    node = start_node(domain, "--estimator", estimator, "--node.wait-s", "1", "--state", str(folder / f"{estimator}.state"))
+    peer = start_peer(path, _DOMAIN)
+    node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(folder / f"{estimator}.state"))
     assert node.stdout is not None
-    assert peer.stdout is not None
     for _ in ("listening", "waiting for topics, with everything compiled"):
         node.stdout.readline()
+    return _measure(peer, node, share)
+
+
+def without_estimator(path: Path) -> OverDds:
+    """The same with `dds_relay` in the node's place: what the transport costs by itself."""
+    peer = start_peer(path, _DOMAIN)
+    relay = subprocess.Popen([sys.executable, "-m", "tests.helpers.dds_relay", _DOMAIN], stdout=subprocess.PIPE, text=True)
+    assert relay.stdout is not None
+    assert relay.stdout.readline() == "listening\n"
+    return _measure(peer, relay)
+
+
+def _measure(peer: subprocess.Popen[str], node: subprocess.Popen[str], share: float = 1.0) -> OverDds:
+    """Play a minute, and end both processes."""
+    assert peer.stdout is not None
     with _confined(node.pid, share) if share < 1.0 else nullcontext():
         before, begin = _cpu_seconds(node.pid), time.monotonic()
         play(peer, 60)
@@ -256,6 +272,8 @@ def latency() -> None:
         except ImportError:
             print("over DDS: the extra 'ros2' is not installed")
         else:
+            found = without_estimator(path)
+            _print("no estimator: scan sent, odometry sent, over DDS", found.out_s, found.cpu)
             for estimator in ("ekf", "graph"):
                 found = over_dds(path, estimator, folder)
                 _print(f"{estimator}: scan sent, odometry sent, over DDS", found.out_s, found.cpu)
