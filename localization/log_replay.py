@@ -160,7 +160,7 @@ class _Replay:
         in_space = self._in_space.trajectory(in_space) if len(self._in_space) else in_space
         if in_space is not None and estimator.smoothed_in_space is not None:
             in_space = in_space.with_end(estimator.smoothed_in_space)
-        plane = self._pipeline.plane
+        choice = self._pipeline.space_choice
         self._seconds += time.perf_counter() - begin
         return Run(
             self._trial.model.name,
@@ -181,5 +181,5 @@ class _Replay:
             estimator.localization(),
             in_space,
             {name: np.array(rows) for name, rows in self._parameters.items()},
-            None if plane is None else plane.left_ns,
+            None if choice is None else choice.left_ns,
         )

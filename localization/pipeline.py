@@ -10,21 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from localization.attitude import AttitudeFilter
 from localization.estimators import (
     ESTIMATORS_IN_SPACE,
     ESTIMATORS_WITH_CORRECTIONS,
     ESTIMATORS_WITH_MAP,
     Estimate,
-    Estimator,
     EstimatorConfig,
     MapFusion,
-    Plane,
     PriorMap,
-    SpaceFusion,
-    SpaceGraphFusion,
+    SpaceChoice,
     SpaceGraphSettings,
     make_estimator,
 )
@@ -81,24 +76,21 @@ class Pipeline:
         model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         name = trial.estimator if trial.prior is None else "ekf"
-        self.estimator: Estimator
-        of_space = robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space
         graph: SpaceGraphSettings | None = None
         if trial.estimator == "graph":
             corrections = make_corrections(model, trial.corrections)
             of_graph = config.estimator.graph, is_smoothing, config.estimator.lidar.range_noise_m
             graph = SpaceGraphSettings(corrections, robot.geometry.track_width_m, *of_graph)
+        choice = SpaceChoice(robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space, graph)
         if is_in_space:
-            in_space = SpaceFusion(*of_space)
-            self.estimator = in_space if graph is None else SpaceGraphFusion(in_space, graph, np.zeros(3))
+            self.estimator = choice.begin()
         else:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
         if trial.prior is not None:
             self.estimator = MapFusion(self.estimator, trial.prior, is_recording=is_smoothing)
-        self.plane: Plane | None = None
+        has_choice = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar
+        self.space_choice = choice if has_choice else None
         """The choice between plane and space; None where there is none."""
-        if trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar:
-            self.plane = Plane(*of_space, graph)
         self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step, robot.clock.sigma_s)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""
@@ -126,8 +118,8 @@ class Pipeline:
             self.checks.insert_imu(event)
         if isinstance(event, Scan):
             event = self.checks.correct(event)
-        if self.plane is not None and isinstance(event, Scan) and not event.is_planar:
-            self.plane.has_clouds = True
+        if self.space_choice is not None and isinstance(event, Scan) and not event.is_planar:
+            self.space_choice.has_clouds = True
             self.synchronizer.measure_in_space()
         self.synchronizer.insert(event)
         yield from self._estimates(is_last=False)
@@ -137,11 +129,11 @@ class Pipeline:
             self.run_deferred()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step)  # without faulty sensors
-            if self.plane is not None and self.plane.has_clouds:
-                self.estimator = self.plane.choose(self.estimator, self.attitude, step.start_ns)
+            if self.space_choice is not None and self.space_choice.has_clouds:
+                self.estimator = self.space_choice.choose(self.estimator, self.attitude, step.start_ns)
             estimate = self.estimator.step(step)  # predict, match, update
-            if self.plane is not None and self.plane.has_clouds:
-                self.plane.add(estimate, self.attitude)
+            if self.space_choice is not None and self.space_choice.has_clouds:
+                self.space_choice.add(estimate, self.attitude)
             self.checks.compare_residuals(self.estimator)
             estimate = self.checks.inflate(estimate)
             if estimate.nis is not None:

@@ -13,7 +13,7 @@ from localization.estimators.estimator import Estimate, Estimator, LearnedParame
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion, PriorMap
-from localization.estimators.plane import Plane
+from localization.estimators.space_choice import SpaceChoice
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
 from localization.lidar import LidarConfig, ScanMatchingSensor
@@ -33,9 +33,9 @@ __all__ = [
     "GraphFusion",
     "LearnedParameter",
     "MapFusion",
-    "Plane",
     "PriorMap",
     "Residuals",
+    "SpaceChoice",
     "SpaceFusion",
     "SpaceGraphFusion",
     "SpaceGraphSettings",

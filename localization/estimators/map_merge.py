@@ -11,6 +11,8 @@ import numpy as np
 
 from localization.errors import MapError
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph
+from localization.lidar.loop_detection import FLOOR_COV
+from localization.lidar.scan_matcher import OPEN_INFORMATION
 from localization.maps import KeyframeMap
 from localization.maps.changes import adds_to, find_changes
 from localization.maps.localizer import Localizer
@@ -19,9 +21,12 @@ from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
-_RELATIVE_COV = np.diag([0.02, 0.02, 0.005]) ** 2
-"""Covariance of the motion between two keyframes of a smoothed map, as of loop closures [m^2, m^2, rad^2]."""
 _START_COV = np.diag([10.0, 10.0, 1.0]) ** 2
+"""Covariance of the second map's place in the first beside its ties: a room's size and any heading, which they narrow to centimetres [m^2,
+m^2, rad^2]."""
+_MAX_OFF_M = 0.3
+"""Distance of an aligned scan from where the localizer has it, up to which it ties [m]: from there on 14 to 31 % of alignments end
+elsewhere (`localization.lidar.registration`)."""
 _LEAST_SCORE, _LEAST_CLOSURES = 0.5, 3
 """Score of a scan in the other map, from which on it ties its keyframe to that; and how many such keyframes a merge takes."""
 
@@ -70,7 +75,7 @@ def _closures(places: PlaceMap, second: KeyframeMap, initial: Pose2 | None) -> d
     for order, near in ((range(len(scans)), initial), (range(len(scans) - 1, -1, -1), None)):
         localizer, before = Localizer(places, near), second.poses[order[0]]
         for k in order:
-            localizer.add(scans[k], se2.between(before, second.poses[k]), _RELATIVE_COV)
+            localizer.add(scans[k], se2.between(before, second.poses[k]), FLOOR_COV)
             before = second.poses[k]
             if k not in found and localizer.state == "localized" and (closure := _closure(places, scans[k], localizer)) is not None:
                 found[k] = closure
@@ -81,9 +86,9 @@ def _closure(places: PlaceMap, points: Points2, localizer: Localizer) -> tuple[P
     if not len(points):
         return None
     place = places.align(points, localizer.pose)
-    if place.score < _LEAST_SCORE or math.hypot(*(place.pose[:2] - localizer.pose[:2])) > 0.3:
+    if place.score < _LEAST_SCORE or math.hypot(*(place.pose[:2] - localizer.pose[:2])) > _MAX_OFF_M:
         return None
-    return place.pose, np.asarray(np.linalg.inv(place.fit.information + np.diag([1e-2, 1e-2, 1.0]))) + _RELATIVE_COV
+    return place.pose, np.asarray(np.linalg.inv(place.fit.information + OPEN_INFORMATION)) + FLOOR_COV
 
 
 def _solve(second: KeyframeMap, closures: dict[int, tuple[Pose2, Cov3]]) -> tuple[FloatArray, FloatArray]:
@@ -94,7 +99,7 @@ def _solve(second: KeyframeMap, closures: dict[int, tuple[Pose2, Cov3]]) -> tupl
     graph.apply(GraphUpdate(np.zeros(3)))
     for k, own in enumerate(second.poses):
         start = se2.compose(first_T_second, own)
-        delta, cov = (start, _START_COV) if k == 0 else (se2.between(second.poses[k - 1], own), _RELATIVE_COV)
+        delta, cov = (start, _START_COV) if k == 0 else (se2.between(second.poses[k - 1], own), FLOOR_COV)
         ties = [BetweenMeasurement(k, k + 1, delta, np.asarray(np.linalg.inv(cov)))]
         if k in closures:
             ties.append(BetweenMeasurement(0, k + 1, closures[k][0], np.asarray(np.linalg.inv(closures[k][1])), is_loop=True))

@@ -23,7 +23,10 @@ _OLD_KEYFRAMES = 8
 _NEW_KEYFRAMES = 5
 """Keyframes whose scans are matched together: one scan fits many places, five of them few. After a loop is closed, the next trial waits
 for as many: loops that share scans share their errors, and would count twice."""
-_FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
+_MIN_INFORMATION = 1e-6
+"""Added to a loop's information, so that a direction which the scene leaves open has a sigma of 1 km, and is seen to be open
+[1/m^2, 1/rad^2]."""
+FLOOR_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 """Submaps bend: covariance of a loop, at least [m^2, m^2, rad^2]."""
 _MAX_DISTANCE_RANGES = 1.5
 """How far from its place a scan still shows the same walls [median range]."""
@@ -108,10 +111,10 @@ class LoopDetector:
             return None
         near = np.diag([2.0 * cell, 2.0 * cell, 0.03]) ** 2
         fit = align_points(make_grid(place, cell, self._config.range_noise_m), recent, found, near, found)
-        own_cov = np.asarray(np.linalg.inv(fit.information + 1e-6 * np.eye(3)), dtype=float)
+        own_cov = np.asarray(np.linalg.inv(fit.information + _MIN_INFORMATION * np.eye(3)), dtype=float)
         if fit.overlap < MIN_PLACE_OVERLAP or not is_narrow(own_cov):  # the latter where the scene leaves a direction open
             return None
-        return LoopClosure(j, k, fit.pose, own_cov + _FLOOR_COV)
+        return LoopClosure(j, k, fit.pose, own_cov + FLOOR_COV)
 
     def _merge(self, ids: range, poses: FloatArray, base: int) -> FloatArray:
         """(N, 2) the scans of keyframes ``ids`` in the frame of keyframe ``base``."""

@@ -28,7 +28,7 @@ _SWEEP_PARTS = 8
 """Parts of a sweep, over which slip within it is summed: 24 parts change no sigma of a bent scan by more than 3 %."""
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
-_OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
+OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
 """Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad, times that of the residuals
 [1/m^2, 1/m^2, 1/rad^2]."""
 _MAPPED_INFORMATION = 1e2
@@ -180,7 +180,7 @@ class ScanMatcher:
         later, earlier = H[::-1].cumsum(axis=0)[::-1][1:], H.cumsum(axis=0)[:-1]
         after, before = np.diff(np.maximum(t, 0.0)), np.diff(np.minimum(t, 0.0))  # how much of each gap is on either side of the middle
         pull = sum(np.einsum("g,gij,jk,glk->il", gap, M, slip_rate, M) for gap, M in ((after, later), (before, earlier)))
-        R = np.linalg.inv(H.sum(axis=0) + _OPEN_INFORMATION)
+        R = np.linalg.inv(H.sum(axis=0) + OPEN_INFORMATION)
         return np.asarray(R @ pull @ R)
 
     def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None) -> KeyScanError:
@@ -194,7 +194,7 @@ class ScanMatcher:
         fit = linearize(self._grid, points, pose)
         if len(self._keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
             self._residuals += np.array([fit.sum_squares, fit.sum_squares, fit.n_inliers])
-        noise = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION) * self._block_variance, dtype=float)
+        noise = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION) * self._block_variance, dtype=float)
         return KeyScanError(share, key_scan_noise(noise, new))
 
     def _fitting_keys(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> list[KeyScan]:
@@ -245,7 +245,7 @@ class ScanMatcher:
 
     def _result(self, fit: Alignment, outlier_cov: Cov3) -> ScanMatch:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
-        R = np.asarray(np.linalg.inv(fit.information + _OPEN_INFORMATION), dtype=float)
+        R = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION), dtype=float)
         measured = se2.retract(fit.pose, -R @ fit.gradient)
         self._residuals = FORGETTING * self._residuals + [fit.sum_squares, fit.sum_block_squares, fit.n_inliers]
         return ScanMatch(fit.pose, measured, R * self._residual_variance, fit.overlap, outlier_cov)

@@ -15,7 +15,7 @@ import numpy as np
 
 from localization.lidar.correlative_search import prior_outlier_cov
 from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanobis
-from localization.lidar.scan_matcher import MIN_POINTS
+from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
 from localization.maps.background_search import BackgroundSearch
 from localization.maps.grid import Grid
 from localization.maps.place_probability import (
@@ -29,7 +29,7 @@ from localization.maps.place_probability import (
     weigh,
     with_fix,
 )
-from localization.maps.place_search import CELL_M, OPEN_INFORMATION, Place, PlaceMap
+from localization.maps.place_search import CELL_M, Place, PlaceMap
 from localization.maps.position_plane import PositionFix
 from localization.maps.recent_scans import RecentMotion, RecentScans
 from motion_models import se2

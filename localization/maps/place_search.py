@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from localization.lidar.correlative_search import draw_image
 from localization.lidar.registration import Alignment, align_points
+from localization.lidar.scan_matcher import OPEN_INFORMATION
 from localization.lidar.submap import VoxelGrid, make_grid, voxel_means
 from localization.maps.grid import Grid, draw_grid
 from localization.maps.keyframe_map import KeyframeMap
@@ -63,8 +64,6 @@ of each in fr079 and ACES, 0.19 the most, on a machine with seven processes on t
 _BLOCK_M, _PADDING = _BLOCK * CELL_M, max(_WIDTHS)
 _NEAR = math.exp(-0.5 * 1.5**2)
 """Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
-OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
-"""Information of a scan along directions that the scene leaves open, at least [1/m^2, 1/m^2, 1/rad^2]."""
 _ALIGN_COV = np.diag([0.1, 0.1, 0.03]) ** 2
 """Covariance of a searched pose, from which scans are aligned [m^2, m^2, rad^2]."""
 

@@ -14,13 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.lidar.registration import align_points, is_narrow, mahalanobis
-from localization.lidar.scan_matcher import MIN_POINTS
+from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
 from localization.lidar.submap import make_grid, voxel_means
-from localization.maps.place_search import OPEN_INFORMATION
 from motion_models import se2
 from motion_models.se2 import Cov3, Points2, Pose2
 
-_MOST = 12
+_MAX_KEYFRAMES = 12
 """Keyframes whose scans are joined, at most: 6 m of way."""
 _ALIGNED = 4
 """The last of them, with which a scan is aligned: 2 m of way."""
@@ -29,7 +28,7 @@ _CELL_M = 0.08
 _WIDE_M, _WIDE_RAD = 0.02, 0.01
 """Sigma of the odometry from keyframe to keyframe, from which on it is aligned: scans give 0.003 m and 0.001 rad, wheels 0.03 m and
 0.08 rad in turns of 25 degrees (fr079)."""
-_BASIN_M, _BASIN_RAD = 0.4, 0.3
+_MAX_SIGMA_M, _MAX_SIGMA_RAD = 0.4, 0.3
 """Sigma of the odometry up to which it is: alignments converge from about there."""
 _LEAST_COV = np.diag([1e-3, 1e-3, 1e-4]) ** 2
 """Covariance of any motion at least [m^2, m^2, rad^2]: a robot that stands in a bare corridor may be pushed along it, and in no other
@@ -68,7 +67,7 @@ class RecentScans:
     def __init__(self, range_noise_m: float) -> None:
         """``range_noise_m``: sigma of a range [m]."""
         self._range_noise_m = range_noise_m
-        self._keys: deque[_Keyframe] = deque(maxlen=_MOST)
+        self._keys: deque[_Keyframe] = deque(maxlen=_MAX_KEYFRAMES)
         self._pose, self._way_m = np.zeros(3), 0.0
 
     def __len__(self) -> int:
@@ -91,7 +90,7 @@ class RecentScans:
             self.clear()  # carried, or driven blind
         A = se2.adjoint(se2.inverse(motion.delta))
         moved = [replace(key, cov=A @ key.cov @ A.T + motion.cov) for key in self._keys]
-        self._keys = deque((key for key in moved if is_narrow(key.cov)), _MOST)
+        self._keys = deque((key for key in moved if is_narrow(key.cov)), _MAX_KEYFRAMES)
         self._pose = se2.compose(self._pose, motion.delta)
         self._way_m += math.hypot(motion.delta[0], motion.delta[1])
         self._way_m += _NEW_VIEW_M * abs(motion.delta[2]) if _is_partial(points) else 0.0
@@ -101,7 +100,7 @@ class RecentScans:
         """The scan ``points`` (N, 2) [m] was taken where the robot is."""
         self._keys.append(_Keyframe(self._pose, points, np.zeros((3, 3)), self._way_m))
 
-    def joined(self, cell_m: float, n: int = _MOST) -> Points2:
+    def joined(self, cell_m: float, n: int = _MAX_KEYFRAMES) -> Points2:
         """(M, 2) the last ``n`` scans as seen from the last one, one point in each voxel of ``cell_m`` [m]."""
         return voxel_means(self._seen_from(self._pose, n), cell_m)
 
@@ -111,7 +110,7 @@ class RecentScans:
     def _aligned(self, motion: RecentMotion, points: Points2) -> RecentMotion:
         delta, cov = motion.delta, motion.cov + _LEAST_COV
         is_wide = np.trace(cov[:2, :2]) > _WIDE_M**2 or cov[2, 2] > _WIDE_RAD**2
-        is_near = np.trace(cov[:2, :2]) < _BASIN_M**2 and cov[2, 2] < _BASIN_RAD**2
+        is_near = np.trace(cov[:2, :2]) < _MAX_SIGMA_M**2 and cov[2, 2] < _MAX_SIGMA_RAD**2
         if not (is_wide and is_near) or not self._keys or len(points) < MIN_POINTS:
             return motion
         grid = make_grid(self._seen_from(self._pose, _ALIGNED), _CELL_M, self._range_noise_m)

@@ -12,10 +12,11 @@ from motion_models.se2 import Cov3
 
 _OPEN_M2 = 1.0
 """Variance of a scan along the robot's axis, from which on it leaves the way open [m^2]; a door frame in view holds it to 3 cm."""
-_SCALE = 1.0 / 9.0
+_WAY_FACTOR_SIGMA = 1.0 / 9.0
 """Sigma of a factor on the wheels' way, which lasts: wheels that spin by half all along count a third too much, 3 sigma."""
-_PUSH_M, _PUSH_S = 4.0 / 3.0, 20.0
-"""Sigma of pushes while a way is open: 4 m are 3 sigma. It grows over some time, so that short stretches have little [m, s]."""
+_PUSH_SIGMA_M, _PUSH_S = 4.0 / 3.0, 20.0
+"""Sigma of pushes along an open way, and the time in which it grows to that, so that short stretches have little [m, s]: a push of 4 m, as
+in the corridors of `tests.helpers.corridors`, is 3 sigma."""
 _MIN_REPORTED_M = 10.0
 """Shortest way by wheels alone that is reported [m]."""
 
@@ -30,7 +31,7 @@ class _Stretch(NamedTuple):
     @property
     def variance(self) -> float:
         """Along the way, by a factor that lasts and by pushes [m^2]."""
-        return (_SCALE * self.way_m) ** 2 + (_PUSH_M * min(self.seconds / _PUSH_S, 1.0)) ** 2
+        return (_WAY_FACTOR_SIGMA * self.way_m) ** 2 + (_PUSH_SIGMA_M * min(self.seconds / _PUSH_S, 1.0)) ** 2
 
 
 class OpenWay:

@@ -17,7 +17,7 @@ from localization.lifting import Lifting, Pose3
 from motion_models.robot import GyroNoise, Mount
 
 
-class Plane:
+class SpaceChoice:
     """Poses of an estimator in the plane, until the IMU shows that the ground tilts: from there on they are in space.
 
     Without a 3D LiDAR they stay in the plane, whatever the ground does: planar scans are not matched in space.
@@ -45,7 +45,13 @@ class Plane:
         if self._pose is None or self.left_ns is not None or attitude is None or not attitude.is_tilting:
             return estimator
         self.left_ns = start_ns
-        in_space = SpaceFusion.continuing(estimator, self._pose, *self._of_space)
+        return self._with_graph(SpaceFusion.continuing(estimator, self._pose, *self._of_space))
+
+    def begin(self) -> Estimator:
+        """An estimator in space, at the origin."""
+        return self._with_graph(SpaceFusion(*self._of_space))
+
+    def _with_graph(self, in_space: SpaceFusion) -> Estimator:
         return in_space if self._graph is None else SpaceGraphFusion(in_space, self._graph, self._map_T_odom)
 
     def add(self, estimate: Estimate, attitude: AttitudeFilter | None) -> None:
