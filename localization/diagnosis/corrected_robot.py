@@ -88,7 +88,7 @@ def held_shares(predictor: DrivePredictor, sizes: Mapping[Cause, float], names: 
     of_robot, corrected = with_sizes(sizes).of_robot(), correct_robot(predictor, sizes)
     shares, weight = {}, np.array([1.0, 1.0, _TURN_M])
     for name in names or MODELS:
-        before = dataclasses.replace(predictor, model=make_model(name, predictor.drive.robot))
+        before = dataclasses.replace(predictor.by_file, model=make_model(name, predictor.drive.robot))
         after = predictor_after(predictor, corrected, name)
         wanted, old, new = before.discrepancies(of_robot), before.discrepancies(Hypothesis()), after.discrepancies(Hypothesis())
         change, left = (float(np.linalg.norm(np.nan_to_num((rows - wanted)[:, :3]) * weight)) for rows in (old, new))

@@ -13,7 +13,7 @@ import numpy as np
 from localization.bounded_settings import Count, Probability, Seed, Settings
 from localization.calibration.calibrate import describe_clocks
 from localization.diagnosis.causes import MISSING_MESSAGES
-from localization.diagnosis.causes.cause import Cause, with_sizes
+from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, Unmodelled
 from localization.diagnosis.findings import (
@@ -38,8 +38,8 @@ from localization.diagnosis.linearization import (
     linearize,
     make_predictor,
 )
-from localization.diagnosis.model_error import MissingSlips, find_model_error, size_error, unmodelled_by
-from localization.diagnosis.noise import slip_sigmas, slow_turn_sigmas
+from localization.diagnosis.model_error import COULOMB_LOG_STIFFNESS, MissingSlips, find_model_error, size_error, unmodelled_by
+from localization.diagnosis.noise import Noise, slip_sigmas, slow_turn_sigmas
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -81,6 +81,9 @@ _SUSPICION = 0.2  # family-wise p of a cause that is mentioned, but not named
 _DETECTABLE_SIGMAS = 3.0
 _PART_LOG_ODDS = 14.0  # twice the log-odds by which a cause in a part of a drive leads: odds of 1000, as hundreds of parts are tried
 _MAX_MOMENT_SHARE = 0.25  # 95 % interval of the moment of an event, over the drive: a payload that is taken up has a tenth
+_CONTACTS_LOG_ODDS = 7.0
+"""Twice the log-odds by which other contacts than the robot file's have to describe a drive better, beside the best causes of each: odds of
+33. MuJoCo's drives gain 9 to 90 (five healthy ones), drives of the simulator lose 32 and 60."""
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -133,13 +136,16 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
-    predictor, first, error = _linearize_with_model_error(make_predictor(drive, model, baseline), config)
     rng = np.random.default_rng(config.seed)
-    linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
-    chosen = _drop_insignificant(linearization, chosen, rng, config)
-    if chosen and _is_worse_with(predictor, linearization, chosen):
-        linearization, chosen = first, ()
-    return _conclude(_Searched(predictor, first, linearization, error), chosen, rng, config)
+    predictor = make_predictor(drive, model, baseline)
+    searched = _search(predictor, config)
+    if searched.error.is_shown:
+        stiff = _search(dataclasses.replace(predictor, unmodelled=Unmodelled(log_stiffness=COULOMB_LOG_STIFFNESS)), config)
+        searched = stiff if _describes_better(stiff, searched) else searched
+    chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
+    if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
+        searched, chosen = searched._replace(linearization=searched.first), ()
+    return _conclude(searched, chosen, rng, config)
 
 
 def _is_worse_with(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...]) -> bool:
@@ -157,7 +163,30 @@ class _Searched(NamedTuple):
     """About the robot file."""
     linearization: Linearization
     """About the best causes."""
+    chosen: tuple[int, ...]
+    """Indices of the best causes."""
     error: MissingSlips
+    """What the contacts are off beside the best causes."""
+
+
+def _search(predictor: DrivePredictor, config: DiagnosisConfig) -> _Searched:
+    """The best causes, with the contacts of ``predictor``."""
+    predictor, first, error = _linearize_with_model_error(predictor, config)
+    linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
+    if error.is_shown:  # also about the best causes, not by the bent signature of a large one
+        error = find_model_error(predictor, linearization)
+    return _Searched(predictor, first, linearization, chosen, error)
+
+
+def _describes_better(new: _Searched, old: _Searched) -> bool:
+    """Whether the contacts and causes of ``new`` describe the drive clearly better than those of ``old``, by the noise of either."""
+
+    def cost(searched: _Searched, noise: Noise) -> float:
+        state = dataclasses.replace(searched.linearization, noise=noise)
+        sizes = state.problem.fit(searched.chosen)[0]
+        return refined_cost(searched.predictor, state, {state.causes[i]: float(s) for i, s in zip(searched.chosen, sizes, strict=True)})
+
+    return all(cost(new, noise) < cost(old, noise) - _CONTACTS_LOG_ODDS for noise in (old.linearization.noise, new.linearization.noise))
 
 
 def _linearize_with_model_error(predictor: DrivePredictor, config: DiagnosisConfig) -> tuple[DrivePredictor, Linearization, MissingSlips]:
@@ -167,7 +196,7 @@ def _linearize_with_model_error(predictor: DrivePredictor, config: DiagnosisConf
     is_searched = predictor.model.name == FrictionModel.name and is_skid_steer(drive.robot) and drive.kind in ("log", "windows")
     if not is_searched or predictor.has_baseline:
         return predictor, linearize(predictor, candidate_causes(predictor, config.moments), {}, TOLERANCE), MissingSlips(0.0, 0.0)
-    predictor = dataclasses.replace(predictor, unmodelled=Unmodelled(has_stiffness=True))
+    predictor = dataclasses.replace(predictor, unmodelled=dataclasses.replace(predictor.unmodelled, has_stiffness=True))
     causes = candidate_causes(predictor, config.moments)
     first = linearize(predictor, causes, {}, TOLERANCE)
     error = find_model_error(predictor, first)
@@ -263,18 +292,18 @@ def _p_value(linearization: Linearization, others: tuple[int, ...], i: int, rng:
 
 def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Generator, config: DiagnosisConfig) -> DiagnosisResult:
     """Findings, the table with its attributions, and the verdict that follows from it."""
-    predictor, first, linearization, error = searched
-    if error.is_shown:  # also about the best causes, not by the bent signature of a large one
-        error = find_model_error(predictor, linearization)
+    predictor, first, linearization, _, error = searched
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
     reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
     excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
     chosen, gains, dropped = _keep_useful(linearization, chosen, config, max(excess) <= MAX_NOISE_OVER_REFERENCE)
     sizes, gained = problem.fit_by_likelihood(chosen)[0], problem.gain(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
-    if error.is_shown:
+    has_other_contacts = error.is_shown or bool(predictor.unmodelled.log_stiffness)
+    if has_other_contacts:
         findings = [dataclasses.replace(f, sigma=math.hypot(f.sigma, size_error(predictor, f.definition))) for f in findings]
-    rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas)
+    by_contacts = _by_contacts(predictor, first)
+    rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas, by_contacts)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
     trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)
@@ -291,7 +320,7 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
         next_drive = separating_drive(predictor, findings)
     else:
         next_drive = general_advice(verdict, [e.id for e in undetectable])
-    if error.is_shown:
+    if has_other_contacts:
         next_drive = f"{next_drive} {model_error_advice(findings)}".strip()
     within = {**dropped, **_within_tolerance(linearization, chosen, sizes, rows)}
     result = Diagnosis(
@@ -305,14 +334,33 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
         gain=_heldout(linearization, chosen, (), config) if chosen else None,
         outliers_s=tuple(float(t) for t in drive.starts_s[predictor.batch.owner][find_outliers(linearization)]),
         windows=len(drive.maneuvers),
-        warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *error.notes, *drive.warnings),
+        warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *_contact_notes(predictor, error), *drive.warnings),
         suspected=None if suspected is None else suspected[0],
     )
     named = [f.definition.key for f in correctable_findings(result)] or [causes[i].key for i in chosen]
     result = dataclasses.replace(result, handover=check_findings(predictor, linearization, named))
     result = _with_data_errors(result, drive)
-    residuals = DriveDiscrepancies(first.rows, left, linearization.noise.sigmas)
+    residuals = DriveDiscrepancies(first.rows + by_contacts, left + by_contacts, linearization.noise.sigmas)
     return DiagnosisResult(result, predictor, residuals, linearization)
+
+
+def _by_contacts(predictor: DrivePredictor, first: Linearization) -> FloatArray:
+    """(M, 6) by how much discrepancies by the robot file are more than those by the contacts about which the drive is linearized."""
+    if predictor.by_file is predictor:
+        return np.zeros_like(first.rows)
+    return predictor.by_file.discrepancies(Hypothesis()) - first.rows
+
+
+def _contact_notes(predictor: DrivePredictor, error: MissingSlips) -> tuple[str, ...]:
+    """That the contacts are not those of the robot file, or not those of the friction model, in sentences."""
+    if not predictor.unmodelled.log_stiffness:
+        return error.notes
+    times = math.exp(predictor.unmodelled.log_stiffness)
+    return (
+        f"the contacts of this robot are {times:.0f} times as stiff as the robot file has them, nearly of Coulomb's friction: causes are"
+        " searched beside such contacts.",
+        *error.notes,
+    )
 
 
 def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> tuple[str, ...]:

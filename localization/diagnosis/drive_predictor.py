@@ -12,6 +12,7 @@ from typing import get_args
 import numpy as np
 
 from localization.diagnosis.causes.cause import Cause, DriveMotion, Hypothesis, Spell, Stage, changed
+from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
@@ -127,6 +128,8 @@ class Unmodelled:
     """The tyres' slip stiffness, how it grows with speed, and how far contacts give way while speeds change, are unknown."""
     slip_share: float = 0.0
     """Sigma of slips by kind of motion, alike on both sides, that the model does not have, over the wheels' way."""
+    log_stiffness: float = 0.0
+    """Logarithm of the slip stiffness over the robot file's, about which the drive is linearized."""
 
 
 @dataclass
@@ -179,6 +182,13 @@ class DrivePredictor:
     def has_baseline(self) -> bool:
         """Whether the robot differs from its file when nothing is wrong."""
         return self.baseline != Baseline()
+
+    @cached_property
+    def by_file(self) -> DrivePredictor:
+        """The drive with the contacts of the robot file."""
+        if not self.unmodelled.log_stiffness:
+            return self
+        return dataclasses.replace(self, unmodelled=dataclasses.replace(self.unmodelled, log_stiffness=0.0))
 
     @property
     def nominal_twist(self) -> FloatArray:
@@ -295,7 +305,8 @@ class DrivePredictor:
         return self._rows[key]
 
     def _predicted_discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
-        hypothesis = self.baseline.hypothesis + hypothesis
+        contacts = slip_stiffness_cause(self.drive.robot).inject(Hypothesis(), self.unmodelled.log_stiffness)
+        hypothesis = self.baseline.hypothesis + contacts + hypothesis
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)
         reference_params = np.array([self.wheel_shift(hypothesis), hypothesis.wheel_lag_s, *self._tracked(hypothesis)])
@@ -455,8 +466,9 @@ def rolling_column(predictor: DrivePredictor) -> FloatArray:
     axles' loads are those of a centre of gravity so much farther back, 4.3 mm on a Husky; where a robot turns in place both sides cancel.
     """
     batch, model = predictor.batch, FrictionModel.from_robot(predictor.drive.robot)
-    params = model.nominal
+    params = model.nominal.copy()
     radius, resistance, wheelbase = (params[model.param_names.index(name)] for name in ("wheel_radius", "rolling_resistance", "wheelbase"))
+    params[model.param_names.index("slip_stiffness")] *= math.exp(predictor.unmodelled.log_stiffness)
     back = resistance * radius * np.sign(batch.wheels).mean(axis=1)
     half = 0.49 * wheelbase  # a centre of gravity over an axle would lift the other one
     cg = np.column_stack([np.clip(batch.cg[:, 0] - back, -half, half), batch.cg[:, 1]])

@@ -122,6 +122,7 @@ def check_written(predictor: DrivePredictor, noise: Noise, candidate: CandidateR
     """
     if candidate.corrected.robot == predictor.drive.robot:
         return None
+    predictor = predictor.by_file
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.toml"
         path.write_text(robot_toml(relocated(candidate.corrected.robot, path.parent)), encoding="utf-8")

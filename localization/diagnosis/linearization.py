@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -329,6 +330,7 @@ def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArr
     if predictor.unmodelled.has_stiffness:
         for cause in (slip_stiffness_cause(predictor.drive.robot), stiffness_exponent_cause()):
             columns.append(predictor.signature(hypothesis, cause, rows)[..., None] * (cause.plausible / FLAT))
+        columns[1] *= math.exp(predictor.unmodelled.log_stiffness)  # the cause is relative to the robot file's stiffness
         columns += [give_columns(predictor) / FLAT, rolling_column(predictor) / FLAT]
     if predictor.unmodelled.slip_share:
         slips = mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT)

@@ -35,6 +35,10 @@ CG_OFFSETS = ("cg_offset_x", "cg_offset_y")
 """Causes that move the centre of gravity, along x and y."""
 _LEAST_LEVER_M = 0.05
 _CG_SIGMA_SHARE, _MODEL_ERROR_SHARE = 0.25, 0.22
+COULOMB_LOG_STIFFNESS = 2.0
+"""Logarithm of the slip stiffness of contacts that hardly differ from Coulomb's friction over the robot file's. Tyres have 0.5 to 1.3 times
+the nominal value; MuJoCo's contacts, which slide from 0.03 m/s on, 8 times and more: slopes about the file's stiffness do not predict how
+they move."""
 _SHARES = np.geomspace(1e-3, 0.2, 20)
 """Sigmas of the slips that are tried."""
 

@@ -241,10 +241,12 @@ def attribute_rows(
     sizes: FloatArray,
     significance: float,
     reference_sigmas: FloatArray | None,
+    by_contacts: FloatArray,
 ) -> dict[str, Component]:
     """Each channel over the whole drive but its outliers, with the causes that account for it; ``sizes`` (k,) of those ``chosen``.
 
-    ``reference_sigmas`` (M, 3) are those of the motion reference, inf where it measured nothing; None where they are not given.
+    ``reference_sigmas`` (M, 3) are those of the motion reference, inf where it measured nothing; None where they are not given. What
+    contacts make that the robot file does not have, ``by_contacts`` (M, 6), is part of the discrepancies, and no finding corrects it.
     """
     regular = ~find_outliers(linearization)
     every = linearization.problem.tolerated(chosen, sizes)
@@ -254,19 +256,20 @@ def attribute_rows(
     is_significant = np.abs(every) >= _MIN_LISTED_SIGMAS * linearization.problem.posterior_sigmas(chosen)
     every[list(chosen)], is_significant[list(chosen)] = sizes, True
     alone = dataclasses.replace(linearization.noise, correlation=np.eye(len(CHANNELS)))  # a row is tested by itself
-    white, white_rest = alone.whiten(first.rows), alone.whiten(rest)
+    rows = first.rows + by_contacts
+    white, white_rest = alone.whiten(rows), alone.whiten(rest)
     weighed = rest * linearization.noise.weights[:, None]  # as in the fit: a single window between four and eight sigma is no shape
     parts = np.nan_to_num(linearization.signatures) * every
     parts[..., list(chosen)] = _parts_of(np.nan_to_num(first.rows - named), parts[..., list(chosen)])
     parts /= linearization.noise.sigmas[..., None]
-    scaled = np.nan_to_num(first.rows) / linearization.noise.sigmas
+    scaled = np.nan_to_num(rows) / linearization.noise.sigmas
     found = {}
     for c, name in enumerate(CHANNELS):
-        known = np.isfinite(first.rows[:, c]) & regular
+        known = np.isfinite(rows[:, c]) & regular
         if not known.any():
             continue
         weights = linearization.noise.sigmas[known, c] ** -2.0
-        rms, corrected_rms, rest_rms = (_rms(rows[known, c], weights, c) for rows in (first.rows, named, weighed))
+        rms, corrected_rms, rest_rms = (_rms(of[known, c], weights, c) for of in (rows, named + by_contacts, weighed))
         expected = float(np.mean(weights) ** -0.5)
         p = float(f_distribution.sf(np.mean(white[known, c] ** 2), int(known.sum()), alone.freedom)) if c < _TESTED_CHANNELS else math.nan
         excess = noise_excess(linearization, reference_sigmas, known, c)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
+from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Hypothesis
+from localization.diagnosis.corrected_robot import correct_robot, held_shares
 from localization.diagnosis.diagnose import diagnose
-from localization.diagnosis.drive_predictor import DrivePredictor, mirrored, rolling_column
+from localization.diagnosis.drive_predictor import DrivePredictor, Unmodelled, mirrored, rolling_column
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.linearization import regression
 from localization.diagnosis.model_error import cg_error_sigmas
@@ -31,6 +34,22 @@ def test_diagnose_contacts_that_creep_by_rate_are_no_cause() -> None:
     found = diagnosed(_CREEPING, 3)
     assert not found.findings
     assert found.verdict == "consistent"
+
+
+def test_predictor_about_stiff_contacts_predicts_as_they_move_and_writes_none_of_them() -> None:
+    drive = law_drive("jackal")
+    model = make_model("friction", drive.robot)
+    stiffness = model.nominal[model.param_names.index("slip_stiffness")]
+    stiffer = Hypothesis(friction={"slip_stiffness": stiffness * (math.exp(2.0) - 1.0)})
+    by_file = DrivePredictor(drive, model, has_inertia=False)
+    about = DrivePredictor(drive, model, has_inertia=False, unmodelled=Unmodelled(log_stiffness=2.0))
+    moved = about.discrepancies(Hypothesis())
+    assert moved == pytest.approx(by_file.discrepancies(stiffer), nan_ok=True)
+    assert np.nanmax(np.abs(moved - by_file.discrepancies(Hypothesis()))) > 2e-3
+    assert about.by_file.discrepancies(Hypothesis()) == pytest.approx(by_file.discrepancies(Hypothesis()), nan_ok=True)
+    causes = {CAUSES["cg_offset_x"]: 0.03}
+    assert correct_robot(about, causes).robot == correct_robot(by_file, causes).robot
+    assert held_shares(about, causes, ["friction"]) == pytest.approx(held_shares(by_file, causes, ["friction"]))
 
 
 def test_rolling_column_is_a_centre_of_gravity_behind_where_wheels_roll_ahead() -> None:

@@ -143,7 +143,7 @@ def test_attribute_rows_unequal_noise_is_weighed_alike_in_all_columns(rotations:
     factor = np.where(sigmas == 0.05, 1.0, 5.0)
     drawn = np.random.default_rng(0).normal(0.0, factor * sigmas)
     drive = measured(rotations, np.where(np.isfinite(rotations.rows), drawn, np.nan), sigmas)
-    yaw = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None)["yaw"]
+    yaw = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None, np.zeros_like(drive.rows))["yaw"]
     white = (drive.rows / sigmas)[:, CHANNELS.index("yaw")]
     assert yaw.rms / yaw.expected_rms == pytest.approx(np.sqrt(np.mean(white**2)))
     assert yaw.rms > 3.0 * yaw.expected_rms
@@ -155,7 +155,7 @@ def test_attribute_rows_lists_no_tolerated_cause_that_is_not_significant(rotatio
     i = causes.index("wheel_radius_scale")
     rows = rotations.signatures[..., i] * 0.8 * rotations.causes[i].negligible
     drive = measured(rotations, rows, np.full(rows.shape, np.sqrt(np.nanmean(rows**2))))
-    yaw = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None)["yaw"]
+    yaw = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None, np.zeros_like(drive.rows))["yaw"]
     assert yaw.status == "within tolerance"
     assert not yaw.attributions
     assert describe_row(yaw) == "several causes together, none of them significant by itself (within tolerance)"
