@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.events import Scan, Step
+from localization.events import Step
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.trajectory import BoolArray
 from motion_models.compiled import kernel
@@ -33,53 +33,27 @@ that is hit at a right angle; 0.4 rad change these by 8 %."""
 
 
 class OwnBody:
-    """Leaves out the points of the robot itself."""
+    """Leaves out the points of the robot itself: their beams have the same range while the robot drives and turns."""
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults = faults
-        self._filters: dict[str, OwnBodyFilter] = {}  # by the LiDAR's frame
+        self._way = self._heading = 0.0  # since the first step [m, rad]
+        self._lidars: dict[str, tuple[FloatArray, float]] = {}  # by frame: bearings as `_find_own` has them, and the way at the last scan
 
     def remove(self, step: Step) -> Step:
-        """``step`` without the points of the robot itself."""
-        for each in self._filters.values():
-            each.add_motion(step.predicted.delta)
-        if step.scan is None:
+        """``step`` without these points. Only planar scans are examined."""
+        x, y, turn = step.predicted.delta.tolist()
+        self._way, self._heading = self._way + math.hypot(x, y), self._heading + turn
+        scan = step.scan
+        if scan is None or not scan.is_planar or not len(scan.points):
             return step
-        if step.scan.frame_id not in self._filters:
-            self._filters[step.scan.frame_id] = OwnBodyFilter()
-        body = self._filters[step.scan.frame_id]
-        scan = body.filter(step.scan)
-        if body.share > _MIN_OWN_SHARE:
-            self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * body.share})
-        return step if scan is step.scan else replace(step, scan=scan)
-
-
-class OwnBodyFilter:
-    """Removes points of the robot itself from the scans of one LiDAR: their beams have the same range while the robot drives and turns."""
-
-    def __init__(self) -> None:
-        self._bearings = np.full((_BODY_BEARINGS, 5), np.nan)  # as `_find_own` has it
-        self._travelled = self._heading = 0.0
-        self.share = 0.0
-        """Largest share of a scan's points that were the robot itself, 0 to 1."""
-
-    def add_motion(self, delta: FloatArray) -> None:
-        """Motion (3,) of the body since the last call."""
-        self._travelled += math.hypot(delta[0], delta[1])
-        self._heading += float(delta[2])
-
-    def filter(self, scan: Scan) -> Scan:
-        """``scan`` without the points that were recognized as the robot itself. Only planar scans are examined."""
-        points = scan.points
-        if not scan.is_planar or not len(points):
-            return scan
-        is_own = np.zeros(len(points), dtype=bool)
-        share = _find_own(points, self._travelled, self._heading, self._bearings, is_own) / len(points)
-        self._travelled = 0.0
-        if share < _MIN_BODY_SHARE:
-            return scan
-        self.share = max(self.share, share)
-        return scan.select(~is_own)
+        bearings, way = self._lidars.get(scan.frame_id) or (np.full((_BODY_BEARINGS, 5), np.nan), self._way)
+        self._lidars[scan.frame_id] = bearings, self._way
+        is_own = np.zeros(len(scan.points), dtype=bool)
+        share = _find_own(scan.points, self._way - way, self._heading, bearings, is_own) / len(scan.points)
+        if share > _MIN_OWN_SHARE:
+            self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * share})
+        return step if share < _MIN_BODY_SHARE else replace(step, scan=scan.select(~is_own))
 
 
 @kernel

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from localization.events import Scan, Step
-from localization.sensor_checks.own_body import LIDAR_OWN_BODY, OwnBodyFilter
+from localization.sensor_checks.faults import FaultLog
+from localization.sensor_checks.inflation import CovarianceInflation
+from localization.sensor_checks.own_body import LIDAR_OWN_BODY, OwnBody
 from motion_models.base import Motion
 from tests.helpers import checked_drive, rooms
 
@@ -22,21 +24,25 @@ def scan(k: int, rng: np.random.Generator) -> Scan:
     return Scan(1_000_000_000 + k, points)
 
 
-def test_filter_of_post_on_driving_and_turning_robot_removes_it() -> None:
-    body, rng = OwnBodyFilter(), np.random.default_rng(0)
-    sizes = []
-    for k in range(30):
-        body.add_motion(np.array([0.1, 0.0, 0.05]))
-        sizes.append(len(body.filter(scan(k, rng)).points))
+def step(k: int, rng: np.random.Generator, delta: np.ndarray) -> Step:
+    """With a scan, on a robot that moves by ``delta`` (3,)."""
+    return Step(k * 10**8, (k + 1) * 10**8, Motion(delta, np.eye(3)), np.zeros(3), np.zeros(3), False, True, None, scan(k, rng))
+
+
+def test_post_on_driving_and_turning_robot_is_removed() -> None:
+    faults, rng = FaultLog(CovarianceInflation()), np.random.default_rng(0)
+    body = OwnBody(faults)
+    sizes = [len(body.remove(step(k, rng, np.array([0.1, 0.0, 0.05]))).scan.points) for k in range(30)]
     assert sizes[0] == len(ANGLES)
     assert sizes[-1] == len(ANGLES) - 20
-    assert body.share == 20 / len(ANGLES)
+    assert list(faults.found) == [LIDAR_OWN_BODY]
 
 
-def test_filter_of_robot_at_rest_removes_nothing() -> None:
-    body, rng = OwnBodyFilter(), np.random.default_rng(0)
-    assert all(len(body.filter(scan(k, rng)).points) == len(ANGLES) for k in range(30))
-    assert body.share == 0.0
+def test_nothing_is_removed_from_scans_of_a_robot_at_rest() -> None:
+    faults, rng = FaultLog(CovarianceInflation()), np.random.default_rng(0)
+    body = OwnBody(faults)
+    assert all(len(body.remove(step(k, rng, np.zeros(3))).scan.points) == len(ANGLES) for k in range(30))
+    assert faults.found == {}
 
 
 def test_beams_on_the_robot_are_left_out_and_reported() -> None:
@@ -66,8 +72,8 @@ def test_beams_of_two_lidars_on_the_robot_are_left_out() -> None:
         points = np.column_stack([ranges * np.cos(ANGLES), ranges * np.sin(ANGLES), np.zeros(len(ANGLES))])
         motion = Motion(np.array([0.1, 0.0, 0.05]), 1e-6 * np.eye(3))
         stamps = k * checked_drive.S // 10, (k + 1) * checked_drive.S // 10
-        step = Step(*stamps, motion, np.zeros(3), np.zeros(3), False, True, None, Scan(stamps[1], points, frame_id=frame))
-        applied = robot.checks.apply(step).scan
+        one = Step(*stamps, motion, np.zeros(3), np.zeros(3), False, True, None, Scan(stamps[1], points, frame_id=frame))
+        applied = robot.checks.apply(one).scan
         assert applied is not None
         is_own.append((np.hypot(applied.points[:, 0], applied.points[:, 1]) < 1.0).mean())
     assert is_own[0] == is_own[1] == 100 / 360
