@@ -82,6 +82,8 @@ class _Lidar:
     last_s: float = -math.inf
     """Time of the last one that did [s]."""
     is_active: bool = False
+    slipped: int = 0
+    """Successive comparisons that showed wheels that slip."""
 
 
 class MovingObjects:
@@ -106,6 +108,8 @@ class MovingObjects:
         """View that the last scan was compared with."""
         self._is_unsure = False
         """Objects may move, or the wheels slip."""
+        self._have_wheels_slipped = False
+        """Successive labels show wheels that slip."""
         self._suspected: FloatArray | None = None
         """(2, 3) poses before labels began to show that either happens."""
         self._suspected_s = -math.inf
@@ -175,11 +179,18 @@ class MovingObjects:
             self._since = self._poses.copy()
         inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
         inflation.possible = None
-        begin = self._suspected if self._suspected is not None else view.poses if view is not None and self._is_near(view) else None
+        begin = self._suspected
+        if begin is None and view is not None and (self._is_unsure or self._is_near(view)):
+            begin = view.poses
         if self._since is None and begin is not None:
             off = self._distance(begin)
-            is_off = self._is_unsure or _MIN_OFF_M < math.hypot(off[0], off[1]) < _MAX_OFF_M or (nis is not None and nis > _MAX_NIS)
+            is_off = self._is_unsure or self._is_undecided(math.hypot(off[0], off[1])) or (nis is not None and nis > _MAX_NIS)
             inflation.possible = off if is_off else None
+
+    def _is_undecided(self, distance: float) -> bool:
+        """Whether the estimate is farther from the motion by the wheels than these slip as a rule [m], and labels do not show that they
+        do."""
+        return distance > _MIN_OFF_M and (distance < _MAX_OFF_M or not self._have_wheels_slipped)
 
     def _distance(self, poses: FloatArray) -> FloatArray:
         """(3,) of the motion by the wheels since ``poses`` (2, 3) from that by the estimate."""
@@ -240,25 +251,27 @@ class MovingObjects:
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
         distance = math.hypot(*self._distance(found.view.poses)[:2])
-        is_unsure = _MIN_OFF_M < distance < _MAX_OFF_M
-        is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
+        is_moving, has_turn, slipped = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None, 0
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE:
                 self._suspected = found.view.poses if self._suspected is None else self._suspected
                 self._suspected_s = now_s
+            else:
+                slipped = lidar.slipped + 1
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
             is_moving = unique >= least and (has_turn or moved_share >= _MIN_MOVED_WITHOUT_GYRO)
         is_moving &= moved_share >= _MIN_MOVED
-        lidar.shown = lidar.shown + 1 if is_moving else 0
+        lidar.shown, lidar.slipped = lidar.shown + 1 if is_moving else 0, slipped
         if is_moving:
             lidar.last_s = now_s
         again = 1 if is_standing else _AGAIN if has_turn else _AGAIN_WITHOUT_GYRO
+        self._have_wheels_slipped = slipped >= again
         lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
         if now_s - self._suspected_s >= _CALM_S:
             self._suspected = None
-        self._is_unsure = is_unsure or self._suspected is not None
+        self._is_unsure = self._suspected is not None or self._is_undecided(distance)
         self._window.is_scene_moving = self._suspected is not None or lidar.is_active
         if lidar.is_active:
             self.report.add(moved_share)
