@@ -28,6 +28,7 @@ from localization import Trial, open_log, replay, score
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.extension import describe_term, extend
+from localization.diagnosis.handover import Reader
 from localization.evaluation.reference_files import load_reference
 from localization.events import Scan
 from localization.logs.writer import write_bag
@@ -105,7 +106,8 @@ def record(name, seed, arcs):
     return path
 
 
-log = open_log(record("first.mcap", seed=1, arcs=24), plain)
+first = record("first.mcap", seed=1, arcs=24)
+log = open_log(first, plain)
 f"{log.duration_s:.0f} s; wheels on {log.sources.wheels.topic}, LiDAR on {log.sources.lidar.topic}"
 
 # %% [markdown]
@@ -149,11 +151,11 @@ picture(
 # ## Step 3. The term
 #
 # `skidloc diagnose --extend` searches products of speed, yaw rate, accelerations, CG and time through the integration of the windows,
-# beside all causes, and keeps what improves windows to which it was not fitted. `off by` counts how many of its own sigmas the size is from
-# what was hidden: beyond 1.96, the 95 % interval misses it, as one in twenty may.
+# beside all causes, and keeps what improves windows to which it was not fitted, also where the log is replayed with the file. `off by`
+# counts how many of its own sigmas the size is from what was hidden: beyond 1.96, the 95 % interval misses it, as one in twenty may.
 
 # %%
-extended = extend(found, drive, model)
+extended = extend(found, drive, model, reader=Reader(lambda robot: open_log(first, robot), drive_of_log))
 assert extended.robot is not None, "no term was found that improves windows held out"
 print(f"{extended.found.diagnosis.verdict}: {extended.found.diagnosis.sentence}")
 

@@ -94,7 +94,9 @@ class Extension:
         fallen = [
             f"{name} falls from {r.before_m:.3g} to {r.after_m:.3g} m" for name, r in self.check.replays.items() if r.after_m < r.before_m
         ]
-        return f"{text}with it in robot.toml {' and '.join(fallen) or self.check.describe()} a window on the other half"
+        if not fallen:
+            return f"{text}with it in robot.toml, {self.check.describe()}"
+        return f"{text}with it in robot.toml {' and '.join(fallen)} a window on the other half"
 
     def to_dict(self) -> dict[str, Any]:
         """For `diagnose --json`: sizes in SI units with their 95 % intervals."""
