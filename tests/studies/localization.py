@@ -290,7 +290,7 @@ def main(words: Sequence[str] | None = None) -> None:
             moments += [moment for _, said, _ in found for moment in said]
             searches += [search for _, _, of_start in found for search in of_start]
             print(table(f"{map_name}, {name}", [start for start, _, _ in found]), flush=True)
-    moments += held_out(searches) if len(maps) > 1 else []
+    moments += held_out(searches)
     print(f"\nReliability: number of keyframes and share that is right [%]\n\n{reliability_table(moments)}")
     if options.figure:
         draw(moments, options.figure)

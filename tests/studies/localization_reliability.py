@@ -70,9 +70,9 @@ def fit(searches: Sequence[Search]) -> Weights:
 
 
 def held_out(searches: Sequence[Search]) -> list[Moment]:
-    """The probability of each best place by weights of the other buildings' searches, and by those of the program."""
-    found = []
-    for building in dict.fromkeys(search.building for search in searches):
+    """The probability of each best place by weights of the other buildings' searches, and by those of the program; none of one building."""
+    found, buildings = [], list(dict.fromkeys(search.building for search in searches))
+    for building in buildings if len(buildings) > 1 else ():
         weights = fit([search for search in searches if search.building != building])
         for search in searches:
             if search.building == building:
