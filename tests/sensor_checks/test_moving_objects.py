@@ -60,13 +60,20 @@ def test_people_who_walk_along_have_another_motion_than_the_room() -> None:
     assert np.hypot(*rest[:2]) < 0.15  # as if the robot stood
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *cases(["12 people walk off", "lift"], usual=["12 people walk off"]),
-        *cases([n for n in SCENES if n not in ("12 people walk off", "lift")], [], others=pytest.mark.slow),
-    ],
-)
+_USUAL = ("12 people walk off", "lift")
+_STILL_WRONG = {
+    "20 people edge away": "they step aside for the robot: 0.11 m off at a sigma of 0.016 m",
+    "fr079: crowd of 12 walks along": "without a gyro nothing but wheels that slip contradicts the crowd: 1.1 m off at a sigma of 0.024 m",
+}
+"""Scenes that docs/lab/scenes.md lists as wrong: a change that mends one must take it out here."""
+
+
+def _slow_case(name: str) -> object:
+    known = [pytest.mark.xfail(reason=_STILL_WRONG[name], strict=True)] if name in _STILL_WRONG else []
+    return pytest.param(name, marks=[pytest.mark.slow, *known])
+
+
+@pytest.mark.parametrize("name", [*cases(_USUAL, usual=_USUAL[:1]), *(_slow_case(n) for n in SCENES if n not in _USUAL)])
 def test_scene_that_moves_is_in_the_covariance(name: str) -> None:
     drive = SCENES[name](0)
     if name == "12 people walk off":  # within the first seconds
