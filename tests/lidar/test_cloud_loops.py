@@ -94,6 +94,7 @@ _OFF = se3.exp(np.array([0.5, -0.4, 0.2, 0.03, -0.03, 0.06]))
 """By as much proposals of map-closures are off."""
 
 
+@pytest.mark.extended
 def test_loop_in_space_errs_as_its_covariance_has_it(monkeypatch):
     """Of four draws of the ranges' noise, the mean NEES of 6 degrees of freedom: at most 10.7 in 99 % (chi-square with 24), and a loop is
     known to millimetres."""
