@@ -13,7 +13,7 @@ from tests.studies.buildings import BUILDINGS
 ROOT = Path(__file__).parents[2]
 PACKAGES = tuple(str(ROOT / name) for name in ("localization", "motion_models"))
 STEPS, WARM_UP_STEPS = 60, 30
-LIMITS = {"functions": 170, "calls a step": 267, "lines of their files": 7_030}
+LIMITS = {"functions": 171, "calls a step": 267, "lines of their files": 7_032}
 
 
 def trace():
