@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from localization.lidar import LidarConfig
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
-from localization.ros.state_serialization import deserialize, serialize
+from localization.ros.state_serialization import deserialize, serialize, serialize_parts
 from localization.synchronizer import StepConfig
 from localization.wheel_buffer import WheelInterval
 from motion_models.registry import make_model
@@ -284,6 +285,24 @@ def test_write_checkpoint_interrupted_keeps_the_old_state(state, monkeypatch):
         write_checkpoint(state, [1], {}, {}, {})
     assert state.read_bytes() == before
     assert [path.name for path in state.parent.iterdir()] == ["state"]
+
+
+def test_checkpoint_writer_on_a_busy_machine_is_as_often_due(tmp_path, monkeypatch):
+    """Where a state takes half a second by the clock, but hardly any CPU."""
+    clock = types.SimpleNamespace(now_s=0.0, monotonic=lambda: clock.now_s, thread_time=lambda: 0.0)
+    monkeypatch.setattr("localization.ros.checkpoint.time", clock)
+    checkpoints = CheckpointWriter(tmp_path / "state", {}, {}, every_s=0.75)
+
+    def serialize_slowly(value, shared):
+        clock.now_s += 0.5
+        return serialize_parts(value, shared)
+
+    monkeypatch.setattr("localization.ros.checkpoint.serialize_parts", serialize_slowly)
+    checkpoints.write([1.5], {})
+    checkpoints.wait()
+    clock.now_s = 0.76
+    assert checkpoints.is_due()
+    checkpoints.close()
 
 
 def test_checkpoint_writer_keeps_its_period_and_reports_a_full_disk(tmp_path, monkeypatch):
