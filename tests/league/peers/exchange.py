@@ -51,6 +51,14 @@ class Drive:
         """(n, 3) points of each scan."""
         return iter(np.split(self.points, self.ends[:-1]))
 
+    def ranges(self, points: FloatArray, missing: float) -> FloatArray:
+        """(B,) ranges of the beams of one scan's ``points`` (n, 3) [m]; ``missing`` where a beam has no point."""
+        first, step, count = self.beams
+        found = np.full(int(count), missing)
+        beam = np.rint((np.arctan2(points[:, 1], points[:, 0]) - first) / step).astype(int)
+        found[np.clip(beam, 0, int(count) - 1)] = np.hypot(points[:, 0], points[:, 1])
+        return found
+
     def predictions(self) -> FloatArray:
         """(N, 4, 4) motion of the LiDAR since the scan before, by wheel odometry; the first is the identity."""
         poses = matrix(self.odometry)

@@ -37,9 +37,7 @@ def _has_moved(before: FloatArray, after: FloatArray) -> bool:
 
 def _scan(drive: Drive, points: FloatArray, odometry: FloatArray) -> LocalizedRangeScan:
     first, step, count = drive.beams
-    ranges = np.full(int(count), np.nan)
-    beam = np.rint((np.arctan2(points[:, 1], points[:, 0]) - first) / step).astype(int)
-    ranges[np.clip(beam, 0, int(count) - 1)] = np.hypot(points[:, 0], points[:, 1])
+    ranges = drive.ranges(points, np.nan)
     last = first + step * (count - 1)
     return LocalizedRangeScan(ranges, first, last, step, 0.0, drive.max_range_m, default_config["range_threshold"], *odometry)
 

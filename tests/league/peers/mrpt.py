@@ -48,16 +48,13 @@ def _run(command: list[str], folder: Path) -> None:
 
 def _write_carmen(drive: Drive, path: Path) -> None:
     """One line ODOM and one FLASER for each scan."""
-    first, step, count = drive.beams
     with path.open("w") as file:
         for index, (points, odometry) in enumerate(zip(drive.scans(), drive.odometry, strict=True)):
-            ranges = np.full(int(count), _OUT_OF_RANGE_M)
-            beam = np.rint((np.arctan2(points[:, 1], points[:, 0]) - first) / step).astype(int)
-            ranges[np.clip(beam, 0, int(count) - 1)] = np.hypot(points[:, 0], points[:, 1])
+            ranges = drive.ranges(points, _OUT_OF_RANGE_M)
             pose = " ".join(f"{value:.6f}" for value in odometry)
             time = f"{index} robot {index}"
             file.write(f"ODOM {pose} 0 0 0 {time}\n")
-            file.write(f"FLASER {int(count)} {' '.join(f'{value:.3f}' for value in ranges)} {pose} {pose} {time}\n")
+            file.write(f"FLASER {len(ranges)} {' '.join(f'{value:.3f}' for value in ranges)} {pose} {pose} {time}\n")
 
 
 def _set_times(path: Path, stamps_ns: np.ndarray) -> None:
