@@ -30,7 +30,7 @@ from motion_models.se2 import Cov3, FloatArray, Pose2
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
 _FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])
 """The first keyframe is the origin of the map [m, m, rad]."""
-CAUCHY = 1.0
+_CAUCHY = 1.0
 """Scale of the robust loss of loop closures [sigma]."""
 _HUBER = 1.345
 """Scale of the robust loss of wheels and positions [sigma]: 95 % efficiency on Gaussian noise (Huber 1981)."""
@@ -194,7 +194,7 @@ class PoseGraph:
         for between in update.betweens:
             noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
             if between.is_loop:
-                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), noise)
+                noise = robust_loop_noise(noise)
             a, b = (gtsam.symbol("x", i) for i in (between.a, between.b))
             factors.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(*between.delta), noise))
         if update.alignment is not None:
@@ -259,6 +259,11 @@ def position_factor(position: PositionMeasurement) -> gtsam.CustomFactor:
         return np.asarray(predicted - position.position)
 
     return robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
+
+
+def robust_loop_noise(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
+    """``noise`` of a loop closure, with a Cauchy loss: one that is wrong pulls little."""
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
 
 
 def robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., FloatArray]) -> gtsam.CustomFactor:

@@ -19,7 +19,7 @@ import numpy as np
 
 from localization.core.measurements.position import predict_position_in_space
 from localization.core.space import lift
-from localization.estimators.pose_graph import CAUCHY, LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor
+from localization.estimators.pose_graph import LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor, robust_loop_noise
 from localization.lidar.cloud_loops import CloudLoop
 from motion_models import se2, se3
 from motion_models.preintegration import PreintegratedMotion
@@ -118,7 +118,7 @@ class SpaceGraph:
         for loop in self.loops:
             noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Covariance(loop.cov[np.ix_(_SWAP, _SWAP)])
             if is_robust:
-                noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), noise)
+                noise = robust_loop_noise(noise)
             ends = gtsam.symbol("x", loop.a), gtsam.symbol("x", loop.b)
             graph.add(gtsam.BetweenFactorPose3(*ends, gtsam.Pose3(loop.delta), noise))
 

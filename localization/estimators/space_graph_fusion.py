@@ -51,7 +51,7 @@ class SpaceGraphSettings:
 
     def __post_init__(self) -> None:
         if self.config.cloud_loops:
-            make_map_closures(1.0)  # an extra that is missing is said before the drive
+            make_map_closures(1.0)  # a missing extra is an error before the drive
 
 
 class SpaceGraphFusion(Estimator):

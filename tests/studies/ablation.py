@@ -172,7 +172,7 @@ PATCHES: Mapping[str, Patch] = {
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {
     "loop closures": _attribute(LoopDetector, "detect", lambda self, cell, poses, marginal: None),
-    "robust loss of loops": _attribute(pose_graph, "CAUCHY", _NO_LOSS),
+    "robust loss of loops": _attribute(pose_graph, "_CAUCHY", _NO_LOSS),
     "robust loss of wheels": _attribute(pose_graph, "_HUBER", _NO_LOSS),
     "ways that the scene leaves open as the wheels' alone": _attribute(graph_fusion, "_OPEN_SHARE", math.inf),
     "corrections of the graph in the filter": _attribute(EkfFusion, "set_corrections", lambda self, mean, cov: None),
