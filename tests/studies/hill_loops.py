@@ -75,9 +75,9 @@ def main() -> None:
         wrong = replace(made, robot=replace(made.robot, geometry=geometry))
         begin, length = int(made.stamps_ns[0]), 1e9 * given.seconds
         silence = tuple(begin + share * length for share in _SILENT)
-        heard = [cloud for cloud in clouds if not silence[0] < cloud.stamp_ns < silence[1]]
+        received = [cloud for cloud in clouds if not silence[0] < cloud.stamp_ns < silence[1]]
         for has_loops in (False, True):
-            run = smoothed(wrong, heard, has_loops)
+            run = smoothed(wrong, received, has_loops)
             assert run.in_space is not None, "hills tilt"
             stamps = run.in_space.stamps_ns
             kept = (stamps > begin + 1e9 * _SETTLED_S) & ~((silence[0] < stamps) & (stamps < silence[1] + 5e8))
