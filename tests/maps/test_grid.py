@@ -33,8 +33,26 @@ def test_grid_of_a_room_has_walls_free_and_unknown_cells() -> None:
             assert 100 in near
         assert value_at(grid, along, 0.0) == 0
         assert value_at(grid, along, square_room.HALF + 0.12) == -1
-    inside = [value_at(grid, x, y) for x in np.arange(-1.85, 1.9, 0.1) for y in np.arange(-1.85, 1.9, 0.1)]
+    inside = [value_at(grid, x, y) for x in np.arange(-1.65, 1.7, 0.1) for y in np.arange(-1.65, 1.7, 0.1)]
     assert inside == [0] * len(inside)
+
+
+def test_grid_wall_seen_at_glancing_angles_stays_a_wall() -> None:
+    """A robot that drives 0.4 m beside a wall: each of its beams to the far end passes the cells of metres of wall."""
+    poses = np.column_stack([np.arange(0.0, 8.0, 0.5), np.zeros(16), np.zeros(16)])
+    bearings = np.radians(np.arange(2.0, 88.0))
+    reach = np.minimum(0.4 / np.sin(bearings), 8.0 / np.cos(bearings))
+    noise = np.random.default_rng(2).normal(0.0, 0.01, (16, len(bearings)))
+    scans = [np.column_stack([(reach + n) * np.cos(bearings), (reach + n) * np.sin(bearings)]) for n in noise]
+    counts = np.full(16, len(bearings), dtype=np.int64)
+    mapped = dataclasses.replace(
+        square_room.make_map(), poses=poses, points=np.vstack(scans).astype(np.float32), counts=counts, sensors=np.zeros((16, 2))
+    )
+    grid = draw_grid(mapped, CELL)
+    along = np.arange(0.5, 7.5, 0.05)
+    walls = [100 in [value_at(grid, x, 0.38), value_at(grid, x, 0.41)] for x in along]
+    assert np.mean(walls) > 0.95
+    assert all(value_at(grid, x, 0.2) == 0 for x in np.arange(1.0, 6.0, 0.05))
 
 
 def test_grid_cells_seen_free_by_one_scan_alone_are_unknown() -> None:
