@@ -48,6 +48,7 @@ _TOPIC_TYPES = {
     SAVE_MAP: "std_msgs/msg/String",
     LOAD_MAP: "std_msgs/msg/String",
 }
+_SUFFIX = ".skidmap"
 _NO_SUCH_MAP, _INVALID_MAP = 1, 2
 """Results of nav2_msgs/LoadMap: RESULT_MAP_DOES_NOT_EXIST, RESULT_INVALID_MAP_DATA."""
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
@@ -191,7 +192,7 @@ class OperatorCommands:
         mounts = {frame: asdict(mount) for frame, mount in sorted(session.pipeline.mounts.items())}
         moved = mapped.moved(session.state.start.map_T_start)
         saved = SavedMap(moved, {"log": "live topics", "run": session.name, "mounts": mounts, "versions": dict(versions())})
-        path = Path(name).with_suffix(".skidmap")
+        path = _map_path(name)
         if path.exists():
             self._report(f"save_map: '{path}' exists already. Give another name.")
             return ServiceReply(False, f"'{path}' exists already")
@@ -211,7 +212,7 @@ class OperatorCommands:
 
         The file is read and checked at once. Until its search images are drawn, in a thread, and where it is refused, all stays as it is.
         """
-        pipeline, path = self._node.session.pipeline, Path(str(name).removeprefix("file://")).with_suffix(".skidmap")
+        pipeline, path = self._node.session.pipeline, _map_path(name)
         if not isinstance(pipeline.estimator, MapFusion):
             self._report(f"load_map: {(refused := 'this estimator uses no saved map. Start with one by --map.')}")
             return ServiceReply(False, refused)
@@ -265,6 +266,11 @@ class OperatorCommands:
             return start.odom_T_start, start.odom_cov
         pose, cov = estimate.odometry or (estimate.pose, estimate.covariance)
         return pose, _known(cov)
+
+
+def _map_path(name: str) -> Path:
+    """The file of a map's ``name``, as given with or without its suffix; a name with other dots, as of a date, keeps these."""
+    return Path(str(name).strip().removeprefix("file://").removesuffix(_SUFFIX) + _SUFFIX)
 
 
 def _known(cov: FloatArray | None) -> FloatArray:

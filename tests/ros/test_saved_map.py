@@ -86,18 +86,18 @@ def test_node_relocalize_searches_again_and_offers_amcls_service(places: PlaceMa
 
 
 def test_node_save_map_writes_the_graphs_map_and_nothing_over_a_file(tmp_path) -> None:
-    name = str(tmp_path / "live")
+    name = str(tmp_path / "live.2026-11-26")
     transport = send("/skidloc/save_map", encode(make("std_msgs/msg/String", data=name)), 12.0)
     node, reports = run_node(transport, "graph", config=NodeConfig(wait_s=0.0))
     for thread in [t for t in threading.enumerate() if t.name == "save map"]:
         thread.join()
     assert any("keyframes are in" in text for text in reports)
-    saved = load_map(tmp_path / "live.skidmap")
+    saved = load_map(tmp_path / "live.2026-11-26.skidmap")
     assert 1 < len(saved.map.poses) <= len(node.session.pipeline.estimator.keyframe_map().poses)
     assert saved.provenance["log"] == "live topics"
-    before = (tmp_path / "live.skidmap").read_bytes()
+    before = (tmp_path / "live.2026-11-26.skidmap").read_bytes()
     assert not transport.services["/skidloc/save_map"](name).is_success
-    assert (tmp_path / "live.skidmap").read_bytes() == before
+    assert (tmp_path / "live.2026-11-26.skidmap").read_bytes() == before
     assert not transport.services["/skidloc/relocalize"](True).is_success
     assert "uses no saved map" in transport.services["/skidloc/load_map"](name).message
 
@@ -117,6 +117,7 @@ def test_node_load_map_searches_the_new_map_and_refuses_what_is_none(places: Pla
     load = transport.services["/skidloc/load_map"]
     codes = [load(str(tmp_path / name)).code for name in ("none", "truncated", "foreign", "newer")]
     assert codes == [1, 2, 2, 2]
+    assert load("").code == 1
     wanted = "is truncated, damaged, or no map file", "no map", "is truncated, damaged, or no map file", "has version 2 of the format"
     assert all(any(text in report and report.endswith("The present map stays.") for report in reports) for text in wanted)
     estimator = node.session.pipeline.estimator
