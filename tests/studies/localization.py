@@ -7,7 +7,8 @@ mapped starts that are localized. *Reliability*: of all
 keyframes by the probability that was given, and of all searches by weights that were fitted to the other buildings. *Drives*: the second
 half of each log, replayed in the map of the first, and the reverse; errors while the state is localized, where the map has most of the
 walls and outside of it, where the pose is by odometry. *Carried*: the same drives with cuts; times count from where the scan
-at the true pose is mapped, with ten seconds of the log left: a place that the map does not have cannot be found.
+at the true pose is mapped, with ten seconds of the log left: a place that the map does not have cannot be found. Those of driving leave out
+how long the robot stands: until it has driven 1 m, its scans are one view of the place.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,14 +37,16 @@ from tests.studies.localization_reliability import Moment, RecordedSearches, Sea
 from tests.studies.localization_reliability import table as reliability_table
 
 _DENSE = ReplayConfig(estimator=EstimatorConfig(graph=GraphConfig(keyframe_distance_m=0.3, keyframe_angle_rad=0.2)))
-_MAP_STRIDE = 3
+MAP_STRIDE = 3
 """Of dense keyframes in a map: about 1 m, as by default."""
-_STEP_M, _STEP_RAD = 0.5, 0.3
-_COV = np.diag([0.01, 0.01, 0.005]) ** 2
-_MAPPED_SCORE = 0.5
+STEP_M, STEP_RAD = 0.5, 0.3
+COV = np.diag([0.01, 0.01, 0.005]) ** 2
+MAPPED_SCORE = 0.5
 _ON_WALL_M, _MAPPED_SHARE = 0.3, 0.5
 """A keyframe is outside of a map where less than this share of its points is this near to points of the map, at the true pose."""
 _CYCLE_S, _KEPT_S = 70.0, 40.0
+_DRIVING, _MAX_STEP_S = 0.05, 1.0
+"""The robot drives where its speed or its turn is faster [m/s, rad/s]; and a step at most [s], of what is not cut out."""
 _FOUND_WITHIN_S = 10.0
 """A carried robot shall be found within this time [s]. A cut that is nearer than that to the log's end counts only if it is found."""
 
@@ -87,20 +90,20 @@ def run_start(
     for k in ids:
         pose = keyframes.poses[k]
         delta = np.zeros(3) if last is None else se2.between(last, pose)
-        if last is not None and math.hypot(delta[0], delta[1]) < _STEP_M and abs(delta[2]) < _STEP_RAD:
+        if last is not None and math.hypot(delta[0], delta[1]) < STEP_M and abs(delta[2]) < STEP_RAD:
             continue
         begin, n_before = time.process_time(), len(places.found)
-        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else _COV)
+        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else COV)
         spent += time.process_time() - begin if math.isnan(after) else 0.0
         last = truth = pose
         if localizer.state == "localized" and math.isnan(after):
             after = (keyframes.stamps_ns[k] - keyframes.stamps_ns[ids[0]]) * 1e-9
-        searches += [Search(name, found, n, is_same and _off(truth, found[0].pose)[1]) for found, n in places.found[n_before:]]
-        moments.append(Moment(kind, name, localizer.probability, is_same and _off(truth, _best(localizer))[1]))
-    error, is_near = _off(truth, _best(localizer))
+        searches += [Search(name, found, n, is_same and off(truth, found[0].pose)[1]) for found, n in places.found[n_before:]]
+        moments.append(Moment(kind, name, localizer.probability, is_same and off(truth, _best(localizer))[1]))
+    error, is_near = off(truth, _best(localizer))
     is_right = is_same and is_near
     at_truth = places.align(scans[ids[-1]], truth)
-    is_mapped = is_same and at_truth.score >= _MAPPED_SCORE
+    is_mapped = is_same and at_truth.score >= MAPPED_SCORE
     return Start(is_mapped, is_same, localizer.state, localizer.probability, is_right, error, after, spent), moments, searches
 
 
@@ -109,11 +112,11 @@ def _best(localizer: Localizer) -> np.ndarray:
     return localizer.pose if localizer.state == "localized" or not localizer.hypotheses else localizer.hypotheses[0].pose
 
 
-def _off(truth: np.ndarray, pose: np.ndarray) -> tuple[float, bool]:
+def off(truth: np.ndarray, pose: np.ndarray) -> tuple[float, bool]:
     """How far ``pose`` is from the ``truth`` [m], and whether that is the same place."""
-    off = se2.between(truth, pose)
-    error = math.hypot(off[0], off[1])
-    return error, error < RIGHT_M and abs(off[2]) < RIGHT_RAD
+    delta = se2.between(truth, pose)
+    error = math.hypot(delta[0], delta[1])
+    return error, error < RIGHT_M and abs(delta[2]) < RIGHT_RAD
 
 
 def starts(
@@ -121,16 +124,20 @@ def starts(
 ) -> list[tuple[Start, list[Moment], list[Search]]]:
     """``n`` starts in each half of building ``name`` in turn, in the map of the other half of ``map_name``: the first of them do not depend
     on ``n``."""
-    found, rng, keyframes = [], np.random.default_rng(1), maps[name]
-    sides = [RecordedSearches(maps[map_name].select(half[::_MAP_STRIDE]), 0.02) for half in halves(maps[map_name])]
-    scans, driven = keyframes.scans(), halves(keyframes)[::-1]
+    keyframes = maps[name]
+    sides = [RecordedSearches(maps[map_name].select(half[::MAP_STRIDE]), 0.02) for half in halves(maps[map_name])]
+    scans = keyframes.scans()
+    return [run_start(sides[i], keyframes, scans, way, name, name == map_name) for i, way in ways(keyframes, n, seconds)]
+
+
+def ways(keyframes: KeyframeMap, n: int, seconds: float) -> Iterator[tuple[int, np.ndarray]]:
+    """The keyframes of ``seconds`` from ``n`` random ones of each half on, in turn, and which half is the map."""
+    rng, driven = np.random.default_rng(1), halves(keyframes)[::-1]
     for _ in range(n):
-        for places, ids in zip(sides, driven, strict=True):
+        for i, ids in enumerate(driven):
             k = rng.integers(ids[0], ids[-1] - 20)
             until = keyframes.stamps_ns[k] + seconds * 1e9
-            way = np.array([j for j in ids if j >= k and keyframes.stamps_ns[j] <= until])
-            found.append(run_start(places, keyframes, scans, way, name, name == map_name))
-    return found
+            yield i, np.array([j for j in ids if j >= k and keyframes.stamps_ns[j] <= until])
 
 
 def table(title: str, found: Sequence[Start]) -> str:
@@ -154,50 +161,48 @@ def table(title: str, found: Sequence[Start]) -> str:
 
 def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i, of which every 40 s the next 30 s are cut out: the robot is carried on meanwhile."""
-    places = PlaceMap(keyframes.select(halves(keyframes)[i][::_MAP_STRIDE]), 0.02)
+    places = PlaceMap(keyframes.select(halves(keyframes)[i][::MAP_STRIDE]), 0.02)
     ids = halves(keyframes)[1 - i]
     begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
     pipeline = Pipeline(Trial(make_model("diff_drive", drive.robot), "map", prior=PriorMap(places)), drive.robot, drive.mounts, True)
     estimator = pipeline.estimator
     assert isinstance(estimator, MapFusion)
-    cut_at, mapped_at, found_after, wrong_s, n, cycle, scans = None, None, [], 0.0, 0, -1, keyframes.scans()
+    cut, mapped, found_after, wrong_s, n, cycle, scans = None, None, [], 0.0, 0, -1, keyframes.scans()
+    now, last_ns = np.zeros(2), 0  # time of the log and of driving [s]
     for event in drive.events:
-        since = (event.stamp_ns - begin) * 1e-9
-        if not begin <= event.stamp_ns <= end or since % _CYCLE_S > _KEPT_S:
+        now[0] = (event.stamp_ns - begin) * 1e-9
+        if not begin <= event.stamp_ns <= end or now[0] % _CYCLE_S > _KEPT_S:
             continue
-        if since // _CYCLE_S != cycle:
-            cycle = since // _CYCLE_S
-            cut_at, mapped_at = since if cycle > 0 else None, None
+        if now[0] // _CYCLE_S != cycle:
+            cycle = now[0] // _CYCLE_S
+            cut, mapped = now.copy() if cycle > 0 else None, None
         for estimate in pipeline.process(event):
+            now[1] += min((estimate.stamp_ns - last_ns) * 1e-9, _MAX_STEP_S) if np.abs(estimate.twist).max() > _DRIVING else 0.0
+            last_ns = estimate.stamp_ns
             k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
-            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or cut_at is None:
+            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or cut is None:
                 continue
-            has_time = since + _FOUND_WITHIN_S <= (end - begin) * 1e-9
-            if mapped_at is None and has_time and places.align(scans[k], keyframes.poses[k]).score >= _MAPPED_SCORE:
-                mapped_at, n = since, n + 1
+            has_time = now[0] + _FOUND_WITHIN_S <= (end - begin) * 1e-9
+            if mapped is None and has_time and places.align(scans[k], keyframes.poses[k]).score >= MAPPED_SCORE:
+                mapped, n = now.copy(), n + 1
             if estimator.localizer.state != "localized":
                 continue
-            is_right = _off(keyframes.poses[k], estimate.pose)[1]
-            wrong_s = max(wrong_s, 0.0 if is_right else since - cut_at)
+            is_right = off(keyframes.poses[k], estimate.pose)[1]
+            wrong_s = max(wrong_s, 0.0 if is_right else now[0] - cut[0])
             if is_right:
-                n += mapped_at is None
-                found_after.append(since - (cut_at if mapped_at is None else mapped_at))
-                cut_at = None
-    quantiles = np.quantile(found_after, [0.5, 0.9]) if found_after else np.full(2, math.nan)
-    times = f"{quantiles[0]:.1f} / {quantiles[1]:.1f}"
-    cells = [
-        f"{name}, map of half {i + 1}",
-        f"{len(found_after)} of {n}",
-        times,
-        f"{wrong_s:.1f}",
-        str(sum(t <= _FOUND_WITHIN_S for t in found_after)),
-    ]
+                n += mapped is None
+                found_after.append(now - (cut if mapped is None else mapped))
+                cut = None
+    after = np.array(found_after).reshape(-1, 2)
+    times = [f"{np.median(column):.1f} / {np.quantile(column, 0.9):.1f}" if len(after) else "-" for column in after.T]
+    soon = [str(np.sum(column <= _FOUND_WITHIN_S)) for column in after.T]
+    cells = [f"{name}, map of half {i + 1}", f"{len(after)} of {n}", *times, *soon, f"{wrong_s:.1f}"]
     return "| " + " | ".join(cells) + " |"
 
 
 def drive_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> str:
     """Half 1 - i of the log in the map of half i: errors while localized, times, and the cost against the filter's alone."""
-    mapped = keyframes.select(halves(keyframes)[i][::_MAP_STRIDE])
+    mapped = keyframes.select(halves(keyframes)[i][::MAP_STRIDE])
     places = PlaceMap(mapped, 0.02)
     ids = halves(keyframes)[1 - i]
     begin, end = keyframes.stamps_ns[ids[0]], keyframes.stamps_ns[ids[-1]]
@@ -303,8 +308,9 @@ def main(words: Sequence[str] | None = None) -> None:
         for name, drive in drives.items():
             for i in (0, 1):
                 print(drive_row(name, drive, maps[name], i), flush=True)
-        print("\n| carried | found again, of those mapped | median / p90 [s] | wrong, longest [s] | within 10 s |")
-        print("|---" * 5 + "|")
+        columns = "found again, of those mapped | median / p90 [s] | of driving | within 10 s | of driving"
+        print(f"\n| carried | {columns} | wrong, longest [s] |")
+        print("|---" * 7 + "|")
         for name, drive in drives.items():
             for i in (0, 1):
                 print(kidnappings_row(name, drive, maps[name], i), flush=True)

@@ -78,15 +78,19 @@ class ParticleFilter:
 
     def guess(self) -> Guess:
         """The heaviest place: particles within 0.5 m and 0.2 rad of the best one, and their share of the weight."""
-        weights = self.weights
-        best = self.poses[np.argmax(weights)]
-        for _ in range(3):
-            near = (np.hypot(*(self.poses - best)[:, :2].T) < RIGHT_M) & (np.abs(se2.wrap_angle(self.poses[:, 2] - best[2])) < RIGHT_RAD)
-            if near.any():
-                angle = np.angle(np.sum(weights[near] * np.exp(1j * self.poses[near, 2])))
-                best = np.array([*np.average(self.poses[near, :2], axis=0, weights=weights[near]), angle])
-        share = float(weights[near].sum())
+        best, share = heaviest_place(self.poses, self.weights)
         return best, share, share > LIKELY
+
+
+def heaviest_place(poses: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """The mean of the particles ``poses`` (n, 3) within 0.5 m and 0.2 rad of the best one, and their share of the ``weights`` (n,)."""
+    best = poses[np.argmax(weights)]
+    for _ in range(3):
+        near = (np.hypot(*(poses - best)[:, :2].T) < RIGHT_M) & (np.abs(se2.wrap_angle(poses[:, 2] - best[2])) < RIGHT_RAD)
+        if near.any():
+            angle = np.angle(np.sum(weights[near] * np.exp(1j * poses[near, 2])))
+            best = np.array([*np.average(poses[near, :2], axis=0, weights=weights[near]), angle])
+    return best, float(weights[near].sum())
 
 
 class Scene(NamedTuple):
