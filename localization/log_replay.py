@@ -15,7 +15,7 @@ from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, Estimate
 from localization.events import Event
 from localization.lidar.losses import LidarLosses
 from localization.lifting import AttitudeTable, SpaceTable, Trajectory3
-from localization.maps import KeyframeMap
+from localization.maps import KeyframeMap, SpaceMap
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.trajectory import Trajectory
 from motion_models.robot import Mount, Robot
@@ -52,7 +52,7 @@ class Run:
     """Filtered poses, as they were estimated at each moment and published live, where ``trajectory`` is smoothed."""
     lidar: LidarLosses | None = None
     """How long the LiDAR was lost; None where no scans were matched to a map."""
-    keyframes: KeyframeMap | None = None
+    keyframes: KeyframeMap | SpaceMap | None = None
     """The map as it can be saved, of an estimator with a map frame."""
     localization: Mapping[str, Any] | None = None
     """State, probability and times of the estimator that localizes in a saved map."""

@@ -13,7 +13,8 @@ import tyro
 from rich.console import Console
 
 from localization.commands.common import new_folder, print_line, write_json
-from localization.maps import SavedMap, load_map, save_map
+from localization.errors import MapError
+from localization.maps import SavedMap, SpaceMap, load_map, save_map
 from localization.output import check_outputs
 
 
@@ -38,7 +39,8 @@ class MapInfo:
 
 @dataclass(frozen=True)
 class MapExport:
-    """Write a map as map_server's .pgm and .yaml, as .png, and its points as .ply."""
+    """Write a map as map_server's .pgm and .yaml, as .png, and its points as .ply. Of a map in space, the grid has what stands within a
+    range of heights above the ground."""
 
     file: tyro.conf.Positional[Path]
     """Map written by `skidloc replay --save-map`."""
@@ -46,15 +48,23 @@ class MapExport:
     """New folder for map.pgm, map.yaml (map_server, nav2), map.png and map.ply."""
     resolution: float = 0.05
     """Side of a cell [m]."""
+    heights: tuple[float, float] | None = None
+    """Lowest and highest above the ground that is a wall in the grid of a map in space [m]; default: 0.3 1.8."""
 
     def run(self, console: Console) -> None:
         """Run the command. Raises `SkidlocError` for input that cannot be used."""
         from localization.maps.export import exports
         from localization.maps.grid import draw_grid
+        from localization.maps.height_slice import HEIGHTS_M, HeightSlice
 
         check_outputs(self.out)
         mapped = load_map(self.file).map
-        grid = draw_grid(mapped, self.resolution)
+        if isinstance(mapped, SpaceMap):
+            grid = HeightSlice(mapped, self.heights or HEIGHTS_M).grid(self.resolution)
+        elif self.heights is None:
+            grid = draw_grid(mapped, self.resolution)
+        else:
+            raise MapError(f"--heights are those of a map in space, and '{self.file}' holds planar scans. Leave them out.")
         with new_folder(self.out) as folder:
             for name, content in exports(grid, mapped).items():
                 (folder / name).write_bytes(content)
@@ -100,7 +110,8 @@ class MapMerge:
 
         check_outputs(self.out)
         first, second = load_map(self.first), load_map(self.second)
-        found = merge(first.map, second.map, LidarConfig().range_noise_m)
+        both = first.planar(self.first, "map merge"), second.planar(self.second, "map merge")
+        found = merge(*both, LidarConfig().range_noise_m)
         save_map(self.out, SavedMap(found.map, {"merged_from": [dict(first.provenance), dict(second.provenance)]}))
         print_line(console, f"{found.closed} of {len(second.map.poses)} keyframes of '{self.second}' were found in '{self.first}'")
         for name, values in (("their scans are off the merged map by", found.errors), ("the second map was bent by", found.bent)):
@@ -126,9 +137,9 @@ class Map:
 def summary(saved: SavedMap) -> dict[str, Any]:
     """Size, extent [m] and uncertainty of a map, and its provenance."""
     mapped = saved.map
-    points = mapped.points_in_map()
-    size = np.ptp(points, axis=0) if len(points) else np.zeros(2)
-    sigma = np.sqrt(np.trace(mapped.covariances[:, :2, :2], axis1=1, axis2=2)).max()
+    points, n = mapped.points_in_map(), 3 if isinstance(mapped, SpaceMap) else 2
+    size = np.ptp(points, axis=0) if len(points) else np.zeros(n)
+    sigma = np.sqrt(np.trace(mapped.covariances[:, :n, :n], axis1=1, axis2=2)).max()
     return {
         "keyframes": len(mapped.poses),
         "points": len(mapped.points),
@@ -140,10 +151,11 @@ def summary(saved: SavedMap) -> dict[str, Any]:
 
 
 def _lines(found: Mapping[str, Any]) -> list[str]:
-    width, height = found["size_m"]
+    size = " x ".join(f"{side:.1f} m" for side in found["size_m"])
+    kind = " in space" if len(found["size_m"]) > 2 else ""
     lines = [
-        f"{found['keyframes']} keyframes with {found['points']} points and {found['loop_closures']} loop closures",
-        f"{width:.1f} m x {height:.1f} m; positions of keyframes have a sigma of at most {found['sigma_m']:.3f} m against the first",
+        f"{found['keyframes']} keyframes{kind} with {found['points']} points and {found['loop_closures']} loop closures",
+        f"{size}; positions of keyframes have a sigma of at most {found['sigma_m']:.3f} m against the first",
     ]
     named = [f"{key} {found[key]}" for key in ("log", "robot", "model", "corrections") if found.get(key)]
     mounts = found.get("mounts")

@@ -208,7 +208,8 @@ class Replay:
             raise EstimatorError("--initial-pose is three numbers x y yaw [m, m, deg] in a saved map. Name the map by --map.")
         if self.map is None:
             return None
-        return PriorMap(PlaceMap(load_map(self.map).map, self.config.estimator.lidar.range_noise_m), self._initial())
+        mapped = load_map(self.map).planar(self.map, "--map")
+        return PriorMap(PlaceMap(mapped, self.config.estimator.lidar.range_noise_m), self._initial())
 
     def _initial(self) -> FloatArray | None:
         """(3,) `--initial-pose` [m, m, rad]."""
@@ -225,7 +226,8 @@ class Replay:
         drive = saved_map(
             of_graph if any(run.keyframes is not None for run in of_graph) else runs, head, mounts, dataclasses.asdict(self.config)
         )
-        found = merge(old.map, drive.map, self.config.estimator.lidar.range_noise_m, only_new=True, initial=self._initial())
+        both = old.planar(self.map, "--extend-map"), drive.planar(path, "--extend-map")
+        found = merge(*both, self.config.estimator.lidar.range_noise_m, only_new=True, initial=self._initial())
         save_map(path, SavedMap(found.map, {"extended_from": [dict(old.provenance), dict(drive.provenance)]}))
         return f"map: {found.added} of {len(drive.map.poses)} keyframes are new in '{path}', {found.closed} were found in '{self.map}'"
 
@@ -298,8 +300,13 @@ class Replay:
 
 
 def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:
-    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``."""
-    run, keyframes = [(run, run.keyframes) for run in runs if run.keyframes is not None][-1]
+    """The map of the last of ``runs`` that has one, and where it comes from: ``mounts`` of sensors by frame, settings ``config``.
+
+    Raises `MapError` where there is none."""
+    mapped = [(run, run.keyframes) for run in runs if run.keyframes is not None]
+    if not mapped:
+        raise MapError("no map was made, as no two keyframes have a pose: the robot did not move, or poses in space lacked the vertical.")
+    run, keyframes = mapped[-1]
     provenance = {
         "log": head.log,
         "log_fingerprint": head.log_fingerprint,

@@ -12,7 +12,7 @@ import numpy as np
 from localization.events import PositionSample, Step, Turn
 from localization.lidar import LostScans
 from localization.lifting import Pose3, Trajectory3
-from localization.maps import KeyframeMap
+from localization.maps import KeyframeMap, SpaceMap
 from localization.maps.grid import Grid
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -173,7 +173,7 @@ class Estimator(ABC):
         """Problems of the measurements so far."""
         return []
 
-    def keyframe_map(self) -> KeyframeMap | None:
+    def keyframe_map(self) -> KeyframeMap | SpaceMap | None:
         """Keyframes as they can be saved; None where the estimator has no map frame. Poses are smoothed after `finish`."""
         return None
 

@@ -48,6 +48,7 @@ class SpaceFusion(Estimator):
         self._map: CloudMap | None = None
         self._odom_T_map = np.eye(4)
         self._cloud: FloatArray | None = None  # of the last step, deskewed, in the body frame
+        self._lidar_position = np.zeros(3)
         self._cloud_cov: FloatArray | None = None  # (6, 6) of the last match; None before the first one
         self._last_key: Transform3 | None = None
         self._lost, self._clock_offset_s = LostScans(), 0.0
@@ -79,6 +80,11 @@ class SpaceFusion(Estimator):
     def cloud(self) -> FloatArray | None:
         """(N, 3) of the last step, deskewed and thinned, in the body frame [m]; None where there is none, and after `run_deferred`."""
         return self._cloud
+
+    @property
+    def lidar_position(self) -> FloatArray:
+        """(3,) of the last cloud's LiDAR in the body frame [m]."""
+        return self._lidar_position
 
     def start_key(self) -> None:
         """Clone the pose as the last keyframe, the variable "key", which all later measurements update as well."""
@@ -132,6 +138,7 @@ class SpaceFusion(Estimator):
         self._counts["scans"] += 1
         c = self._lidar
         mount = self._mounts.get(step.scan.frame_id, Mount())
+        self._lidar_position = np.array([mount.x, mount.y, mount.z])
         sweep = Sweep.from_scan(step.scan, mount).within(c.min_range_m, c.max_range_m)
         if len(sweep.points) < MIN_POINTS:
             self._lost.add(step.end_ns, "sparse")

@@ -24,7 +24,9 @@ from localization.events import PositionSample, Step
 from localization.lidar import LostScans
 from localization.lidar.cloud_loops import find_loops, make_map_closures
 from localization.lifting import Pose3, SpaceTable, Trajectory3
-from localization.trajectory import Trajectory
+from localization.maps import SpaceMap
+from localization.maps.space_map import in_units
+from localization.trajectory import IntArray, Trajectory
 from motion_models import se2, se3
 from motion_models.online_calibration import Corrections
 from motion_models.preintegration import MotionPreintegration
@@ -45,7 +47,7 @@ class SpaceGraphSettings:
     """Track width of the robot [m]."""
     config: GraphConfig
     is_smoothing: bool
-    """`finish` is to give the smoothed trajectory; memory then grows with the drive, 424 bytes a step, and with loops 40 kB a keyframe."""
+    """`finish` is to give the smoothed trajectory; memory then grows with the drive, 424 bytes a step and 40 kB a keyframe."""
     range_noise_m: float
     """Sigma of a range [m]."""
 
@@ -75,8 +77,10 @@ class SpaceGraphFusion(Estimator):
         self._stamps_ns, self._poses, self._covs_since = array("q"), array("d"), array("d")
         self._nodes: list[int] = []
         self._range_noise_m = settings.range_noise_m
-        self._clouds: list[FloatArray | None] = []  # of keyframes, in the body frame, if loops are to be closed
+        self._clouds: list[FloatArray | None] = []  # of keyframes, in the body frame, if poses are to be smoothed
+        self._sensors: list[FloatArray] = []
         self._smoothed: Trajectory3 | None = None
+        self._map: SpaceMap | None = None
         self._failure = ""
 
     def step(self, step: Step) -> Estimate:
@@ -130,9 +134,9 @@ class SpaceGraphFusion(Estimator):
         self.graph.poses.append(state["pose"])
         if self._is_smoothing:
             self._nodes.append(len(self._stamps_ns) - 1)
-            if self._config.cloud_loops:
-                cloud = self.odometry.cloud
-                self._clouds.append(None if cloud is None else cloud.astype(np.float32))
+            cloud = self.odometry.cloud
+            self._clouds.append(None if cloud is None else cloud.astype(np.float32))
+            self._sensors.append(self.odometry.lidar_position)
         self._wheels = MotionPreintegration(len(self._corrections.names))
         self.odometry.start_key()
 
@@ -153,13 +157,15 @@ class SpaceGraphFusion(Estimator):
         self._align()
         try:
             poses, covs, _ = self.graph.smooth()
-            self.graph.loops = find_loops(self._clouds, poses, self.graph.relative_cov, self._range_noise_m)
+            if self._config.cloud_loops:
+                self.graph.loops = find_loops(self._clouds, poses, self.graph.relative_cov, self._range_noise_m)
             if self.graph.loops:
                 poses, covs, _ = self.graph.smooth()
         except EstimatorError as error:
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
         stamps = np.array(self._stamps_ns, dtype=np.int64)
+        self._map = self._make_map(stamps[self._nodes], lift(self._map_T_odom) @ poses, covs)
         odometry, since = np.array(self._poses).reshape(-1, 4, 4), np.array(self._covs_since).reshape(-1, 6, 6)
         smoothed, spread = through_nodes(SE3, odometry, since, np.array(self._nodes), poses, covs)
         smoothed = lift(self._map_T_odom) @ smoothed
@@ -175,6 +181,27 @@ class SpaceGraphFusion(Estimator):
                 planar_covs[row] = above
         self._smoothed = table.trajectory()
         return Trajectory(filtered.stamps_ns, planar, planar_covs)
+
+    def _make_map(self, stamps_ns: IntArray, poses: FloatArray, covs: FloatArray) -> SpaceMap:
+        """The map of keyframes at ``stamps_ns`` (K,), smoothed to ``poses`` (K, 4, 4) with covariances (K, 6, 6)."""
+        betweens, loops = self.graph.betweens, self.graph.loops
+        points, counts = in_units([np.empty((0, 3)) if cloud is None else cloud.astype(float) for cloud in self._clouds])
+        return SpaceMap(
+            stamps_ns=stamps_ns,
+            poses=poses,
+            covariances=0.5 * (covs + covs.swapaxes(1, 2)),
+            points=points,
+            counts=counts,
+            sensors=np.array(self._sensors),
+            edges=np.array([(b.k, b.k + 1) for b in betweens] + [(loop.a, loop.b) for loop in loops], dtype=np.int64).reshape(-1, 2),
+            edge_deltas=np.array([b.delta for b in betweens] + [loop.delta for loop in loops]).reshape(-1, 4, 4),
+            edge_information=np.array([b.information for b in betweens] + [np.linalg.inv(loop.cov) for loop in loops]).reshape(-1, 6, 6),
+            edge_is_loop=np.arange(len(betweens) + len(loops)) >= len(betweens),
+        )
+
+    def keyframe_map(self) -> SpaceMap | None:
+        """Keyframes as they can be saved, once `finish` has smoothed them."""
+        return self._map
 
     def _align(self) -> None:
         """The map's place and heading among the positions, where these suffice."""

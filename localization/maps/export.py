@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from localization.maps.grid import Grid
 from localization.maps.keyframe_map import KeyframeMap
+from localization.maps.space_map import SpaceMap
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 """Grey values of map_server and nav2."""
@@ -18,7 +19,7 @@ _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 as free."""
 
 
-def exports(grid: Grid, mapped: KeyframeMap) -> dict[str, bytes]:
+def exports(grid: Grid, mapped: KeyframeMap | SpaceMap) -> dict[str, bytes]:
     """Contents of map.pgm, map.yaml, map.png and map.ply, by name. Points are those of ``mapped``."""
     image = _image(grid)
     height, width = image.shape
@@ -66,7 +67,7 @@ def png(grid: Grid) -> bytes:
 
 
 def _ply(points: NDArray[np.float32]) -> bytes:
-    """Binary PLY; z is 0."""
+    """Binary PLY of ``points`` (N, 3), or (N, 2) with a z of 0."""
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
     head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    return head.encode() + np.column_stack((points, np.zeros(len(points), "<f4"))).astype("<f4").tobytes()
+    return head.encode() + np.pad(points, ((0, 0), (0, 3 - points.shape[1]))).astype("<f4").tobytes()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,13 +50,32 @@ def draw_grid(mapped: KeyframeMap, resolution: float, free: float = FREE) -> Gri
 
     Raises `MapError` if there are no points, or too many cells.
     """
-    if not (math.isfinite(resolution) and resolution > 0.0):
-        raise MapError(f"a resolution of {resolution} m is none. Give the side of a cell in metres, as 0.05.")
     ends = mapped.points_in_map()
     if not len(ends):
         raise MapError("the map has no scan points, so there is nothing to draw. Build it from a log with scans.")
-    starts = se2.transform(mapped.poses, mapped.sensors)
-    both = np.vstack((ends, starts))
+    beams = Beams(se2.transform(mapped.poses, mapped.sensors), ends, np.repeat(np.arange(len(mapped.poses)), mapped.counts))
+    return cast_beams(beams, np.ones(len(ends), dtype=bool), resolution, free)
+
+
+class Beams(NamedTuple):
+    """Beams of K keyframes, M in all, as seen from above."""
+
+    starts: Points2
+    """(K, 2) where the LiDAR of each keyframe was [m]."""
+    ends: Points2
+    """(M, 2) of the beams [m]."""
+    keys: IntArray
+    """(M,) keyframe of each, in rising order."""
+
+
+def cast_beams(beams: Beams, is_wall: NDArray[np.bool_], resolution: float, free: float = FREE) -> Grid:
+    """The grid of ``beams``, of which those that end on a wall (M,) hit their last cell, and the others pass up to there.
+
+    Other arguments and errors are those of `draw_grid`.
+    """
+    if not (math.isfinite(resolution) and resolution > 0.0):
+        raise MapError(f"a resolution of {resolution} m is none. Give the side of a cell in metres, as 0.05.")
+    both = np.vstack((beams.ends, beams.starts))
     low = np.floor(both.min(axis=0) / resolution) - _MARGIN_CELLS
     shape = np.floor(both.max(axis=0) / resolution) - low + 1 + _MARGIN_CELLS
     if not (shape.max() <= _MAX_CELLS and shape[0] * shape[1] <= _MAX_CELLS):
@@ -66,17 +85,16 @@ def draw_grid(mapped: KeyframeMap, resolution: float, free: float = FREE) -> Gri
             "--resolution."
         )
     log_odds = np.zeros((int(shape[1]), int(shape[0])))
-    _add_beams(log_odds, low, resolution, starts, ends, mapped.counts)
+    _add_beams(log_odds, low, resolution, beams, is_wall)
     return _classify(log_odds, low, resolution, free)
 
 
-def _add_beams(log_odds: FloatArray, low: FloatArray, resolution: float, starts: Points2, ends: Points2, counts: IntArray) -> None:
-    """Add the beams of keyframes with LiDARs at ``starts`` (K, 2) and ``counts`` (K,) of the points ``ends`` (M, 2) [m] to the cells
-    ``log_odds`` (H, W), whose first one has the indices ``low`` (2,)."""
-    keys = np.repeat(np.arange(len(starts)), counts)
-    clear = _clear_ends(starts[keys], ends, keys, resolution)
-    first, passed, last = (np.floor(where / resolution).astype(np.int64) - low.astype(np.int64) for where in (starts, clear, ends))
-    _cast(log_odds, first, passed, last, keys)
+def _add_beams(log_odds: FloatArray, low: FloatArray, resolution: float, beams: Beams, is_wall: NDArray[np.bool_]) -> None:
+    """Add ``beams`` (`cast_beams`) to the cells ``log_odds`` (H, W), whose first one has the indices ``low`` (2,)."""
+    (starts, ends, keys), passed = beams, beams.ends.copy()
+    passed[is_wall] = _clear_ends(starts[keys[is_wall]], ends[is_wall], keys[is_wall], resolution)
+    first, clear, last = (np.floor(where / resolution).astype(np.int64) - low.astype(np.int64) for where in (starts, passed, ends))
+    _cast(log_odds, first, clear, last, keys, is_wall)
 
 
 def _clear_ends(starts: Points2, ends: Points2, keys: IntArray, distance: float) -> Points2:
@@ -142,7 +160,8 @@ class GrowingGrid:
             points, counts = np.vstack(ends), np.array([len(scans[k]) for k in new])
             if not self._grow(np.vstack([points, *starts])):
                 return self.update(poses, scans, lidars)
-            _add_beams(self._log_odds, self._low, self._resolution, np.array(starts), points, counts)
+            beams = Beams(np.array(starts), points, np.repeat(np.arange(len(starts)), counts))
+            _add_beams(self._log_odds, self._low, self._resolution, beams, np.ones(len(points), dtype=bool))
         self._drawn = poses.copy()
         return _classify(self._log_odds, self._low, self._resolution, FREE)
 
@@ -166,9 +185,9 @@ class GrowingGrid:
 
 
 @kernel
-def _cast(log_odds: FloatArray, starts: IntArray, clear: IntArray, ends: IntArray, keys: IntArray) -> None:
-    """Add beams to ``log_odds`` (H, W): from cells ``starts`` (K, 2) they pass up to ``clear`` (M, 2), and hit ``ends`` (M, 2). ``keys``
-    (M,) are their keyframes, in rising order."""
+def _cast(log_odds: FloatArray, starts: IntArray, clear: IntArray, ends: IntArray, keys: IntArray, is_wall: NDArray[np.bool_]) -> None:
+    """Add beams to ``log_odds`` (H, W): from cells ``starts`` (K, 2) they pass up to ``clear`` (M, 2), and those that end on a wall (M,)
+    hit ``ends`` (M, 2). ``keys`` (M,) are their keyframes, in rising order."""
     done = np.full(log_odds.shape, -1, np.int64)
     begin = 0
     while begin < len(keys):
@@ -176,7 +195,7 @@ def _cast(log_odds: FloatArray, starts: IntArray, clear: IntArray, ends: IntArra
         end = begin
         while end < len(keys) and keys[end] == k:
             x, y = ends[end]
-            if done[y, x] != k:
+            if is_wall[end] and done[y, x] != k:
                 done[y, x] = k
                 log_odds[y, x] = min(log_odds[y, x] + _HIT, _HIGH)
             end += 1

@@ -12,10 +12,13 @@ import numpy as np
 
 from localization.maps.export import png
 from localization.maps.grid import Grid, draw_grid
+from localization.maps.height_slice import HeightSlice
 from localization.maps.keyframe_map import KeyframeMap
+from localization.maps.space_map import SpaceMap
 from localization.report import page as html
 from localization.report.interactive import grid_layer, numbers
 from localization.trajectory import IntArray
+from motion_models.se2 import Points2
 
 _RESOLUTION_M = 0.05
 _MOST_CELLS = 4_000_000
@@ -27,13 +30,19 @@ _MARK_M = 0.8
 """Least side of the square that marks a change [m]."""
 
 
-def map_page(name: str, mapped: KeyframeMap, sentences: Sequence[str], provenance: Mapping[str, Any]) -> str:
-    """HTML of the whole page of ``mapped``, in one file. Raises `MapError` where it has no points."""
-    grid = picture_grid(mapped)
+def map_page(name: str, mapped: KeyframeMap | SpaceMap, sentences: Sequence[str], provenance: Mapping[str, Any]) -> str:
+    """HTML of the whole page of ``mapped``, in one file; one in space is seen from above, with walls of `height_slice.HEIGHTS_M`.
+
+    Raises `MapError` where it has no points."""
+    if isinstance(mapped, SpaceMap):
+        upright = HeightSlice(mapped)
+        planar, grid = upright.keyframes, upright.grid(_cell_of(mapped.points_in_map()[:, :2]))
+    else:
+        planar, grid = mapped, picture_grid(mapped)
     facts = f"{len(mapped.poses)} keyframes, {len(mapped.points)} points, {int(mapped.edge_is_loop.sum())} loop closures"
     known = {key: str(value) for key, value in provenance.items() if isinstance(value, (str, int, float))}
     sections = [
-        html.Section("Explore", [html.Explorer(json.dumps(_explorer_data(mapped, grid), separators=(",", ":"), allow_nan=False))]),
+        html.Section("Explore", [html.Explorer(json.dumps(_explorer_data(planar, grid), separators=(",", ":"), allow_nan=False))]),
         html.Section("Grid", [grid_figure(grid)], is_static=True),
         html.Section("Where it comes from", [html.Definitions(known)] if known else []),
     ]
@@ -42,9 +51,13 @@ def map_page(name: str, mapped: KeyframeMap, sentences: Sequence[str], provenanc
 
 def picture_grid(mapped: KeyframeMap) -> Grid:
     """The grid of ``mapped`` with cells of 0.05 m, or larger ones where these were too many. Raises `MapError` without points."""
-    ends = mapped.points_in_map()
-    area = float(np.prod(np.ptp(ends, axis=0) + 1.0)) if len(ends) else 1.0
-    return draw_grid(mapped, _RESOLUTION_M * max(1.0, np.ceil(np.sqrt(area / _RESOLUTION_M**2 / _MOST_CELLS))))
+    return draw_grid(mapped, _cell_of(mapped.points_in_map()))
+
+
+def _cell_of(points: Points2) -> float:
+    """Side of the cells of a picture of ``points`` (N, 2) [m]."""
+    area = float(np.prod(np.ptp(points, axis=0) + 1.0)) if len(points) else 1.0
+    return _RESOLUTION_M * max(1.0, float(np.ceil(np.sqrt(area / _RESOLUTION_M**2 / _MOST_CELLS))))
 
 
 def grid_figure(grid: Grid, changes: Sequence[Mapping[str, Any]] = ()) -> html.Figure:

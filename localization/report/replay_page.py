@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
+from localization.maps import KeyframeMap
 from localization.report import figures
 from localization.report import page as html
 from localization.report.interactive import Scans, explorer
@@ -131,11 +132,13 @@ def _sections(
 
 def _grid_blocks(runs: Sequence[PlottedRun]) -> list[html.Block]:
     """The grid of the last map of a graph, or of a drive in a saved map; and what of the saved map has changed."""
-    mapped = [run.result.run for run in runs if run.result.run.keyframes is not None and len(run.result.run.keyframes.points)]
-    if not mapped or mapped[-1].keyframes is None:
+    mapped = [(run.result.run, run.result.run.keyframes) for run in runs]
+    planar = [(run, keyframes) for run, keyframes in mapped if isinstance(keyframes, KeyframeMap) and len(keyframes.points)]
+    if not planar:
         return []
-    found = mapped[-1].localization or {}
-    return [grid_figure(picture_grid(mapped[-1].keyframes), found.get("changes", ())), *change_blocks(found)]
+    run, keyframes = planar[-1]
+    found = run.localization or {}
+    return [grid_figure(picture_grid(keyframes), found.get("changes", ())), *change_blocks(found)]
 
 
 def _with_note(table: html.Table | None, note: str) -> list[html.Block]:

@@ -185,7 +185,7 @@ class OperatorCommands:
         """Write the map as it is into the new file ``name``, beside the estimates; what comes of it is reported."""
         session = self._node.session
         mapped = session.pipeline.estimator.keyframe_map()
-        if mapped is None or not str(name).strip():
+        if not isinstance(mapped, KeyframeMap) or not str(name).strip():
             text = "give the name of a new file." if mapped is not None else "this estimator has no map of its own. Use graph."
             self._report(f"save_map: nothing is saved: {text}")
             return ServiceReply(False, text)
@@ -217,7 +217,7 @@ class OperatorCommands:
             self._report(f"load_map: {(refused := 'this estimator uses no saved map. Start with one by --map.')}")
             return ServiceReply(False, refused)
         try:
-            mapped = load_map(path).map
+            mapped = load_map(path).planar(path, "a live node")
         except (MapError, OSError) as error:
             self._report(f"load_map: {error} The present map stays.")
             return ServiceReply(False, str(error), _INVALID_MAP if path.exists() else _NO_SUCH_MAP)

@@ -219,8 +219,11 @@ class OnlineSettings:
         name = self.estimator if self.map is None else LOCALIZER
         check_estimator(name, has_lidar, self.map is not None)
         (form,) = check_forms([self.corrections])
-        prior = None if self.map is None else PriorMap(PlaceMap(load_map(self.map).map, self.config.estimator.lidar.range_noise_m))
-        return Trial(make_model(self.model, load_robot(self.robot)), name, form, prior)
+        return Trial(make_model(self.model, load_robot(self.robot)), name, form, None if self.map is None else self._prior(self.map))
+
+    def _prior(self, path: Path) -> PriorMap:
+        mapped = load_map(path).planar(path, "a live node")
+        return PriorMap(PlaceMap(mapped, self.config.estimator.lidar.range_noise_m))
 
     def live_run(self) -> LiveRun:
         """Raises `OutputError`, `RobotError`, `SettingError`."""

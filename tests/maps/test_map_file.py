@@ -77,7 +77,7 @@ def test_save_of_poses_not_finite_is_refused(tmp_path: Path) -> None:
 
 def test_load_of_a_newer_version_names_both(file: Path) -> None:
     rewrite_header(file, version=7)
-    with pytest.raises(MapError, match="version 7 of the format, and this program reads 1"):
+    with pytest.raises(MapError, match="version 7 of the format, and this program reads 1 and 2"):
         load_map(file)
 
 

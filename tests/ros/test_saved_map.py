@@ -110,7 +110,7 @@ def test_node_load_map_searches_the_new_map_and_refuses_what_is_none(places: Pla
     whole = (tmp_path / "office.skidmap").read_bytes()
     (tmp_path / "truncated.skidmap").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "foreign.skidmap").write_bytes(b"image: office.pgm")
-    header = zip_member(tmp_path / "office.skidmap", "skidmap.json").replace(b'"version": 1', b'"version": 2')
+    header = zip_member(tmp_path / "office.skidmap", "skidmap.json").replace(b'"version": 1', b'"version": 3')
     write_zip(tmp_path / "newer.skidmap", {"skidmap.json": header})
     transport = send("/skidloc/load_map", encode(make("std_msgs/msg/String", data=str(tmp_path / "truncated"))), 8.0)
     node, reports = run_node(transport, "map", config=NodeConfig(wait_s=0.0), prior=PriorMap(places, np.array([1.0, 0.1, 0.2])))
@@ -118,7 +118,7 @@ def test_node_load_map_searches_the_new_map_and_refuses_what_is_none(places: Pla
     codes = [load(str(tmp_path / name)).code for name in ("none", "truncated", "foreign", "newer")]
     assert codes == [1, 2, 2, 2]
     assert load("").code == 1
-    wanted = "is truncated, damaged, or no map file", "no map", "is truncated, damaged, or no map file", "has version 2 of the format"
+    wanted = "is truncated, damaged, or no map file", "no map", "is truncated, damaged, or no map file", "has version 3 of the format"
     assert all(any(text in report and report.endswith("The present map stays.") for report in reports) for text in wanted)
     estimator = node.session.pipeline.estimator
     assert estimator.localizer.places is places
