@@ -177,6 +177,7 @@ class DrivePredictor:
         self.kinematic_forces = self._accelerations()
         self._twists: dict[tuple[object, ...], FloatArray] = {}
         self._rows: dict[tuple[object, ...], FloatArray] = {}
+        self._turns: dict[int, tuple[FloatArray, FloatArray]] = {}
 
     @property
     def has_baseline(self) -> bool:
@@ -327,13 +328,9 @@ class DrivePredictor:
             # times the predicted turn: times the measured one, its own noise and all slip would look like a scale
             out[:, 2] -= hypothesis.gyro_bias * seconds + poses[:, 2] * hypothesis.gyro_scale
         if drive.gyro is not None:
-            late = round((hypothesis.lidar_time_offset_s - hypothesis.gyro_time_offset_s) * 1e9)
-            for i, (a, b) in enumerate(drive.spans_ns):
-                turn = drive.gyro.turn(int(a) - late, int(b) - late, float(batch.measured[i, 2]))
-                if turn is not None:  # times the predicted turn: the measured one's noise and bias would look like a scale
-                    out[i, 3] = (
-                        turn.angle - batch.measured[i, 2] - hypothesis.gyro_scale * poses[i, 2] - hypothesis.gyro_bias * turn.duration
-                    )
+            angles, seconds = self._gyro_turns(round((hypothesis.lidar_time_offset_s - hypothesis.gyro_time_offset_s) * 1e9))
+            # times the predicted turn: the measured one's noise and bias would look like a scale
+            out[:, 3] = angles - batch.measured[:, 2] - hypothesis.gyro_scale * poses[:, 2] - hypothesis.gyro_bias * seconds
         if drive.forces is not None:
             middle = self.headings + 0.5 * batch.measured[:, 2]
             c, s = np.cos(middle), np.sin(middle)
@@ -342,6 +339,18 @@ class DrivePredictor:
             out[:, 4] = drive.forces[:, 0] - self.kinematic_forces[:, 0] - (c * sx + s * sy)
             out[:, 5] = drive.forces[:, 1] - self.kinematic_forces[:, 1] - (-s * sx + c * sy)
         return out
+
+    def _gyro_turns(self, late_ns: int) -> tuple[FloatArray, FloatArray]:
+        """(W,) turn [rad] and (W,) length [s] of every window by a gyro whose stamps are so much earlier than the motion reference's; NaN
+        where it has no samples. Kept, as nearly all hypotheses have the same clocks."""
+        if late_ns not in self._turns:
+            gyro, found = self.drive.gyro, np.full((2, len(self.drive.spans_ns)), np.nan)
+            for i, (a, b) in enumerate(self.drive.spans_ns):
+                turn = None if gyro is None else gyro.turn(int(a) - late_ns, int(b) - late_ns, float(self.batch.measured[i, 2]))
+                if turn is not None:
+                    found[:, i] = turn.angle, turn.duration
+            self._turns[late_ns] = found[0], found[1]
+        return self._turns[late_ns]
 
     def wheel_shift(self, hypothesis: Hypothesis) -> float:
         """By how much the wheels' stamps are later than those of the motion reference under ``hypothesis`` [s]."""

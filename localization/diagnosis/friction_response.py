@@ -16,18 +16,17 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
 from motion_models.friction.contact import CREEP, rolling, tyre
-from motion_models.friction.dynamics import FrictionDynamics, _accelerations, _Body
+from motion_models.friction.dynamics import FrictionDynamics, Inputs, _Body, accelerations
 from motion_models.friction.equilibrium import Floor, motion, newton
 from motion_models.friction.model import FrictionModel, check_parameters, gripped, loads_at, pull_of, unit_rolls
-from motion_models.linear_equations import assign, solve
+from motion_models.linear_equations import Matrix3, assign, solve_3x3
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Triple
 
 _CREEP = 3e-3
 _NEWTON = 12
@@ -150,153 +149,158 @@ def dynamic_twists(robot: Robot, model: FrictionModel, params: FloatArray, drive
 TRACKED = tuple(FrictionModel.param_names.index(name) for name in ("tracked_x", "tracked_y"))
 
 
-class _Problem(NamedTuple):
-    """One backward Euler step."""
+class _Step(NamedTuple):
+    """One backward Euler step; of numbers alone, as compiled loops count the references to each array that is passed on."""
 
-    before: FloatArray
-    """(3,) twist at its start."""
+    before: Triple
+    """Twist at its start."""
     h: float
     """Duration [s]."""
-    q_l: float
-    q_r: float
-    state: FloatArray
-    influence: FloatArray
-    shift: FloatArray
-    """(2,) from the centre of gravity to that of the grip [m]."""
+    wheels: tuple[float, float]
+    """Left and right rate [rad/s]."""
+    inputs: Inputs
+    shift: tuple[float, float]
+    """From the centre of gravity to that of the grip [m]."""
     floor: Floor
     body: _Body
 
 
-class _Work(NamedTuple):
-    """Arrays of Newton's method, made once."""
+class _Off(NamedTuple):
+    """How far a twist is off a backward Euler step [m/s, m/s, rad/s], and the length of that."""
 
-    jacobian: FloatArray
-    off: FloatArray
-    tried: FloatArray
-    off_tried: FloatArray
-    is_stale: NDArray[np.bool_]
-    """(1,) the Jacobian is of another drive, or of none."""
+    x: float
+    y: float
+    w: float
+    size: float
+
+
+class _Solution(NamedTuple):
+    """Twist at the end of a step, and the Jacobian for the next one."""
+
+    twist: Triple
+    is_found: bool
+    jacobian: Matrix3
+    is_stale: bool
+    """The Jacobian is of another drive, or of none."""
 
 
 @kernel
 def _integrate(drive: ManeuverSamples, quasi_static: FloatArray, rated: Floor, body: _Body, out: FloatArray) -> None:
-    state, influence, shift, now = np.zeros(6), np.zeros(13), np.zeros(2), np.empty(3)
-    influence[12] = body.height
-    work = _Work(np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.ones(1, dtype=np.bool_))
     weight, slope = body.mass * body.gravity, drive.slope
+    jacobian = Matrix3(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for w in range(drive.first.shape[0] - 1):
-        heading = drive.headings[w]
-        before = quasi_static[drive.first[w]].copy()
-        work.is_stale[0] = True
+        heading, is_stale = drive.headings[w], True
+        before = _row(quasi_static, drive.first[w])
         for i in range(drive.last[w], drive.first[w + 1]):
             assign(out[i], quasi_static[i])
         for i in range(drive.first[w], drive.last[w]):
             q_l, q_r, h = drive.wheels[i, 0], drive.wheels[i, 1], drive.dt[i]
             if q_l == 0.0 and q_r == 0.0:
-                before[:] = 0.0
+                before = 0.0, 0.0, 0.0
                 out[i] = 0.0
                 continue
             floor = _floor_at(body.radius * math.hypot(q_l, q_r) * math.sqrt(0.5), rated, drive.stiffness_exponent)
             c, s = math.cos(heading), math.sin(heading)
-            influence[0], influence[1] = drive.grip_center[i, 0], drive.grip_center[i, 1]
-            shift[0], shift[1] = influence[0] - drive.cg[i, 0], influence[1] - drive.cg[i, 1]
-            influence[7] = -weight * (c * slope[0] + s * slope[1])
-            influence[8] = -weight * (-s * slope[0] + c * slope[1])
-            influence[10], influence[11] = influence[0], influence[1]
-            problem = _Problem(before, h, q_l, q_r, state, influence, shift, floor, body)
+            x, y = drive.grip_center[i, 0], drive.grip_center[i, 1]
+            f_x, f_y = -weight * (c * slope[0] + s * slope[1]), -weight * (-s * slope[0] + c * slope[1])
+            inputs = Inputs(x, y, 0.0, 0.0, 0.0, 0.0, 0.0, f_x, f_y, 0.0, x, y, body.height)
+            step = _Step(before, h, (q_l, q_r), inputs, (x - drive.cg[i, 0], y - drive.cg[i, 1]), floor, body)
             # start as far from the quasi-static motion as the sample before was
-            last = max(i - 1, drive.first[w])
-            for j in range(3):
-                now[j] = quasi_static[i, j] + (before[j] - quasi_static[last, j])
-            found = _solve_step(now, problem, work)
-            if not found:
-                assign(now, quasi_static[i])
-                found = _solve_step(now, problem, work)
-            assign(out[i], now if found else quasi_static[i])
-            assign(before, out[i])
-            heading += out[i, 2] * h
+            settled, last = _row(quasi_static, i), _row(quasi_static, max(i - 1, drive.first[w]))
+            start = settled[0] + (before[0] - last[0]), settled[1] + (before[1] - last[1]), settled[2] + (before[2] - last[2])
+            found = _solve_step(start, step, jacobian, is_stale)
+            if not found.is_found:
+                found = _solve_step(settled, step, found.jacobian, found.is_stale)
+            jacobian, is_stale = found.jacobian, found.is_stale
+            before = found.twist if found.is_found else settled
+            out[i, 0], out[i, 1], out[i, 2] = before
+            heading += before[2] * h
 
 
 @subroutine
-def _solve_step(now: FloatArray, problem: _Problem, work: _Work) -> bool:
-    """Twist at the end of a step by Newton's method from ``now`` (3,), which is overwritten; the Jacobian before is used while it helps."""
-    size = _misfit(now, problem, work.off)
+def _row(rows: FloatArray, i: int) -> Triple:
+    return rows[i, 0], rows[i, 1], rows[i, 2]
+
+
+@subroutine
+def _solve_step(start: Triple, step: _Step, jacobian: Matrix3, is_stale: bool) -> _Solution:
+    """Twist at the end of a step by Newton's method from ``start``; the ``jacobian`` before is used while it helps."""
+    now, off = start, _off_step(start, step)
     for _ in range(_NEWTON):
-        if size < _MAX_RESIDUAL:
+        if off.size < _MAX_RESIDUAL:
             break
-        new = math.inf if work.is_stale[0] else _try(now, problem, work, 1.0)
-        if not new < _MIN_REDUCTION * size:
-            _differentiate(now, problem, work)
-            new = _search(now, problem, work, size)
-            if not new < size:
+        tried, left = (now, _Off(0.0, 0.0, 0.0, math.inf)) if is_stale else _try(now, off, jacobian, 1.0, step)
+        if not left.size < _MIN_REDUCTION * off.size:
+            jacobian, is_stale = _differentiate(now, off, step), False
+            tried, left = _search(now, off, jacobian, step)
+            if not left.size < off.size:
                 break
-        assign(now, work.tried)
-        assign(work.off, work.off_tried)
-        size = new
-    if not size < _SOLVED:
-        work.is_stale[0] = True
-    return bool(size < _SOLVED)
+        now, off = tried, left
+    is_found = off.size < _SOLVED
+    return _Solution(now, is_found, jacobian, is_stale or not is_found)
 
 
 @subroutine
-def _try(now: FloatArray, problem: _Problem, work: _Work, share: float) -> float:
-    """Misfit after a ``share`` of Newton's step; inf where the Jacobian is singular."""
-    d0, d1, d2 = solve(work.jacobian, work.off)
+def _try(now: Triple, off: _Off, jacobian: Matrix3, share: float, step: _Step) -> tuple[Triple, _Off]:
+    """Twist after a ``share`` of Newton's step, and how far it is off; inf where the Jacobian is singular."""
+    d0, d1, d2 = solve_3x3(jacobian, off.x, off.y, off.w)
     if not math.isfinite(d0 + d1 + d2):
-        return math.inf
-    work.tried[0], work.tried[1], work.tried[2] = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
-    return _misfit(work.tried, problem, work.off_tried)
+        return now, _Off(0.0, 0.0, 0.0, math.inf)
+    tried = now[0] - share * d0, now[1] - share * d1, now[2] - share * d2
+    return tried, _off_step(tried, step)
 
 
 @subroutine
-def _search(now: FloatArray, problem: _Problem, work: _Work, size: float) -> float:
-    """Misfit of the first of shrinking steps that is below ``size``; inf where none is."""
+def _search(now: Triple, off: _Off, jacobian: Matrix3, step: _Step) -> tuple[Triple, _Off]:
+    """The first of shrinking steps that is less far off than ``off``; inf where none is."""
     share = 1.0
     for _ in range(8):
-        new = _try(now, problem, work, share)
-        if new < size:
-            return new
+        tried, left = _try(now, off, jacobian, share, step)
+        if left.size < off.size:
+            return tried, left
         share *= 0.4
-    return math.inf
+    return now, _Off(0.0, 0.0, 0.0, math.inf)
 
 
 @subroutine
-def _differentiate(now: FloatArray, problem: _Problem, work: _Work) -> None:
-    for j in range(3):
-        assign(work.tried, now)
-        work.tried[j] += _DIFFERENCE
-        _misfit(work.tried, problem, work.off_tried)
-        for k in range(3):
-            work.jacobian[k, j] = (work.off_tried[k] - work.off[k]) / _DIFFERENCE
-    work.is_stale[0] = False
+def _differentiate(now: Triple, off: _Off, step: _Step) -> Matrix3:
+    """Derivatives of how far a twist is off, by differences from ``now``, which is ``off``."""
+    x = _off_step((now[0] + _DIFFERENCE, now[1], now[2]), step)
+    y = _off_step((now[0], now[1] + _DIFFERENCE, now[2]), step)
+    w = _off_step((now[0], now[1], now[2] + _DIFFERENCE), step)
+    return Matrix3(
+        *((x.x - off.x) / _DIFFERENCE, (y.x - off.x) / _DIFFERENCE, (w.x - off.x) / _DIFFERENCE),
+        *((x.y - off.y) / _DIFFERENCE, (y.y - off.y) / _DIFFERENCE, (w.y - off.y) / _DIFFERENCE),
+        *((x.w - off.w) / _DIFFERENCE, (y.w - off.w) / _DIFFERENCE, (w.w - off.w) / _DIFFERENCE),
+    )
 
 
 @subroutine
-def _misfit(twist: FloatArray, problem: _Problem, off: FloatArray) -> float:
-    """Fill ``off`` (3,) with how far ``twist`` is off a backward Euler step [m/s, m/s, rad/s]; its length."""
-    state, before, h = problem.state, problem.before, problem.h
-    state[3], state[4], state[5] = twist[0], twist[1], twist[2]
-    a_x, a_y, a_w, _ = _accelerations(state, problem.q_l, problem.q_r, problem.influence, problem.floor, problem.body)
-    if problem.shift[0] != 0.0 or problem.shift[1] != 0.0:
-        a_x, a_y, a_w = _about_cg(twist, a_x, a_y, a_w, problem)
-    off[0], off[1], off[2] = twist[0] - before[0] - h * a_x, twist[1] - before[1] - h * a_y, twist[2] - before[2] - h * a_w
-    return math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+def _off_step(twist: Triple, step: _Step) -> _Off:
+    """How far ``twist`` is off a backward Euler step."""
+    before, h = step.before, step.h
+    a_x, a_y, a_w, _ = accelerations(twist, step.wheels, step.inputs, step.floor, step.body)
+    if step.shift[0] != 0.0 or step.shift[1] != 0.0:
+        a_x, a_y, a_w = _about_cg(twist, a_x, a_y, a_w, step)
+    x, y, w = twist[0] - before[0] - h * a_x, twist[1] - before[1] - h * a_y, twist[2] - before[2] - h * a_w
+    return _Off(x, y, w, math.sqrt(x * x + y * y + w * w))
 
 
 @subroutine
-def _about_cg(twist: FloatArray, a_x: float, a_y: float, a_w: float, problem: _Problem) -> tuple[float, float, float]:
+def _about_cg(twist: Triple, a_x: float, a_y: float, a_w: float, step: _Step) -> Triple:
     """Accelerations of the wheelbase's centre, which were worked out as if mass and inertia sat at the grip's centre, with these at the
     centre of gravity: contact forces are the same, their moment is taken about it, and rolling resistance goes with the load alone."""
-    influence, shift, floor, body, w = problem.influence, problem.shift, problem.floor, problem.body, twist[2]
-    x, y = influence[0], influence[1]
-    force_x = body.mass * (a_x - twist[1] * w - y * a_w - x * w * w) - influence[7]
-    force_y = body.mass * (a_y + twist[0] * w + x * a_w - y * w * w) - influence[8]
+    inputs, shift, floor, body, w = step.inputs, step.shift, step.floor, step.body, twist[2]
+    x, y = inputs.x, inputs.y
+    force_x = body.mass * (a_x - twist[1] * w - y * a_w - x * w * w) - inputs.f_x
+    force_y = body.mass * (a_y + twist[0] * w + x * a_w - y * w * w) - inputs.f_y
     moment = body.inertia * a_w + shift[0] * force_y - shift[1] * force_x
-    speed = body.radius * math.sqrt(0.5 * (problem.q_l * problem.q_l + problem.q_r * problem.q_r))
-    ahead_l, ahead_r = rolling(body.radius * problem.q_l / speed)[0], rolling(body.radius * problem.q_r / speed)[0]
+    q_l, q_r = step.wheels
+    speed = body.radius * math.sqrt(0.5 * (q_l * q_l + q_r * q_r))
+    ahead_l, ahead_r = rolling(body.radius * q_l / speed)[0], rolling(body.radius * q_r / speed)[0]
     drag = 0.5 * shift[1] * floor.drag * body.mu * body.mass * body.gravity  # too much on the left, times the half track
     force_x += drag / floor.half_track * (ahead_l - ahead_r)
     moment -= drag * (ahead_l + ahead_r)
-    cg_x, cg_y, alpha = (force_x + influence[7]) / body.mass, (force_y + influence[8]) / body.mass, moment / body.inertia
+    cg_x, cg_y, alpha = (force_x + inputs.f_x) / body.mass, (force_y + inputs.f_y) / body.mass, moment / body.inertia
     x, y = x - shift[0], y - shift[1]
     return cg_x + y * alpha + x * w * w + twist[1] * w, cg_y - x * alpha + y * w * w - twist[0] * w, alpha

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from scipy.optimize import nnls
 from localization.diagnosis.causes import STIFFNESS_EXPONENT
 from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
-from motion_models.calibration.maneuvers import Batch
+from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.se2 import FloatArray
 
 FLAT = 1e3
@@ -74,11 +75,19 @@ class Noise:
     def _unmix(self, scaled: FloatArray) -> FloatArray:
         """(M, 6, n) channels made independent of each other, by the Cholesky factor of the covariance of those that a window has."""
         found = scaled.copy()
+        for windows, has, inverse_root in self._patterns:
+            found[np.ix_(windows, has)] = np.einsum("ij,njk->nik", inverse_root, scaled[np.ix_(windows, has)])
+        return found
+
+    @cached_property
+    def _patterns(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
+        """Windows (w,) that have the same channels (c,), and the inverse (c, c) of the Cholesky factor of the covariance of these."""
+        found = []
         for pattern in np.unique(self.known, axis=0):
             has = np.flatnonzero(pattern)
             windows = np.flatnonzero((self.known == pattern).all(axis=1))
             root = np.linalg.cholesky(self.correlation[np.ix_(has, has)])
-            found[np.ix_(windows, has)] = np.einsum("ij,njk->nik", np.linalg.inv(root), scaled[np.ix_(windows, has)])
+            found.append((windows, has, np.linalg.inv(root)))
         return found
 
 

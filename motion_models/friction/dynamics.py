@@ -20,7 +20,7 @@ from motion_models.friction.contact import CREEP, contact, loads, rolling
 from motion_models.friction.equilibrium import Floor
 from motion_models.friction.model import FrictionModel, check_parameters, floor_of
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Triple
 from motion_models.slope import GRAVITY
 
 _THESIS_GYRATION_SQUARED = (0.43**2 + 0.27**2) / 12.0  # m^2; Appendix A's I / m
@@ -194,19 +194,52 @@ def _shifted_loads(xi_0: float, eta_0: float, lean_x: float, lean_y: float, warp
     return xi, eta
 
 
+class Inputs(NamedTuple):
+    """Numbers of an `Influence`, for compiled loops."""
+
+    x: float
+    """CG in the body frame [m]."""
+    y: float
+    dx: float
+    """Its velocity in the body frame [m/s]."""
+    dy: float
+    ddx: float
+    """Its acceleration in the body frame [m/s^2]."""
+    ddy: float
+    ddz: float
+    f_x: float
+    """External force in the body frame [N]."""
+    f_y: float
+    f_z: float
+    p_x: float
+    """Where it acts, in the body frame [m]."""
+    p_y: float
+    p_z: float
+
+
 @kernel
 def _accelerations(
     state: FloatArray, q_l: float, q_r: float, influence: FloatArray, floor: Floor, body: _Body
 ) -> tuple[float, float, float, float]:
     """Rates of vx, vy, wz and the tipping margin. ``influence`` (13,) holds the fields of `Influence` in their order."""
+    i = influence
+    inputs = Inputs(i[0], i[1], i[2], i[3], i[4], i[5], i[6], i[7], i[8], i[9], i[10], i[11], i[12])
+    return accelerations((state[3], state[4], state[5]), (q_l, q_r), inputs, floor, body)
+
+
+@subroutine
+def accelerations(
+    twist: Triple, wheels: tuple[float, float], inputs: Inputs, floor: Floor, body: _Body
+) -> tuple[float, float, float, float]:
+    """Rates of vx, vy, wz at a ``twist`` of the wheelbase's centre and rates of the left and right ``wheels``, and the tipping margin."""
+    vx, vy, w = twist
+    q_l, q_r = wheels
     mu, mass, inertia, height, rest, radius = body.mu, body.mass, body.inertia, body.height, body.rest_speed, body.radius
-    x_g, y_g, dx_g, dy_g = influence[0], influence[1], influence[2], influence[3]
-    ddx_g, ddy_g, ddz_g = influence[4], influence[5], influence[6]
-    f_x, f_y, f_z, p_x, p_y, p_z = influence[7], influence[8], influence[9], influence[10], influence[11], influence[12]
+    x_g, y_g, dx_g, dy_g, ddx_g, ddy_g, ddz_g, f_x, f_y, f_z, p_x, p_y, p_z = inputs
     speed = math.sqrt(0.5 * radius * radius * (q_l * q_l + q_r * q_r) + rest * rest)
-    wz = state[5] / speed
+    wz = w / speed
     rolls = (radius * q_l / speed, radius * q_r / speed)
-    sums = _wheel_sums(state[3] / speed, state[4] / speed, wz, rolls, (x_g, y_g), floor, body.creep)
+    sums = _wheel_sums(vx / speed, vy / speed, wz, rolls, (x_g, y_g), floor, body.creep)
 
     weight = mass * (body.gravity + ddz_g)
     load = weight - f_z  # 3.21
@@ -222,12 +255,11 @@ def _accelerations(
     moment -= mu * load * floor.scrub * spin / math.sqrt(spin * spin + body.creep * body.creep)
     lean = abs(xi_0 - height * force_x / (load * floor.half_wheelbase)), abs(eta_0 - height * force_y / (load * floor.half_track))
 
-    w = state[5]
     a_x, a_y = (force_x + f_x) / mass, (force_y + f_y) / mass  # 3.24, 3.25
     alpha = (moment + (p_x - x_g) * f_y - (p_y - y_g) * f_x) / inertia  # 3.26
     base_x = a_x - ddx_g + y_g * alpha + 2.0 * dy_g * w + x_g * w * w  # 3.18
     base_y = a_y - ddy_g - x_g * alpha - 2.0 * dx_g * w + y_g * w * w  # 3.19
-    return base_x + state[4] * w, base_y - state[3] * w, alpha, 1.0 - max(lean)
+    return base_x + vy * w, base_y - vx * w, alpha, 1.0 - max(lean)
 
 
 @subroutine

@@ -29,10 +29,10 @@ import numpy as np
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.causes.cause import Cause, Hypothesis
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot, predictor_after
-from localization.diagnosis.diagnose import TOLERANCE, examine
+from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor
-from localization.diagnosis.extension import extend
+from localization.diagnosis.extension import ExtendedResult, extend
 from localization.diagnosis.findings import confirmed_findings
 from localization.diagnosis.linearization import candidate_causes, default_model, linearize, make_predictor
 from localization.diagnosis.missing_terms import candidate_terms, merge_terms, term_columns
@@ -170,6 +170,11 @@ def ours(measured: Drive, baseline: Baseline | None) -> Answer:
     model = make_model(default_model(measured.robot), measured.robot)
     found = examine(measured, model, None, baseline)
     result = extend(found, measured, model)
+    return answer_of(found, result)._replace(seconds=time.process_time() - begin)
+
+
+def answer_of(found: DiagnosisResult, result: ExtendedResult) -> Answer:
+    """What `diagnose --extend` names and writes: ``found`` without terms, and the ``result`` with them."""
     d, predictor = result.found.diagnosis, found.predictor
     assert predictor is not None
     findings = confirmed_findings(d)
@@ -184,7 +189,7 @@ def ours(measured: Drive, baseline: Baseline | None) -> Answer:
         robot = correct_robot(predictor, {f.definition: f.size for f in findings}).robot
     is_alarm = d.verdict not in ("consistent", "undecidable")
     size = named[0][1] if named else math.nan
-    return Answer(tuple(n for n, _ in named), is_alarm, size, time.process_time() - begin, robot)
+    return Answer(tuple(n for n, _ in named), is_alarm, size, math.nan, robot)
 
 
 class _Columns(NamedTuple):
@@ -315,7 +320,7 @@ def score(method: str, name: str, drives: tuple[Drive, Drive, Drive], baseline: 
         is_wrong = bool(answer.names) and not is_named
     else:
         is_wrong = any("[" not in n for n in answer.names[:1])
-    removed = _removed(answer, fresh, floor, measured.robot, baseline) if name != "nothing" else math.nan
+    removed = removed_share(answer, fresh, floor, measured.robot, baseline) if name != "nothing" else math.nan
     size_error = abs(answer.size / hidden.size - 1.0) if is_named and answer.names[0] in hidden.names and hidden.size else math.nan
     return {
         "method": method,
@@ -331,7 +336,7 @@ def score(method: str, name: str, drives: tuple[Drive, Drive, Drive], baseline: 
     }
 
 
-def _removed(answer: Answer, fresh: Drive, floor: Drive, robot: Robot, baseline: Baseline | None) -> float:
+def removed_share(answer: Answer, fresh: Drive, floor: Drive, robot: Robot, baseline: Baseline | None) -> float:
     """Share of the effect's squares on the ``fresh`` drive that the written file, read again, takes off; below 0 where it adds to them."""
     name = default_model(robot)
     before, least = (make_predictor(d, make_model(name, robot), baseline) for d in (fresh, floor))
