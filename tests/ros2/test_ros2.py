@@ -206,7 +206,7 @@ def test_colcon_build_installs_a_package_that_ros2_finds_and_starts(distro, runn
     source.mkdir(parents=True)
     for name in ("pyproject.toml", "setup.py", "package.xml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
-    for name in ("localization", "motion_models"):
+    for name in ("localization", "motion_models", "skidloc"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     environment = {**ros2_environment(own_domain(7)), "PATH": f"{python.parent}:{os.environ['PATH']}"}
     build = [python.parent / "colcon", "build", "--event-handlers", "console_direct+"]
