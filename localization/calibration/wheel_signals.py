@@ -60,8 +60,8 @@ class WheelSignals:
     """(n,) forward speeds by source [m/s]."""
     is_gyro_upright: bool = True
     """The IMU's mount agrees with gravity; else the sign of its yaw rate is unknown."""
-    jumps: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """Sizes of sudden changes of positions, in the unit of the log."""
+    jumps: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """(m, 2) message and size of sudden changes of positions, in the unit of the log."""
     first_ns: int = 0
     start_s: float = 0.0
 
@@ -163,13 +163,13 @@ def _signals(log: Log, gathered: Mapping[str, Sequence[Any]], first_ns: int, mov
             speeds[topic], turns[topic] = _odometry(readings, edges, first_ns)
     joints, left = (*log.joints[0], *log.joints[1]), len(log.joints[0])
     rates = angle_rates = np.full((n, len(joints)), np.nan)
-    jumps = np.zeros(0)
+    jumps = np.zeros((0, 2))
     if joints:
         t = _seconds(of_wheels, first_ns)
         rates = _mean_rates(t, np.array([r.velocity for r in of_wheels]), edges)
         angles, jumps = _continuous(np.array([r.position for r in of_wheels]))
         angle_rates = _differences(t, angles, edges)
-        jumps = jumps / log.robot.joints.angle_unit_rad
+        jumps = jumps / [1.0, log.robot.joints.angle_unit_rad]
     return WheelSignals(joints, left, rates, angle_rates, turns, speeds, is_upright, jumps, first_ns, float(edges[0]))
 
 
@@ -230,19 +230,20 @@ def _mean_rates(t: FloatArray, rates: FloatArray, edges: FloatArray) -> FloatArr
 
 
 def _continuous(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``positions`` (m, k) without jumps, over which the increment before holds; and the jumps' sizes."""
-    steps = np.diff(positions, axis=0)
+    """``positions`` (m, k) without jumps, over which the increment before holds, and (n, 2) rows and sizes of the jumps. Joints stand
+    where they are NaN."""
+    steps = np.nan_to_num(np.diff(positions, axis=0))
     sizes = np.abs(steps)
     finite = sizes[np.isfinite(sizes) & (sizes > 0.0)]
     if not len(finite):
-        return positions, np.zeros(0)
+        return positions, np.zeros((0, 2))
     is_jump = sizes > _JUMP_FACTOR * float(np.percentile(finite, 97.0))
     found = []
     for i, j in zip(*np.nonzero(is_jump), strict=True):
         before = steps[i - 1, j] if i else 0.0
-        found.append(steps[i, j] - before)
+        found.append((i, steps[i, j] - before))
         steps[i, j] = before
-    return np.vstack([positions[:1], positions[:1] + np.cumsum(steps, axis=0)]), np.array(found)
+    return np.vstack([positions[:1], positions[:1] + np.cumsum(steps, axis=0)]), np.array(found).reshape(-1, 2)
 
 
 def _gyro(samples: Sequence[ImuSample], mounts: Mapping[str, Mount], edges: FloatArray, first_ns: int) -> tuple[FloatArray, bool]:

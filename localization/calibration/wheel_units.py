@@ -281,13 +281,13 @@ def gyro_in_degrees(report: UnitReport, ratio: float) -> UnitReport:
 
 
 def _name_range(report: UnitReport, signals: WheelSignals) -> UnitReport:
-    """Counters that wrap: jumps of positions that all have one size."""
-    sizes, joints = np.abs(signals.jumps), report.robot.joints
+    """Counters that wrap: jumps of positions that all have one size. All wheels at once, and once, are a reset."""
+    sizes, joints = np.abs(signals.jumps[:, 1]), report.robot.joints
     if not len(sizes) or joints.angle_range:
         return report
     size = float(np.median(sizes))
     counter = next((c for c in _COUNTERS if abs(size / c - 1.0) <= _SAME_JUMP), None)
-    is_one_size = float(np.abs(sizes / size - 1.0).max()) <= _SAME_JUMP and (counter is not None or len(sizes) >= 2)
+    is_one_size = float(np.abs(sizes / size - 1.0).max()) <= _SAME_JUMP and (counter is not None or len(set(signals.jumps[:, 0])) >= 2)
     if not is_one_size or abs(size * joints.angle_unit_rad / math.tau - 1.0) <= _SAME_JUMP:
         return report
     value = float(f"{size if counter is None else counter:.6g}")

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
-import itertools
 import statistics
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -120,7 +119,9 @@ def _shift_to(common: int, offset: int) -> int:
 
 def _period_s(first: Sequence[FirstMessage]) -> float | None:
     stamps = [message.stamp_ns for message in first if message.frame == first[0].frame]
-    steps = [after - before for before, after in itertools.pairwise(stamps) if after > before]
+    known = sorted(set(stamps))
+    every = 2 if len(known) > 2 else 1  # stamps of arrival come in pairs
+    steps = [(after - before) / every for before, after in zip(known, known[every:], strict=False)]
     return statistics.median(steps) * 1e-9 if steps else None
 
 

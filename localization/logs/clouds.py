@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from localization.events import Scan
-from localization.logs.decode import MAX_SCAN_DURATION_S, Oddity, UnusableError, frame_name
+from localization.logs.decode import MAX_PERIODS, MAX_SCAN_DURATION_S, Oddity, UnusableError, frame_name
 from motion_models.se2 import FloatArray
 
 # sensor_msgs/PointField: datatype 1..8
@@ -24,10 +24,8 @@ _TIME_NAME = re.compile("time|stamp|^(ts|dt|t_.*)$")
 _MAX_POINTS = 10_000_000  # points; LiDARs have up to 300,000 a scan, and this many take 1 GB as float64
 _MAX_START_OFFSET_S = 0.5  # a scan begins at the stamp of its header, or ends there
 _UNITS_NS = (1_000_000_000, 1_000_000, 1_000, 1)
+"""A factor of 1000 apart, so that a sweep of a thousandth of its turn on is taken in the right one."""
 _USUAL_PERIOD_S = 0.1  # of LiDARs that turn, for a log with one cloud
-_MAX_PERIODS = 1.5
-"""Length of a sweep in periods: some overlap a little, and drivers join packets by whole ones. Units are a factor of 1000 apart, so that a
-sweep of a thousandth of its turn on is taken in the right one."""
 
 
 def cloud_decoder(period_s: float | None) -> Callable[[Any, int], Scan]:
@@ -106,7 +104,7 @@ class _PointTimes:
         known = values[good] if is_whole else values[good & np.isfinite(values)]
         if len(known) == 0:
             return np.full(len(values), 0.0 if is_whole else np.nan)
-        first, spread, longest = known.min(), float(np.ptp(known)), _MAX_PERIODS * self._period_s
+        first, spread, longest = known.min(), float(np.ptp(known)), MAX_PERIODS * self._period_s
         start_s = max(_MAX_START_OFFSET_S, longest)
         for unit_ns in _UNITS_NS:
             begin = float(first) * unit_ns * 1e-9

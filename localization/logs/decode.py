@@ -20,6 +20,10 @@ from localization.events import CgSample, ImuSample, Scan
 from motion_models.se2 import FloatArray
 
 MAX_SCAN_DURATION_S = 2.0
+MAX_PERIODS = 1.5
+"""Length of a sweep in periods: some overlap a little, and drivers join packets by whole ones."""
+_MAX_SWEEP = 1e9  # of the longest sweep, in nanoseconds
+_MIN_SWEEP = 0.05  # of the longest sweep, a field of view of 27 degrees: times in milliseconds are known from times that are wrong
 _MAX_RATE_RAD_S = math.radians(2000.0)  # rad/s, the full scale of gyros on robots
 _MAX_SPECIFIC_FORCE_M_S2 = 1e5  # m/s^2; drivers use other units, in which this may be 100 g (cm/s^2)
 _MIN_SQUARED_NORM = 0.01  # of a rotation, as its quaternion need not be normalised; a smaller one was not filled in
@@ -34,6 +38,8 @@ class Oddity(Enum):
     UNDECODABLE = "dropped (bytes that are not of the type)"
     MALFORMED = "dropped (fields that contradict each other)"
     NO_ANGLES = "dropped (angle_increment is zero, or makes more than a full turn: in degrees?); correct the driver's angles"
+    BEAM_TIME_UNIT = "with a time_increment that is not in seconds; it was scaled so that a sweep lasts as long as from scan to scan"
+    BEAM_TIMES = "with a time_increment that makes sweeps longer than the time from scan to scan; it was left out: correct the driver"
     NOT_FINITE = "dropped (NaN or inf)"
     BEYOND = "dropped (beyond what such a sensor can measure)"
     NO_FIX = "left out (no GPS fix)"
@@ -53,7 +59,7 @@ class Oddity(Enum):
     TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
     WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
     SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
-    FROZEN_WHEEL = "with an angle that never changes while another wheel of its side turns; it was left out (check its encoder)"
+    FROZEN_WHEEL = "with an angle that does not change while another wheel of its side turns; it was left out (check its encoder)"
     CONSTANT_ANGLES = "with wheel angles that never change while the rates do; the increments were taken from the rates"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
 
@@ -193,7 +199,7 @@ def joint_decoder(joints: tuple[str, ...]) -> Callable[[Any, int], JointReading 
         if place is None:
             return None
         position, velocity = _at(message.position, place), _at(message.velocity, place)
-        if not (_all_finite(position) or _all_finite(velocity)):
+        if not (np.isfinite(position).any() or np.isfinite(velocity).any()):
             raise UnusableError(Oddity.NOT_FINITE)
         return JointReading(stamp, position, velocity)
 
@@ -237,12 +243,11 @@ def _at(values: Any, place: NDArray[np.intp]) -> FloatArray:
         return np.full(len(place), np.nan)
 
 
-def _all_finite(values: FloatArray) -> bool:
-    return all(map(math.isfinite, values.tolist()))  # faster than numpy on four numbers
+def scan_decoder(period_s: float | None = None, count: Callable[[Oddity], None] = lambda oddity: None) -> Callable[[Any, int], Scan]:
+    """Decoder of LaserScans that are ``period_s`` apart [s] (None: unknown); it keeps the beams' directions between scans.
 
-
-def scan_decoder() -> Callable[[Any, int], Scan]:
-    """Decoder of LaserScans; it keeps the beams' directions between scans."""
+    ``count`` is called with what was corrected. The decoder raises `UnusableError`.
+    """
     directions: dict[tuple[int, float, float], FloatArray] = {}
 
     def decode(message: Any, stamp: int) -> Scan:
@@ -269,12 +274,27 @@ def scan_decoder() -> Callable[[Any, int], Scan]:
         kept = np.flatnonzero(hit)
         points = direction.take(kept, axis=0)
         points *= ranges.take(kept)[:, None]
-        beam_s = float(message.time_increment)
-        if abs(beam_s) * len(ranges) > MAX_SCAN_DURATION_S:
-            raise UnusableError(Oddity.MALFORMED)
-        offsets: FloatArray = np.empty(0)
-        if math.isfinite(beam_s) and beam_s != 0.0:
-            offsets = np.asarray(kept * beam_s, dtype=float)
+        beam_s, oddity = _seconds_per_beam(float(message.time_increment), n, period_s)
+        if oddity is not None:
+            count(oddity)
+        offsets: FloatArray = np.empty(0) if beam_s == 0.0 else np.asarray(kept * beam_s, dtype=float)
         return Scan(stamp, points, offsets, frame_name(message.header.frame_id), is_planar=True)
 
     return decode
+
+
+def _seconds_per_beam(increment: float, beams: int, period_s: float | None) -> tuple[float, Oddity | None]:
+    """Time from beam to beam [s], 0 where it is not known, and what is odd about the ``increment`` of a scan.
+
+    A sweep does not last longer than from scan to scan: one that does is in another unit, or is none. Raises `UnusableError` for no time.
+    """
+    sweep = abs(increment) * beams
+    longest = MAX_SCAN_DURATION_S if period_s is None else min(MAX_PERIODS * period_s, MAX_SCAN_DURATION_S)
+    if math.isnan(sweep) or sweep == 0.0:
+        return 0.0, None
+    if sweep > _MAX_SWEEP * longest:
+        raise UnusableError(Oddity.MALFORMED)
+    if sweep <= longest:
+        return increment, None
+    unit_s = next((unit for unit in (1e-3, 1e-6, 1e-9) if _MIN_SWEEP * longest <= sweep * unit <= longest), None)
+    return (0.0, Oddity.BEAM_TIMES) if unit_s is None else (increment * unit_s, Oddity.BEAM_TIME_UNIT)

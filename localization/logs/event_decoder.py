@@ -107,7 +107,7 @@ class EventDecoder:
         cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
         self._check_cg = partial(check_tipping, geometry=robot.geometry, topic=cg_topic, oddity=Oddity.TIPPING_CG, stats=stats)
         self.decoders: Mapping[str, TopicDecoder] = {
-            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source), late_ns(source.kind, robot.clock))
+            source.topic: TopicDecoder(_RANKS[source.kind], self._decoder(source, stats), late_ns(source.kind, robot.clock))
             for source in sources.used()
         }
         """By topic."""
@@ -136,7 +136,7 @@ class EventDecoder:
             return sample
         return dataclasses.replace(sample, velocity=sample.velocity * self._multipliers, position=sample.position * self._multipliers)
 
-    def _decoder(self, source: TopicSource) -> MessageDecoder:
+    def _decoder(self, source: TopicSource, stats: MessageStats) -> MessageDecoder:
         if source.kind == "joint_states":
             is_wheels = any(wheels.topic == source.topic for wheels in self._sources.all_wheels)
             of_wheels = self._of_wheels if is_wheels else None
@@ -145,7 +145,7 @@ class EventDecoder:
             assert of_wheels is not None
             return of_wheels
         if source.kind == "scan":
-            return scan_decoder()
+            return scan_decoder(self._period_s.get(source.topic), partial(stats.count, source.topic))
         if source.type in ODOMETRY_DECODERS:
             return ODOMETRY_DECODERS[source.type]()
         decoders: dict[str, MessageDecoder] = {
@@ -304,14 +304,15 @@ class JointsToWheels:
         self._publisher: _PublisherState | None = None
         self._second_publisher: _PublisherState | None = None
         self._rates = PublisherSeparator()
-        self._turned = np.zeros(len(self._names))  # by each joint so far [rad]
-        self._is_working = np.ones(len(self._names), dtype=bool)
+        self._has_turned = False
+        self._failing = FailingEncoders(self._left, len(self._names))
         self._by_rates, self._last_ns = np.zeros(len(self._names)), 0  # turned while no angle has changed [rad]
         self.angle_period = math.tau
         """After which angles wrap [rad]."""
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
+        reading = self._hold_unknown(reading)
         has_angles = all(map(math.isfinite, reading.position.tolist()))
         velocity = reading.velocity
         if any(abs(rate) * self._radius > _MAX_SPEED_M_S for rate in velocity.tolist()):
@@ -347,13 +348,22 @@ class JointsToWheels:
                 self._second_publisher = replace(publisher, turned=0.0)
                 publisher = replace(publisher, turned=0.0)
             publisher = self._publisher = self._accumulate(publisher, reading, step)
-        self._find_frozen(publisher)
+        for i in self._failing.joints:
+            self._stats.count(f"{self._topic}, joint '{self._names[i]}'", Oddity.FROZEN_WHEEL)
         yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(publisher.angle))
+
+    def _hold_unknown(self, reading: JointReading) -> JointReading:
+        """``reading`` with the last angles of joints whose angles are NaN while others have some."""
+        unknown = ~np.isfinite(reading.position)
+        if not unknown.any() or unknown.all():
+            return reading
+        last = np.zeros(len(unknown)) if self._publisher is None else self._publisher.reading.position
+        return replace(reading, position=np.where(unknown, last, reading.position))
 
     def _has_constant_angles(self, reading: JointReading, velocity: FloatArray) -> bool:
         """Whether no angle has changed yet, though the wheels have turned by their rates."""
         publisher = self._publisher
-        if publisher is None or self._turned.any() or (reading.position != publisher.reading.position).any():
+        if publisher is None or self._has_turned or (reading.position != publisher.reading.position).any():
             return False
         passed_s = (reading.stamp_ns - max(self._last_ns, publisher.reading.stamp_ns)) * 1e-9
         self._by_rates += np.nan_to_num(velocity) * min(max(passed_s, 0.0), _MAX_PUBLISHER_GAP_NS * 1e-9)
@@ -363,7 +373,7 @@ class JointsToWheels:
     def _convert_rates(self, stamp_ns: int, velocity: FloatArray) -> Iterator[WheelSample]:
         """A reading without angles, unless it is of a second publisher."""
         angles = self._publisher
-        if angles is not None and stamp_ns - angles.reading.stamp_ns <= _MAX_PUBLISHER_GAP_NS and self._turned.any():
+        if angles is not None and stamp_ns - angles.reading.stamp_ns <= _MAX_PUBLISHER_GAP_NS and self._has_turned:
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)  # wheels that have turned by their angles have these
             return
         speed = velocity * self._radius
@@ -372,15 +382,6 @@ class JointsToWheels:
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
             return
         yield WheelSample(stamp_ns, self._side_means(velocity), np.full(2, np.nan))
-
-    def _find_frozen(self, publisher: _PublisherState) -> None:
-        """Leave out a wheel that never turns while others of its side do; its encoder has failed."""
-        for side in (slice(None, self._left), slice(self._left, None)):
-            turned = self._turned[side]
-            if len(turned) > 1 and turned.max() > _FROZEN_AFTER_RAD:
-                self._is_working[side] = turned > _STATIONARY_RAD
-        for i in np.flatnonzero(~self._is_working) if not self._is_working.all() else ():
-            self._stats.count(f"{self._topic}, joint '{self._names[i]}'", Oddity.FROZEN_WHEEL)
 
     def _is_reachable(self, publisher: _PublisherState, reading: JointReading) -> bool:
         """Whether wheels can have turned from the last reading of ``publisher`` to ``reading``."""
@@ -392,8 +393,8 @@ class JointsToWheels:
 
     def _accumulate(self, publisher: _PublisherState, reading: JointReading, step: FloatArray) -> _PublisherState:
         turned = publisher.turned if self._second_publisher is None else publisher.turned + sum(map(abs, step.tolist()))
-        self._turned += np.abs(step)
-        return _PublisherState(reading, publisher.angle + step, turned)
+        self._has_turned |= bool(step.any())
+        return _PublisherState(reading, publisher.angle + self._failing.replace(step), turned)
 
     def _corrected_step(self, known: JointReading, reading: JointReading, velocity: FloatArray) -> tuple[FloatArray, bool]:
         """(n,) increments where some are too large: of an angle that wrapped, or from the rates for one that was reset; whether one was."""
@@ -406,11 +407,58 @@ class JointsToWheels:
         return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:
-        if not self._is_working.all():
-            left, right = self._is_working[: self._left], self._is_working[self._left :]
-            return np.array([values[: self._left][left].mean(), values[self._left :][right].mean()])
-        numbers = values.tolist()
+        numbers = self._failing.fill(values).tolist()
         return np.array([sum(numbers[: self._left]) / self._left, sum(numbers[self._left :]) / (len(numbers) - self._left)])
+
+
+class FailingEncoders:
+    """Joints whose angles do not change while another wheel of their side turns: what that one turns is theirs, until they count again.
+
+    Wheels of a side are coupled by a chain or by the ground.
+    """
+
+    def __init__(self, left: int, n: int) -> None:
+        """Of ``n`` joints the first ``left`` are the left side's."""
+        self._sides = (np.arange(left), np.arange(left, n))
+        self._missing = np.zeros(n)  # what the others have turned on average since a joint last turned [rad]
+        self._idle = np.zeros(n)  # the sizes of their steps
+        self.joints: list[int] = []
+        """Those that fail now."""
+
+    def replace(self, step: FloatArray) -> FloatArray:
+        """Increments (n,) with those of failing joints replaced; where one is found, with what it has lost."""
+        is_turning = np.abs(step) > _STATIONARY_RAD
+        if not self.joints and (is_turning.all() or not is_turning.any()):
+            if is_turning.all():
+                self._missing[:] = self._idle[:] = 0.0
+            return step
+        found, before = step.copy(), frozenset(self.joints)
+        self.joints = []
+        for side in self._sides:
+            turning = [i for i in side if is_turning[i] and i not in before]
+            mean = float(step[turning].mean()) if turning else 0.0
+            for i in side:
+                if is_turning[i]:
+                    found[i] = mean if i in before and turning else step[i]  # counts again, from wherever
+                    self._missing[i] = self._idle[i] = 0.0
+                    continue
+                self._missing[i] += mean
+                self._idle[i] += abs(mean)
+                if self._idle[i] > _FROZEN_AFTER_RAD:
+                    self.joints.append(int(i))
+                    found[i] = mean if i in before else self._missing[i]
+        return found
+
+    def fill(self, values: FloatArray) -> FloatArray:
+        """``values`` (n,), those of failing joints replaced by the mean of the others of their side, where there are such."""
+        if not self.joints:
+            return values
+        found = values.copy()
+        for side in self._sides:
+            working = [i for i in side if i not in self.joints]
+            if working:
+                found[[i for i in side if i in self.joints]] = values[working].mean()
+        return found
 
 
 class OdometryToWheels:

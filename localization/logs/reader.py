@@ -33,7 +33,7 @@ from motion_models.se2 import FloatArray
 from motion_models.text_files import check_file
 
 _GPS = "/fix"
-_TF_READ_NS = 10_000_000_000  # of ROS 1, where static transforms are repeated every 0.1 to 1 s on /tf
+_TF_READ_NS = 10_000_000_000  # in ROS 1, and from simulators, fixed transforms are repeated every 0.1 to 1 s on /tf
 _TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
 _FIRST_READ_NS = 20_000_000_000  # of a topic, for its latency; a long log is not read to its end for one that is slow
 _POINTS_READ = 100  # first messages of a point that may be the centre of gravity
@@ -177,17 +177,23 @@ class Log:
             _try(lambda raw=raw: transforms.add(decode(raw), is_static=True))  # type: ignore[misc]
             if left == 0:
                 break
-        if self.source.is_ros1:
+        if self.source.is_ros1 or self._unmounted(transforms):
             moving = [channel.topic for channel in tf if not channel.topic.endswith("tf_static")]
             for raw in self.source.messages(moving) if moving else ():
                 if raw.log_ns > self.start_ns + _TF_READ_NS:
                     break
                 _try(lambda raw=raw: transforms.add(decode(raw), is_static=False))  # type: ignore[misc]
         found = transforms.mounts()
-        self._mount_notes = transforms.warnings()
+        self._mount_notes = [*transforms.warnings(), *transforms.describe_moving(self._unmounted(transforms))]
         for frame in transforms.contradictions().keys() & self.robot.mounts.keys():
             del found[frame]  # the robot file decides
         return self.robot.with_mounts(found)
+
+    def _unmounted(self, transforms: FixedTransforms) -> set[str]:
+        """Frames of sensors in use whose mounts neither the log's ``transforms`` so far nor the robot file have."""
+        used = {s.topic for s in (self.sources.lidar, self.sources.imu) if s is not None}
+        frames = {frame for topic, frame in self.frames.items() if topic in used and frame}
+        return frames - transforms.mounts().keys() - self.robot.mounts.keys()
 
     def damage(self) -> list[str]:
         """Warnings about which of its files could not be read, and how much could, so far."""

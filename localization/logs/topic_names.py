@@ -16,6 +16,14 @@ _BY_WHEELS = re.compile(r"wheel|encoder|diff_?drive|base_controller|velocity_con
 _MEASURED_OUTSIDE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack|vrpn|qualisys", re.IGNORECASE)
 
 
+_FORCES_ALONE = re.compile(r"accel|force|mag(?!ni)", re.IGNORECASE)
+
+
+def is_without_gyro(topic: str) -> bool:
+    """Whether an Imu has by its name no rates: cameras publish gyro and accelerometer on topics of their own, with zeros for the other."""
+    return bool(_FORCES_ALONE.search(topic))
+
+
 def is_other_estimate(topic: str) -> bool:
     """Whether an Odometry is by its name no driver's: ground truth, mocap, GPS, SLAM, or a filter's."""
     return bool(_OTHER_ESTIMATE.search(topic))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from localization.errors import TopicError
 from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
-from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate
+from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate, is_without_gyro
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.cg_model import CgModel
 from motion_models.center_of_gravity.files import arms_model
@@ -59,7 +59,7 @@ CHOSEN_BY = {
     "option": "given as an option",
     "robot": "named in the robot file",
     "only": "the only one of its type",
-    "names": "of several the wheels' by its name",
+    "names": "of several by its name",
     "points": "of several by name and place of its points",
     "arms": "the arms' joints",
 }
@@ -147,6 +147,10 @@ class TopicChooser:
         if topic is not None and len(topics) > 1:
             self.warnings.append(f"{topic} is used as {kind.replace('_', ' ')}: it is {wanted} in a namespace.")
             return TopicSource(topic, kind, "robot")
+        without_gyro = [other for other in self.of_type(TYPES[kind]) if is_without_gyro(other) and other not in topics]
+        if kind == "imu" and len(topics) == 1 and without_gyro:
+            self.warnings.append(f"{topics[0]} is used as imu: {', '.join(without_gyro)} by name without a gyro.")
+            return TopicSource(topics[0], kind, "names")
         by_wheels = [topic for topic in topics if is_by_wheels(topic)] if kind == "odometry" else []
         if len(by_wheels) == 1 and len(topics) > 1:
             others = ", ".join(other for other in topics if other != by_wheels[0])
@@ -161,6 +165,8 @@ class TopicChooser:
         """Topics of the matching type that no option names. What the run is scored against must not be what it is estimated from."""
         kept_out = {self._robot.topics.reference, self._overrides.reference}
         found = [topic for topic in self.of_type(TYPES[kind]) if topic not in kept_out]
+        if kind == "imu":
+            return [topic for topic in found if not is_without_gyro(topic)] or found
         return [topic for topic in found if kind != "odometry" or not is_other_estimate(topic)]
 
     def no_wheels(self) -> str:

@@ -85,6 +85,16 @@ class FixedTransforms:
         """Frames whose poses in the log contradict each other, as found by `mounts`, with a sentence about each."""
         return dict(self._contradictions)
 
+    def describe_moving(self, frames: Iterable[str]) -> list[str]:
+        """Sentences about those of ``frames`` that move against the body, such as a LiDAR's on a pan joint."""
+        moving = {child: parent for parent, child in self._moving if parent not in _WORLDS}
+        return [
+            f"/tf: '{frame}' moves against '{moving[frame]}' (a pan joint?): its data are taken as of a fixed one. Fix the joint, or leave"
+            f" its sensor out by an empty --topic option."
+            for frame in sorted(frames)
+            if frame in moving
+        ]
+
     def warnings(self) -> list[str]:
         """Sentences about transforms that could not be used, or that contradict each other."""
         return [*self._contradictions.values(), *self._no_rotations.values()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 
@@ -69,6 +70,17 @@ def test_units_of_counters_of_16_bits_lose_no_motion(tmp_path: Path) -> None:
     turned = [event.position for event in log.events() if isinstance(event, WheelSample)]
     whole = [event.position for event in open_log(CASES / "base-log" / "log.mcap", ROBOT).events() if isinstance(event, WheelSample)]
     np.testing.assert_allclose(turned[-1] - turned[0], whole[-1] - whole[0], rtol=0.1)
+
+
+def test_units_of_positions_that_are_reset_once_are_no_counter(tmp_path: Path) -> None:
+    """The driver starts anew half way."""
+
+    numbers = itertools.count()
+
+    def reset(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (position - 30.0 if next(numbers) > 500 else position), velocity
+
+    assert report_of(drive(tmp_path / "log.mcap", reset)).findings == ()
 
 
 def test_units_of_gyro_in_degrees_are_corrected(tmp_path: Path) -> None:

@@ -80,13 +80,24 @@ def test_scan_nan_limits_are_unlimited_and_nan_angle_is_malformed(tmp_path: Path
     assert any("/scan: 1 message dropped" in note for note in log.warnings())
 
 
-@pytest.mark.parametrize(("beam_s", "count"), [(1e30, 0), (-1e30, 0), (np.inf, 0), (1.1, 0), (0.9, 1), (np.nan, 1)])
-def test_scan_that_lasts_seconds_is_malformed(tmp_path: Path, beam_s: float, count: int) -> None:
-    """NaN is no time, and the scan one without times."""
+@pytest.mark.parametrize("beam_s", [1e30, -1e30, np.inf])
+def test_scan_of_endless_sweep_is_malformed(tmp_path: Path, beam_s: float) -> None:
     scans, log = scans_of(tmp_path, [bags.laser_scan(START, [2.0, 3.0], time_increment=beam_s)])
-    assert len(scans) == count
-    assert log.warnings() == ["/scan: 1 message dropped (fields that contradict each other)."] * (1 - count)
-    assert [len(scan.offsets) for scan in scans] == [0 if np.isnan(beam_s) else 2] * count
+    assert scans == []
+    assert log.warnings() == ["/scan: 1 message dropped (fields that contradict each other)."]
+
+
+@pytest.mark.parametrize(
+    ("sweep_s", "wanted_s", "word"),
+    [(0.07, 0.07, ""), (np.nan, 0.0, ""), (-0.1, -0.1, ""), (70.0, 0.07, "scaled"), (-5e4, -0.05, "scaled"), (1.0, 0.0, "left out")],
+)
+def test_scan_sweep_longer_than_its_period_is_scaled_or_left_out(tmp_path: Path, sweep_s: float, wanted_s: float, word: str) -> None:
+    """Milliseconds and microseconds are known by the period, a tenth of a second too many is none; NaN is no time."""
+    messages = [bags.laser_scan(START + i * S // 10, np.full(50, 2.0), angle_increment=0.1, time_increment=sweep_s / 50) for i in range(12)]
+    scans, log = scans_of(tmp_path, messages)
+    assert len(scans) == 12
+    assert {round(float(scan.offsets[-1]), 4) if len(scan.offsets) else 0.0 for scan in scans} == {round(wanted_s * 49 / 50, 4)}
+    assert [word in note for note in log.warnings()] == [True] * bool(word)
 
 
 def test_scan_directions_follow_a_changed_angle_increment(tmp_path: Path) -> None:
@@ -317,6 +328,27 @@ def test_wheel_angles_after_encoder_reset_lose_one_increment(tmp_path: Path) -> 
     log = log_of(tmp_path, "/joint_states", messages)
     np.testing.assert_allclose([w.position for w in wheels_of(log)], 0.2 * np.arange(40)[:, None] * [1, 1], atol=1e-12)
     assert any("/joint_states: 1 message with a wheel angle" in note for note in log.warnings())
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan], ids=["frozen", "NaN"])
+def test_wheel_encoder_that_fails_on_the_way_is_left_out(tmp_path: Path, value: float) -> None:
+    """Of four, for five of twenty seconds; the wheels of a side turn unlike each other, and where it counts again it begins at zero."""
+    i = np.arange(400)
+    angle = 0.1 * i[:, None] * [1.0, 1.2, 1.1, 1.3]
+    fails, again = (i >= 100) & (i < 200), i >= 200
+    angle[:, 0] = np.where(fails, angle[99, 0] if value == 0.0 else value, np.where(again, 0.1 * (i - 200), angle[:, 0]))
+    rates = np.where(fails[:, None] & (np.arange(4) == 0), value, 2.0 * np.array([1.0, 1.2, 1.1, 1.3]))
+    messages = [bags.joint_state(START + k * S // 20, position=angle[k], velocity=rates[k]) for k in i]
+    log = log_of(tmp_path, "/joint_states", messages, S // 20)
+    wheels = wheels_of(log)
+    left = np.diff([sample.position[0] for sample in wheels])
+    lost = round(0.5 / 0.11)
+    np.testing.assert_allclose(left[:98], 0.105)
+    np.testing.assert_allclose(left[100 + lost + 1 : 199], 0.11)
+    np.testing.assert_allclose(left[201:], 0.105)
+    assert left[98:201].sum() == pytest.approx(0.11 * 103, abs=0.02)  # what was lost until it was found is made good
+    assert wheels[150].velocity[0] == pytest.approx(2.2)
+    assert any("joint 'front_left_wheel'" in note and "left out" in note for note in log.warnings())
 
 
 WILD = "/joint_states: 4 messages with rates that wheels cannot reach; these were left out."

@@ -293,3 +293,39 @@ def test_tilt_in_info_is_by_the_imu_and_takes_clouds_to_space(tmp_path: Path) ->
 
 def test_tilt_in_info_without_an_imu_says_what_is_missing(tmp_path: Path) -> None:
     assert inspect_log(log_of(tmp_path, {"/joint_states": "joints", "/scan": "scan"})).tilt.startswith("not available: there is no IMU")
+
+
+def test_topic_of_the_gyro_is_the_imu_beside_an_accelerometer(tmp_path: Path) -> None:
+    """Cameras publish both as Imu, each with zeros for the other; an accelerometer alone is used for gravity."""
+    log = log_of(tmp_path, {"/joint_states": "joints", "/camera/accel/sample": "imu", "/camera/gyro/sample": "imu"})
+    assert log.sources.imu is not None
+    assert log.sources.imu.topic == "/camera/gyro/sample"
+    assert "/camera/gyro/sample is used as imu: /camera/accel/sample by name without a gyro." in log.warnings()
+    (tmp_path / "alone").mkdir()
+    alone = log_of(tmp_path / "alone", {"/joint_states": "joints", "/camera/accel/sample": "imu"})
+    assert alone.sources.imu is not None
+    assert alone.sources.imu.topic == "/camera/accel/sample"
+
+
+def _with_tf(tmp_path: Path, yaws: list[float]) -> Log:
+    """Scans whose frame is on /tf alone."""
+    stamps = [START + i * S // 10 for i in range(20)]
+    records: list[Record] = [("/joint_states", make(stamp, "joints"), stamp) for stamp in stamps]
+    records += [("/scan", make(stamp, "scan"), stamp) for stamp in stamps]
+    edges = [("odom", "base_link", (1.0, 0.0, 0.0), bags.quaternion())]
+    for i, stamp in enumerate(stamps):
+        laser = ("base_link", "laser", (0.2, 0.0, 0.4), bags.quaternion(yaws[i % len(yaws)]))
+        records.append(("/tf", bags.tf(stamp, [*edges, laser]), stamp))
+    return open_log(bags.write_mcap(tmp_path / "run.mcap", sorted(records, key=lambda r: r[2])), ROBOT)
+
+
+def test_mount_on_tf_alone_is_used(tmp_path: Path) -> None:
+    log = _with_tf(tmp_path, [0.3])
+    assert (log.mounts["laser"].x, round(log.mounts["laser"].yaw, 6)) == (0.2, 0.3)
+    assert not any("/tf" in note for note in log.warnings())
+
+
+def test_mount_that_moves_is_named(tmp_path: Path) -> None:
+    log = _with_tf(tmp_path, [0.3, 0.4])
+    assert "laser" not in log.mounts
+    assert any("'laser' moves against 'base_link'" in note for note in log.warnings())

@@ -236,10 +236,11 @@ def initialized(
 def main(arguments: Sequence[str]) -> None:
     """Judge those that are named, by default all."""
     from tests.studies.entrance_command_cases import CASES
+    from tests.studies.entrance_hostile_cases import HOSTILE
 
     wanted = [a for a in arguments if not a.startswith("-")]
     found = []
-    for case in (c for c in CASES if not wanted or any(w == c.kind or w in c.name for w in wanted)):
+    for case in (c for c in (*HOSTILE, *CASES) if not wanted or any(w == c.kind or w in c.name for w in wanted)):
         with tempfile.TemporaryDirectory() as folder:
             try:
                 one = case.judge(Path(folder))
