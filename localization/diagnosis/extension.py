@@ -229,11 +229,11 @@ def _without(drive: Drive, predictor: DrivePredictor, removed: FloatArray) -> Dr
     gyro = drive.gyro
     if gyro is not None and removed[:, 3].any():
         seconds = predictor.window_times_s[1] - predictor.window_times_s[0]
-        gyro = _CorrectedGyro(gyro, drive.spans_ns, removed[:, 3] / seconds)
+        gyro = CorrectedGyro(gyro, drive.spans_ns, removed[:, 3] / seconds)
     return dataclasses.replace(drive, maneuvers=tuple(motions), forces=forces, gyro=gyro)
 
 
-class _CorrectedGyro(GyroRecord):
+class CorrectedGyro(GyroRecord):
     """The record of a gyro less ``rates`` (W,) [rad/s] in the ``spans_ns`` (W, 2)."""
 
     def __init__(self, inner: GyroRecord, spans_ns: IntArray, rates: FloatArray) -> None:

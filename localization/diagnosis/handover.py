@@ -204,7 +204,9 @@ def _compared_rows(before: FloatArray, after: FloatArray, sigmas: FloatArray, we
     squares = [np.sum(np.nan_to_num(r[:, changed] * scale) ** 2, axis=1) for r in (before, after)]
     first, second = (s / max(float(squares[0].mean()), 1e-12) for s in squares)
     gain = root_mean_gain(first, second, np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
-    return HandoverCheck(before_rms, after_rms, len(before), gain)
+    old, change = (np.nan_to_num(r[:, changed] * scale) for r in (before, before - after))
+    whole = max(float(np.sum(change**2)), 1e-12)
+    return HandoverCheck(before_rms, after_rms, len(before), gain, shown=(float(np.sum(change * old)) / whole, whole**-0.5))
 
 
 def _root_mean(squares: FloatArray, weights: FloatArray) -> float:

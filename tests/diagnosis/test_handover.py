@@ -30,3 +30,19 @@ def test_check_findings_jump_of_the_reference_does_not_decide() -> None:
     assert found.is_better
     assert found.after["x"] < 0.5 * found.before["x"]
     assert found.after["x"] == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("larger", "is_better"), [(0.02, True), (0.0, False)])
+def test_check_findings_change_of_few_windows_counts_by_noise(larger: float, is_better: bool) -> None:
+    """Wheels 2 % larger on a robot that stands in 10 of the 12 windows held out: these scatter by as much as the others gain."""
+    drive = law_drive("husky_a200")
+    standing = [m if i % 12 < 2 else dataclasses.replace(m, wheels=np.zeros_like(m.wheels)) for i, m in enumerate(drive.maneuvers)]
+    model = make_model("friction", drive.robot)
+    true = Hypothesis(left_radius_scale=larger, right_radius_scale=larger)
+    measured = measured_under(dataclasses.replace(drive, maneuvers=tuple(standing)), model, true, np.random.default_rng(1))
+    predictor = DrivePredictor(measured, model, has_inertia=False)
+    state = linearize(predictor, (CAUSES["wheel_radius_scale"],), {}, TOLERANCE)
+    found = check_findings(predictor, state, ["wheel_radius_scale"])
+    assert found is not None
+    assert found.gain.low <= 0.0
+    assert found.is_better == is_better

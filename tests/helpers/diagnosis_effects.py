@@ -10,6 +10,7 @@ import numpy as np
 
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.drive import Drive, path_of
+from localization.diagnosis.extension import CorrectedGyro
 from localization.diagnosis.linearization import make_predictor
 from localization.events import Event, ImuSample
 from localization.logs import Log
@@ -39,18 +40,22 @@ Effect = Callable[[Motion], tuple[Any, Any, Any]]
 
 
 def hide(drive: Drive, effect: Effect) -> Drive:
-    """``drive`` as its reference measures it where the robot's twist is changed by ``effect``; its noise stays."""
+    """``drive`` as its reference and its gyro measure it where the robot's twist is changed by ``effect``; their noise stays."""
     predictor = make_predictor(drive, make_model("friction" if drive.robot.drive != "diff_drive" else "diff_drive", drive.robot))
     batch, twist = predictor.batch, predictor.corrected_twist(Hypothesis())
     motion = _motion(drive, twist, predictor.times_s)
     added = np.column_stack([np.broadcast_to(np.asarray(part, dtype=float), len(twist)) for part in effect(motion)])
-    maneuvers = []
+    maneuvers, turned = [], np.zeros(len(drive.maneuvers))
     for w, m in enumerate(drive.maneuvers):
         inside = slice(batch.first[w] + batch.lead[w], batch.first[w] + batch.lead[w] + int(m.ends[-1]))
         dt = batch.dt[inside, None]
         before, after = (path_of(t[inside] * dt)[m.ends - 1] for t in (twist, twist + added))
         maneuvers.append(dataclasses.replace(m, measured=se2.compose(m.measured, se2.between(before, after))))
-    return dataclasses.replace(drive, maneuvers=tuple(maneuvers))
+        turned[w] = added[inside, 2] @ batch.dt[inside]
+    gyro = drive.gyro
+    if gyro is not None and turned.any():
+        gyro = CorrectedGyro(gyro, drive.spans_ns, -turned / (1e-9 * np.diff(drive.spans_ns, axis=1)[:, 0]))
+    return dataclasses.replace(drive, maneuvers=tuple(maneuvers), gyro=gyro)
 
 
 def _motion(drive: Drive, twist: FloatArray, times_s: FloatArray) -> Motion:
