@@ -40,6 +40,8 @@ _MIN_COHERENCE = 0.9
 _MAX_SLIDE_RAD = math.radians(20.0)
 """Largest angle between the ways by wheels and LiDAR that a slide explains [rad], as in the sensor check of the direction of travel: no
 slide of 99.9 % of the windows of three buildings is larger."""
+_MIN_PART = 0.15
+"""Smallest part of the way on each side of a change of the mount."""
 _SNAP_RAD = math.radians(4.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that."""
 _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
@@ -191,6 +193,12 @@ class LidarCheck:
             return None if direction is None else self._upside_down(frame, direction)
         if direction is None or abs(direction) <= _MAX_SLIDE_RAD:
             return None
+        if (turned_rad := _largest_change(by_wheels, by_scans)) > _MAX_SLIDE_RAD:
+            text = (
+                f"{self._topic}: its scans travel {math.degrees(turned_rad):.0f} deg apart before and after some point of the first"
+                f" {np.abs(by_wheels).sum():.1f} m: '{frame}' was turned on the way (a bump, a loose mount, a pan joint). Fix its mount."
+            )
+            return LidarFinding(text, frame, None)
         direction, is_quarter = _snapped(direction)
         yaw = math.remainder(mount.yaw - direction, math.tau)
         side = "backwards" if abs(abs(direction) - math.pi) < _SNAP_RAD else f"{abs(math.degrees(direction)):.0f} deg to the "
@@ -318,6 +326,15 @@ def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
     if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < _MIN_COHERENCE * size:
         return None
     return float(np.angle(product.sum()))
+
+
+def _largest_change(by_wheels: FloatArray, by_scans: FloatArray) -> float:
+    """Largest angle between the directions of the LiDAR's travel before and after any of the intervals (n,) [rad]."""
+    product = by_scans * by_wheels.conj()
+    size, before = np.cumsum(np.abs(product)), np.cumsum(product)
+    is_inside = (size > _MIN_PART * size[-1]) & (size < (1.0 - _MIN_PART) * size[-1])
+    changes = np.abs(np.angle(before * (before[-1] - before).conj()))
+    return float(changes[is_inside].max(initial=0.0))
 
 
 def _snapped(direction: float) -> tuple[float, bool]:

@@ -45,6 +45,8 @@ _MAX_CLOCK_S = 10.0
 """Largest offset between the clocks of wheels and gyro that is searched [s]; beyond, clocks are set by the times of recording."""
 _MAX_UNSHIFTED = 0.85
 """Correlation without an offset below which one is searched: whole drives of healthy logs have 0.95 and more."""
+_MIN_TURN_PART = 1e-3
+"""Least root mean square of the sides' difference, of the largest of all wirings'."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -422,8 +424,11 @@ def _alternatives(signals: WheelSignals, base: Wiring) -> list[Wiring]:
 def _best(signals: WheelSignals, rates: FloatArray, wirings: Sequence[Wiring]) -> list[Wiring]:
     """Wirings of the fewest changes with which every source agrees."""
     fitting = []
-    for wiring in wirings:
+    turns = np.array([np.sqrt(np.nanmean(np.r_[0.0, _signed(rates, wiring)[1]] ** 2)) for wiring in wirings])
+    for wiring, turn in zip(wirings, turns, strict=True):
         measured = correlations(signals, rates, wiring)
+        if turn < _MIN_TURN_PART * turns.max():  # sides that always turn alike, up to rounding
+            continue
         if measured and min(measured.values()) >= _SURE_CORRELATION and _agreement(rates, wiring) >= _MIN_AGREEMENT:
             fitting.append(wiring)
     fewest = min((wiring.changes for wiring in fitting), default=0)
@@ -473,8 +478,11 @@ def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, meas
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     after = correlations(signals, signals.joint_rates, wiring)
     entries = "; ".join(f"{key} = {value}" for key, value in keys.items())
+    what = wiring.text
+    if len(wiring.reversed) == len(names) and "speed by the LiDAR" in measured:
+        what += " (or left and right are swapped and the LiDAR looks backwards: only the robot's front tells)"
     text = (
-        f"{wheels}: {wiring.text}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
+        f"{wheels}: {what}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
         f" so. {CORRECTED} {entries}."
     )
     return WiringReport(robot, (text,), keys, correlations=measured)

@@ -41,7 +41,8 @@ class Standstill:
     """Such wheels count as unknown, for as long as that lasts.
 
     Objects that move around a standing robot look like its own motion. Where there is a gyro or an IMU, one must confirm the LiDAR, once
-    until the wheels turn again.
+    until the wheels turn again. Wheels that have never turned, though gyro or LiDAR showed motion, are unknown until they do: encoders that
+    count nothing show no standstill either.
     """
 
     def __init__(self, faults: FaultLog, window: Window, config: StepConfig) -> None:
@@ -50,6 +51,8 @@ class Standstill:
         self._stood_s = 0.0  # time for which the wheels read zero
         self._turned_s = 0.0  # the same, while the gyro turns
         self._is_confirmed = False  # that the robot moved meanwhile, by gyro or IMU
+        self._have_turned = False  # the wheels, so far
+        self._is_dead = False  # wheels that have not, while the robot moved
         self._rested_s = 0.0  # the same, while gyro and IMU are at rest too
         self._trusted_s = 0.0  # the same, as far as it counted as standing and no scan has measured the pose since
 
@@ -60,6 +63,8 @@ class Standstill:
     def apply(self, step: Step, *, is_contradicted: bool) -> Step:
         """``step`` with unknown wheels where these ``is_contradicted``, or stand while another sensor shows motion."""
         if not step.is_standing:
+            self._have_turned |= step.has_wheels and bool(step.predicted.delta.any())
+            self._is_dead &= not self._have_turned
             self._turned_s = self._stood_s = self._trusted_s = self._rested_s = 0.0
             self._is_confirmed = False
             if is_contradicted and step.has_wheels:
@@ -76,7 +81,8 @@ class Standstill:
             besides = _OR_OBJECTS if moving == _LIDAR_MOVED and not self._is_confirmed else ""
             numbers = {"others": moving or "the gyro turned", "besides": besides}
             self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, numbers)
-        if not contradicted_s:
+            self._is_dead |= not self._have_turned and (self._is_confirmed or self._turned_s >= _MIN_TURNING_S)
+        if not contradicted_s and not self._is_dead:
             self._trusted_s += step.duration
             self._velocity.lasted_s = 0.0
             self._rested_s = self._rested_s + step.duration if self._is_at_rest(step) else 0.0

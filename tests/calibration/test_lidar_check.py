@@ -12,7 +12,7 @@ import pytest
 from localization.calibration.lidar_check import check_lidar, corrected, open_log_checked
 from localization.evaluation.references import reference_track
 from localization.evaluation.scores import score
-from localization.events import ImuSample, WheelSample
+from localization.events import ImuSample, Scan, WheelSample
 from localization.log_replay import replay
 from localization.logs import Log, open_log
 from localization.pipeline import Trial
@@ -65,6 +65,21 @@ def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
 @pytest.mark.parametrize("degrees", [0.0, 10.0, -10.0])
 def test_lidar_yaw_that_slides_explain_is_kept(degrees: float) -> None:
     assert check_lidar(turned(opened(), degrees)) is None
+
+
+def test_lidar_that_is_turned_on_the_way_is_named_and_not_corrected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By 40 deg after 5 s: no mount is right for the whole drive."""
+    log = turned(opened(), 0.0)
+    events = list(log.events())
+    c, s = math.cos(math.radians(40.0)), math.sin(math.radians(40.0))
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    bump_ns = events[0].stamp_ns + 5_000_000_000
+    bumped = [dataclasses.replace(e, points=e.points @ R) if isinstance(e, Scan) and e.stamp_ns > bump_ns else e for e in events]
+    monkeypatch.setattr(log, "events", lambda: iter(bumped))
+    found = check_lidar(log)
+    assert found is not None
+    assert "was turned on the way" in found.text
+    assert not found.is_corrected
 
 
 def test_lidar_yaw_of_a_healthy_drive_is_kept() -> None:

@@ -66,6 +66,18 @@ def test_wiring_with_axles_for_sides_is_corrected(tmp_path: Path) -> None:
     assert {*report.robot.joints.left} == {LEFT[0], RIGHT[0]}
 
 
+def test_wiring_of_axles_that_turn_alike_is_no_alternative(tmp_path: Path) -> None:
+    """Left and right swapped, the wheels of a side equal up to rounding: front against rear is no turn."""
+
+    def swap(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        order = np.array([2, 2, 0, 0])
+        return position[order], velocity[order] * [1.0, 1.0 + 1e-15, 1.0, 1.0 + 1e-15]
+
+    report = report_of(drive(tmp_path / "log.mcap", swap, has_odometry=True))
+    assert not report.is_ambiguous
+    assert report.robot.joints.left == RIGHT
+
+
 def test_wiring_with_gyro_opposite_is_corrected_by_odometry(tmp_path: Path) -> None:
     report = report_of(drive(tmp_path / "log.mcap", gyro=-1.0, has_odometry=True))
     assert (report.robot.imu.rate_unit_rad_s, report.robot.joints) == (-1.0, ROBOT.joints)

@@ -58,6 +58,19 @@ def test_lidar_stays_confirmed_until_the_wheels_turn() -> None:
     assert not any(step.has_wheels for step in robot.applied[-40:])
 
 
+@pytest.mark.parametrize("moved_s", [0.0, 1.0])
+def test_wheels_that_never_turned_show_no_standstill(moved_s: float) -> None:
+    """The robot turns, then the gyro is still. Those that have turned before do."""
+    robot = CheckedDrive(has_scans=False, gyro=lambda w: w)
+    robot.drive(moved_s)
+    robot.wheels, robot.gyro = lambda v, w: (0.0, 0.0), lambda w: 0.3
+    robot.drive(2.0)
+    robot.gyro = lambda w: 0.0
+    robot.drive(2.0)
+    assert WHEELS_STANDING in robot.checks.found
+    assert robot.applied[-1].has_wheels == bool(moved_s)
+
+
 @pytest.mark.parametrize("gyro", [None, lambda w: 0.0], ids=["no gyro", "a gyro that repeats zero"])
 def test_lidar_without_another_sensor_has_both_explanations(gyro) -> None:
     checks = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=gyro).drive(8.0)
