@@ -208,7 +208,7 @@ class MapFusion(FilteredOdometry):
         places = [] if self.localizer.state == "localized" else self.localizer.hypotheses[:_LISTED_PLACES]
         return {
             "state": self.localizer.state,
-            "probability": self.localizer.probability,
+            "probability": self.localizer.probability_after(*self._motion_since_keyframe()),
             "pose": self.localizer.pose.tolist(),
             **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
             "is_outside": self._is_outside,

@@ -12,7 +12,7 @@ from localization.maps.grid import Grid
 from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.space_map import SpaceMap
 
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+_OCCUPIED, _FREE, UNKNOWN = 0, 254, 205
 """Grey values of map_server and nav2."""
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of (255 - grey) / 255, for readers of the image. map_server's 0.196, and not nav2's 0.25: by that, 205 (0.1961) would be read
@@ -33,7 +33,7 @@ def exports(grid: Grid, mapped: KeyframeMap | SpaceMap) -> dict[str, bytes]:
 
 def _image(grid: Grid) -> NDArray[np.uint8]:
     """(H, W) grey values; the first row has the largest y."""
-    image = np.full(grid.cells.shape, _UNKNOWN, np.uint8)
+    image = np.full(grid.cells.shape, UNKNOWN, np.uint8)
     image[grid.cells == 100] = _OCCUPIED
     image[grid.cells == 0] = _FREE
     return np.ascontiguousarray(image[::-1])

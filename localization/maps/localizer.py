@@ -77,6 +77,10 @@ _STAYED_M, _STAYED_RAD = 1.0, 0.8
 a thousand times."""
 _INDEPENDENT_M = 1.0
 """Way between the first and the last of the scans that are searched, from which on they are more than the same view again [m]."""
+_ONE_VIEW = 0.98
+"""Probability from which on one view of a place is enough to track it, in a search of the whole map: after the robot was carried in
+three logs, 34 of 93 views have more, and all are right; of the wrong ones none has more than 0.26, and of 164 searches in maps of other
+buildings none more than 0.81."""
 _INITIAL_KEYFRAMES = 10
 """Keyframes after which a given pose that no scan confirms is dropped."""
 INITIAL_COV = np.diag([0.5, 0.5, 0.26]) ** 2
@@ -106,10 +110,11 @@ class Localizer:
         """Places that a search found, the most probable first."""
         self._initial_left = 0
         self._is_doubtful = False  # the last scan does not fit, as the first one does after the robot was carried unnoticed
+        self._is_one_view = False  # the place was taken by one view, and the robot has not left it
         self.is_outside = False
         """Whether most of the last scan is where the map has nothing: the tracked pose is by odometry meanwhile."""
         self._is_reckoned = False  # the pose is by odometry since it was tracked, and was not refuted
-        self._searched_m, self._since_search = 0.0, np.zeros((3, 3))
+        self._searched_m, self._is_whole_searched, self._since_search = 0.0, False, np.zeros((3, 3))
         self._failures, self._wait = 0, 0
         self._fix: PositionFix | None = None
         self._running: BackgroundSearch | None = None
@@ -136,9 +141,14 @@ class Localizer:
     @property
     def probability(self) -> float:
         """That the robot is within 0.5 m and 0.2 rad of `pose`; while it is searched, that it is at the first of `hypotheses`."""
+        return self.probability_after(np.zeros(3), np.zeros((3, 3)))
+
+    def probability_after(self, delta: Pose2, cov: Cov3) -> float:
+        """`probability` when the robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) since the last keyframe."""
         if self.state != "localized":
             return sigmoid(self._search_odds)
-        probability = sigmoid(self._track_odds) * _within(self._cov)
+        A = se2.adjoint(se2.inverse(delta))
+        probability = sigmoid(self._track_odds) * _within(A @ self._cov @ A.T + cov)
         return min(probability, LIKELY) if self._is_doubtful else probability
 
     @property
@@ -215,8 +225,9 @@ class Localizer:
             of_again = self._evidence(again, wide)
             if of_again >= _FITTING:
                 place, cov, evidence = again, wide, of_again
-        self._is_doubtful = evidence < _FITTING
-        self._track_odds = min(self._track_odds + evidence, _MAX_LOG_ODDS)
+        self._is_one_view &= evidence < _FITTING or self._recent.way_m < _INDEPENDENT_M
+        self._is_doubtful = evidence < _FITTING or self._is_one_view
+        self._track_odds = min(self._track_odds + evidence, log_odds(LIKELY) if self._is_one_view else _MAX_LOG_ODDS)
         self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
         if self.state == "localized" and sigmoid(self._track_odds) < _LOST:
             self._lose(points)
@@ -275,7 +286,7 @@ class Localizer:
         self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
         is_near = self._initial_left > 0 or (self._is_reckoned and self.state == "searching")
         near = (self.pose, _three_sigma(self._cov)) if is_near else self._near_fix()
-        is_by_fix = near is not None and not is_near
+        is_by_fix, self._is_whole_searched = near is not None and not is_near, near is None
         if self._initial_left:
             self._initial_left -= 1
             self._cov = self._cov if self._initial_left else np.zeros((3, 3))
@@ -294,7 +305,7 @@ class Localizer:
 
     def _conclude(self, places: Sequence[Place], n_points: int, is_by_fix: bool, moved: Pose2, moved_cov: Cov3) -> None:
         """Take the best of ``places``, which ``n_points`` have found before the robot ``moved`` (3,), if it is probable and the search
-        before agrees."""
+        before agrees, or if nothing else in the map is like it: then the probability is at most `LIKELY` until scans from elsewhere fit."""
         before, since_cov = self.hypotheses, self._since_search
         self._since_search = moved_cov
         found = [replace(place, pose=se2.compose(place.pose, moved)) for place in weigh(places, n_points, self._weights, is_by_fix)]
@@ -306,14 +317,17 @@ class Localizer:
         is_repeated = self._searched_m >= _INDEPENDENT_M and any(_agree(place.pose, best.pose, since_cov) for place in before)
         A = se2.adjoint(se2.inverse(moved))
         cov = np.asarray(A @ (best.cov + _BEND) @ A.T + moved_cov)
-        is_confirmed = (is_repeated or self._is_reckoned_at(best.pose)) and self._is_fitting(best.pose, cov)
+        is_fitting = self._is_fitting(best.pose, cov)
+        is_confirmed = (is_repeated or self._is_reckoned_at(best.pose)) and is_fitting
+        is_unmistakable = self._is_whole_searched and best.probability >= _ONE_VIEW and is_fitting
         probability = best.probability if is_confirmed else min(best.probability, LIKELY)
         self.hypotheses = [replace(best, probability=probability), *self.hypotheses[1:]]
         self._search_odds = log_odds(probability)
         if probability >= _PROMISING:
             self._failures = self._wait = 0
-        if is_confirmed and probability >= LIKELY and is_narrow(best.cov):
+        if (is_confirmed or is_unmistakable) and probability >= LIKELY and is_narrow(best.cov):
             self._begin_tracking(best.pose, cov)
+            self._is_doubtful = self._is_one_view = not is_confirmed
 
     def _is_fitting(self, pose: Pose2, cov: Cov3) -> bool:
         """Whether the last scan alone fits at ``pose`` (3,), with covariance ``cov`` (3, 3): the scans of a way may fit together where that
