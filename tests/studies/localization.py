@@ -7,8 +7,8 @@ mapped starts that are localized. *Reliability*: of all
 keyframes by the probability that was given, and of all searches by weights that were fitted to the other buildings. *Drives*: the second
 half of each log, replayed in the map of the first, and the reverse; errors while the state is localized, where the map has most of the
 walls and outside of it, where the pose is by odometry. *Carried*: the same drives with cuts; times count from where the scan
-at the true pose is mapped, with ten seconds of the log left: a place that the map does not have cannot be found. Those of driving leave out
-how long the robot stands: until it has driven 1 m, its scans are one view of the place.
+at the true pose is mapped, ten seconds or more before the next cut or the end: a place that the map does not have cannot be found. Those
+of driving leave out how long the robot stands: until it has driven 1 m, its scans are one view of the place.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _CYCLE_S, _KEPT_S = 70.0, 40.0
 _DRIVING, _MAX_STEP_S = 0.05, 1.0
 """The robot drives where its speed or its turn is faster [m/s, rad/s]; and a step at most [s], of what is not cut out."""
 _FOUND_WITHIN_S = 10.0
-"""A carried robot shall be found within this time [s]. A cut that is nearer than that to the log's end counts only if it is found."""
+"""A carried robot shall be found within this time [s]. A cut with less time on mapped ground counts only if it is found."""
 
 
 @dataclass(frozen=True)
@@ -168,30 +168,32 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
     estimator = pipeline.estimator
     assert isinstance(estimator, MapFusion)
     cut, mapped, found_after, wrong_s, n, cycle, scans = None, None, [], 0.0, 0, -1, keyframes.scans()
-    now, last_ns = np.zeros(2), 0  # time of the log and of driving [s]
+    now, last_ns, localized = np.zeros(2), 0, None  # time of the log and of driving [s], and since when the robot is localized
     for event in drive.events:
         now[0] = (event.stamp_ns - begin) * 1e-9
         if not begin <= event.stamp_ns <= end or now[0] % _CYCLE_S > _KEPT_S:
             continue
         if now[0] // _CYCLE_S != cycle:
             cycle = now[0] // _CYCLE_S
-            cut, mapped = now.copy() if cycle > 0 else None, None
+            cut, mapped, localized = now.copy() if cycle > 0 else None, None, None
         for estimate in pipeline.process(event):
-            now[1] += min((estimate.stamp_ns - last_ns) * 1e-9, _MAX_STEP_S) if np.abs(estimate.twist).max() > _DRIVING else 0.0
-            last_ns = estimate.stamp_ns
+            is_driving = np.abs(estimate.twist).max() > _DRIVING and (estimate.stamp_ns - begin) * 1e-9 % _CYCLE_S <= _KEPT_S
+            now[1] += min((estimate.stamp_ns - last_ns) * 1e-9, _MAX_STEP_S) if is_driving else 0.0
+            last_ns, is_localized = estimate.stamp_ns, estimator.localizer.state == "localized"
+            localized = (now.copy() if localized is None else localized) if is_localized else None
             k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
             if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or cut is None:
                 continue
-            has_time = now[0] + _FOUND_WITHIN_S <= (end - begin) * 1e-9
-            if mapped is None and has_time and places.align(scans[k], keyframes.poses[k]).score >= MAPPED_SCORE:
+            left = min(_KEPT_S - now[0] % _CYCLE_S, (end - begin) * 1e-9 - now[0])
+            if mapped is None and left >= _FOUND_WITHIN_S and places.align(scans[k], keyframes.poses[k]).score >= MAPPED_SCORE:
                 mapped, n = now.copy(), n + 1
-            if estimator.localizer.state != "localized":
+            if localized is None:
                 continue
             is_right = off(keyframes.poses[k], estimate.pose)[1]
             wrong_s = max(wrong_s, 0.0 if is_right else now[0] - cut[0])
             if is_right:
                 n += mapped is None
-                found_after.append(now - (cut if mapped is None else mapped))
+                found_after.append(np.maximum(localized - (cut if mapped is None else mapped), 0.0))
                 cut = None
     after = np.array(found_after).reshape(-1, 2)
     times = [f"{np.median(column):.1f} / {np.quantile(column, 0.9):.1f}" if len(after) else "-" for column in after.T]
