@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Gravity, ImuSample
+from localization.ground_curvature import GroundCurvature
 from localization.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
@@ -76,6 +77,8 @@ class Tilt:
     """(2,) at its end."""
     cov: FloatArray
     """(2, 2) of both, by the attitude, the mount, friction and the CG's height."""
+    twist: float = 0.0
+    """Twist of the ground, the second derivative of its height by x and y in the body's axes [1/m]."""
 
     def at(self, shares: FloatArray) -> FloatArray:
         """(n, 2) at ``shares`` (n,) of the step, 0 to 1."""
@@ -127,7 +130,7 @@ class AttitudeFilter:
         self._sums = _Sums(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.zeros((6, 6)), np.zeros(7), np.zeros(3), np.zeros(4))
         self._split, self._split_cov = np.zeros(4), np.diag([_MOUNT_SIGMA**2] * 2 + [_GROUND_SIGMA**2] * 2)
         self._has_started, self._tilts = False, False
-        self._downhill = np.zeros(2)
+        self._downhill, self._curvature = np.zeros(2), GroundCurvature()
         self.gravity: Gravity | None = None
         """By the window that ended in the last `advance`; None where none did."""
 
@@ -224,7 +227,7 @@ class AttitudeFilter:
         if not self._n or self._problem:
             return None
         wheels = np.ascontiguousarray(dt_s), np.ascontiguousarray(rates)
-        before, left = self._n, self._last_ns
+        before, left, turned = self._n, self._last_ns, float(self._sums.wheels[1])
         self._n, self._last_ns, dt = _advance(self._imu, self._sums, self._stamps, self._samples, self._n, left, end_ns, wheels)
         if self._n == before or not self._imu.scale:
             return None
@@ -234,6 +237,10 @@ class AttitudeFilter:
             self._restart(has_wheels)
             return None
         self._is_explained &= has_wheels
+        if self._has_started and has_wheels:
+            way = 0.5 * self._imu.radius * float(dt_s @ rates.sum(axis=1))
+            turn = float(self._sums.wheels[1]) - turned - float(self._sums.state[5]) * dt
+            self._curvature.advance(self._downhill, self._slope(), (way, turn), self._imu.white**2 * dt)
         if self._sums.window[6] >= (_WINDOW_S if self._has_started else _FIRST_WINDOW_S):
             self._measure(has_wheels)
         return self._tilt() if self._has_started else None
@@ -272,7 +279,7 @@ class AttitudeFilter:
         self._sums.cov[:] = np.diag([sigma**2] * 3 + [_BIAS_SIGMA**2] * 3)
         self._split_cov[2:] = self._split_cov[:, 2:] = 0.0
         self._split_cov[2, 2] = self._split_cov[3, 3] = _GROUND_SIGMA**2
-        self._has_started, self._downhill = True, -up[:2] / up[2]
+        self._has_started, self._downhill, self._curvature = True, -up[:2] / up[2], GroundCurvature()
         self.gravity = Gravity(gravity, (GRAVITY * sigma) ** 2)
 
     def _is_above(self, up_z: float) -> bool:
@@ -293,14 +300,19 @@ class AttitudeFilter:
 
     def _tilt(self) -> Tilt | None:
         """The tilt by the mount's error and the vertical as they are now."""
-        state = self._sums.state
-        before, self._downhill = self._downhill, -state[:2] / max(state[2], _MIN_UP)
+        before, self._downhill = self._downhill, self._slope()
         if not self._tilts:
             return None
         error, P = self._split[:2], self._sums.cov
         now = self._downhill - error
         own = np.array([[P[1, 1], -P[0, 1]], [-P[0, 1], P[0, 0]]]) + _ACCELEROMETER_RAD**2 * np.eye(2)
-        return Tilt(before - error, now, own + self._split_cov[:2, :2] + _SLOPE_EFFECT**2 * np.outer(now, now))
+        cov = own + self._split_cov[:2, :2] + _SLOPE_EFFECT**2 * np.outer(now, now)
+        return Tilt(before - error, now, cov, self._curvature.twist)
+
+    def _slope(self) -> FloatArray:
+        """(2,) `motion_models.slope.Slope.downhill` by the vertical as it is, mount and ground together."""
+        state = self._sums.state
+        return np.asarray(-state[:2] / max(state[2], _MIN_UP))
 
     def warnings(self) -> list[str]:
         """Problems of the accelerometer, and their remedy."""

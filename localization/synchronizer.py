@@ -300,7 +300,8 @@ class Synchronizer:
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
             motion = integrate_twists(dt, inside, self._wheel_noise)
         else:
-            found = partial(self._slope_effect.twist, model, rates, cg, self.params)
+            warp = self._slope_effect.warp_of(tilt.twist)
+            found = partial(self._slope_effect.twist, model, rates, cg, self.params, warp=warp)
             twist, motion = self._integrate_on_slope(found, dt, n, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last

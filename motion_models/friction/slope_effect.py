@@ -12,6 +12,17 @@ from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope, SlopeTwist
 
+_DEFLECTION = 0.01
+"""Deflection of a tyre by a quarter of the weight, over the wheel's radius [-]."""
+_WARP = FrictionModel.param_names.index("warp")
+
+
+def _warped(params: FloatArray, warp: float) -> FloatArray:
+    """``params`` (13,) of the friction model with ``warp`` added to theirs."""
+    out = params.copy()
+    out[_WARP] += warp
+    return out
+
 
 @dataclass(frozen=True)
 class SlopeEffect:
@@ -26,24 +37,31 @@ class SlopeEffect:
         """The robot's friction parameters and the height of its CG."""
         return cls(FrictionModel.from_robot(robot), robot.geometry.cg_height_m)
 
+    def warp_of(self, twist: float) -> float:
+        """Load that ground with the ``twist`` [1/m] (`localization.ground_curvature`) moves onto the front left and rear right wheels, over
+        m g / 4: their feet are higher than the others by twist * wheelbase * track / 2, which four tyres share."""
+        track, wheelbase, radius = self.friction.nominal[1], self.friction.nominal[2], self.friction.nominal[0]
+        return float(twist * wheelbase * track / (4.0 * _DEFLECTION * radius))
+
     def twist(
-        self, model: MotionModel, wheels: FloatArray, cg: FloatArray, params: FloatArray, downhill: FloatArray
+        self, model: MotionModel, wheels: FloatArray, cg: FloatArray, params: FloatArray, downhill: FloatArray, warp: float = 0.0
     ) -> tuple[SlopeTwist, BoolArray]:
-        """Twist of ``model`` at ``wheels`` (n, 2), ``cg`` (n, 2) and ``params`` where the ground falls to ``downhill`` (n, 2).
+        """Twist of ``model`` at ``wheels`` (n, 2), ``cg`` (n, 2) and ``params`` where the ground falls to ``downhill`` (n, 2) and moves
+        the load ``warp`` onto the front left and rear right wheels, over m g / 4.
 
         Also the samples (n,) whose slope tips the robot over or lets it slide by itself: their twist is that of level ground.
         """
-        slope, level = Slope(downhill, self.cg_height), model.twist(wheels, cg, params)
-        if isinstance(model, FrictionModel):
-            found = model.find_on_slope(wheels, cg, params, slope)
-            twist = found.twist
-        else:
-            own = self.friction.nominal
-            found, flat = self.friction.find_on_slope(wheels, cg, own, slope), self.friction.twist(wheels, cg, own)
+        level = model.twist(wheels, cg, params)
+        is_friction = isinstance(model, FrictionModel)
+        friction, own = (model, params) if isinstance(model, FrictionModel) else (self.friction, self.friction.nominal)
+        flat = level if is_friction else friction.twist(wheels, cg, own)
+        found = friction.find_on_slope(wheels, cg, _warped(own, warp), Slope(downhill, self.cg_height))
+        twist = found.twist
+        if not is_friction:
             twist = Twist(
-                level.value + (found.twist.value - flat.value),
-                level.d_wheels + (found.twist.d_wheels - flat.d_wheels),
-                level.d_cg + (found.twist.d_cg - flat.d_cg),
+                level.value + (twist.value - flat.value),
+                level.d_wheels + (twist.d_wheels - flat.d_wheels),
+                level.d_cg + (twist.d_cg - flat.d_cg),
                 level.d_params,
             )
         limited = np.asarray(np.isnan(twist.value).any(axis=-1))
