@@ -20,11 +20,14 @@ from localization.estimators import (
     MapFusion,
     PriorMap,
     SpaceChoice,
+    SpaceFusion,
     SpaceGraphSettings,
+    SpaceMapFusion,
     make_estimator,
 )
 from localization.events import Event, ImuSample, PositionSample, Scan
 from localization.lidar.losses import LidarLosses
+from localization.maps.space_places import SpacePlaces
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from motion_models.base import MotionModel
@@ -71,11 +74,15 @@ class Pipeline:
         self.is_localizing = trial.estimator in ESTIMATORS_WITH_MAP
         self.mounts = dict(mounts)
         """Known mounts by frame, shared with the synchronizer and the estimator."""
+        prior = trial.prior
         is_in_space = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is False
-        has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not (is_in_space and trial.estimator == "ekf")
+        is_in_space |= prior is not None and isinstance(prior.places, SpacePlaces)
+        has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not (is_in_space and trial.estimator != "graph")
         model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
-        name = trial.estimator if trial.prior is None else "ekf"
+        if is_in_space:
+            self.synchronizer.measure_in_space()
+        name = trial.estimator if prior is None else "ekf"
         graph: SpaceGraphSettings | None = None
         if trial.estimator == "graph":
             corrections = make_corrections(model, trial.corrections)
@@ -86,8 +93,12 @@ class Pipeline:
             self.estimator = choice.begin()
         else:
             self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
-        if trial.prior is not None:
-            self.estimator = MapFusion(self.estimator, trial.prior, is_recording=is_smoothing)
+        if prior is not None and isinstance(prior.places, SpacePlaces):
+            assert isinstance(self.estimator, SpaceFusion)
+            self.estimator = SpaceMapFusion(self.estimator, prior.places, prior.initial, is_recording=is_smoothing)
+        self._is_in_planar_map = prior is not None and not is_in_space  # whether its ground tilts is to be known
+        if prior is not None and not is_in_space:
+            self.estimator = MapFusion(self.estimator, prior, is_recording=is_smoothing)
         has_choice = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar
         self.space_choice = choice if has_choice else None
         """The choice between plane and space; None where there is none."""
@@ -118,9 +129,10 @@ class Pipeline:
             self.checks.insert_imu(event)
         if isinstance(event, Scan):
             event = self.checks.correct(event)
-        if self.space_choice is not None and isinstance(event, Scan) and not event.is_planar:
-            self.space_choice.has_clouds = True
+        if isinstance(event, Scan) and not event.is_planar and (self.space_choice is not None or self._is_in_planar_map):
             self.synchronizer.measure_in_space()
+            if self.space_choice is not None:
+                self.space_choice.has_clouds = True
         self.synchronizer.insert(event)
         yield from self._estimates(is_last=False)
 

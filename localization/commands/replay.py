@@ -39,8 +39,9 @@ from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
 from localization.logs.reference_topics import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
-from localization.maps import SavedMap, load_map, save_map
+from localization.maps import SavedMap, SpaceMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
+from localization.maps.space_places import SpacePlaces
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
@@ -129,6 +130,7 @@ class Replay:
         layer = ScanLayer(log.duration_s, mounts)
         with _progress(console, log) as (events, on_event):
             found = replay(layer.watch(merge_positions(events, positions)), once, robot, mounts, has_lidar, self.config, on_event)
+        self._refuse_tilt(log, once, found)
         by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
         runs = []
         for p in pairs:
@@ -169,7 +171,7 @@ class Replay:
 
     def _trials(self, log: Log, models: Sequence[MotionModel], forms: Sequence[Form]) -> list[Trial]:
         """Each estimator with each model, and, where it corrects that, each of the ``forms`` of corrections."""
-        prior = self._prior()
+        prior = self._prior(log)
         return [
             Trial(model, estimator, form, prior if estimator == LOCALIZER else None)
             for estimator in self._estimators(log)
@@ -201,15 +203,36 @@ class Replay:
             found.remove(_WHEELLESS)
         return found
 
-    def _prior(self) -> PriorMap | None:
-        """The saved map. Raises `MapError` where it cannot be read."""
+    def _prior(self, log: Log) -> PriorMap | None:
+        """The saved map. Raises `MapError` where it cannot be read, or does not fit the LiDAR of ``log``."""
         pose = self.initial_pose
         if pose is not None and (self.map is None or not all(map(math.isfinite, pose))):
             raise EstimatorError("--initial-pose is three numbers x y yaw [m, m, deg] in a saved map. Name the map by --map.")
         if self.map is None:
             return None
-        mapped = load_map(self.map).planar(self.map, "--map")
-        return PriorMap(PlaceMap(mapped, self.config.estimator.lidar.range_noise_m), self._initial())
+        saved, noise_m, has_clouds = load_map(self.map), self.config.estimator.lidar.range_noise_m, _has_clouds(log)
+        if not isinstance(saved.map, SpaceMap):
+            if self.config.step.planar is False:
+                raise MapError(f"map '{self.map}' holds planar scans: poses in it are in the plane. Leave out --config.step.no-planar.")
+            return PriorMap(PlaceMap(saved.map, noise_m), self._initial())
+        if self.extend_map is not None:
+            saved.planar(self.map, "--extend-map")
+        if not has_clouds or self.config.step.planar:
+            why = "--config.step.planar keeps poses in the plane" if has_clouds else "the LiDAR of this log is planar"
+            raise MapError(
+                f"map '{self.map}' holds clouds in space, and {why}. Name a map of planar scans, or the topic by --topic.points."
+            )
+        return PriorMap(SpacePlaces(saved.map, noise_m), self._initial())
+
+    def _refuse_tilt(self, log: Log, trials: Sequence[Trial], runs: Sequence[Run]) -> None:
+        """Raises `MapError` where a 3D LiDAR was tilted by the ground in a map of planar scans."""
+        for trial, run in zip(trials, runs, strict=True):
+            is_planar_map = trial.prior is not None and isinstance(trial.prior.places, PlaceMap)
+            if is_planar_map and run.in_space is not None and _has_clouds(log) and self.config.step.planar is None:
+                raise MapError(
+                    f"map '{self.map}' holds planar scans, and the IMU shows that the ground tilts: a 3D LiDAR is lost in it. "
+                    "Save a map in space by --estimator graph --save-map, or stay in the plane by --config.step.planar."
+                )
 
     def _initial(self) -> FloatArray | None:
         """(3,) `--initial-pose` [m, m, rad]."""
@@ -297,6 +320,11 @@ class Replay:
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _has_clouds(log: Log) -> bool:
+    """Whether the LiDAR of ``log`` is a 3D one."""
+    return log.sources.lidar is not None and log.sources.lidar.kind == "points"
 
 
 def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:

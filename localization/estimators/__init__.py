@@ -16,6 +16,7 @@ from localization.estimators.map_fusion import MapFusion, PriorMap
 from localization.estimators.space_choice import SpaceChoice
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
+from localization.estimators.space_map_fusion import SpaceMapFusion
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
@@ -39,6 +40,7 @@ __all__ = [
     "SpaceFusion",
     "SpaceGraphFusion",
     "SpaceGraphSettings",
+    "SpaceMapFusion",
     "check_estimator",
     "make_estimator",
 ]

@@ -23,6 +23,7 @@ from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from localization.maps.recent_scans import RecentMotion
+from localization.maps.space_places import SpacePlaces
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
@@ -37,9 +38,9 @@ _LEAST_CHANGED = 0.05
 class PriorMap:
     """A map that exists before the drive, and about where the drive begins in it."""
 
-    places: PlaceMap
+    places: PlaceMap | SpacePlaces
     initial: Pose2 | None = None
-    """(3,) ``map_T_body`` [m, m, rad]; None for anywhere."""
+    """(3,) ``map_T_body`` [m, m, rad]; None for anywhere. In space height, roll and pitch are those of the map's ground and gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,7 @@ class MapFusion(FilteredOdometry):
         """``odometry``: an `EkfFusion` with a LiDAR. With ``is_recording``, the keyframes of the drive are kept, and `finish` compares
         them with the map."""
         assert isinstance(odometry, EkfFusion)
+        assert isinstance(prior.places, PlaceMap)
         self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial, is_background=True)
         self._end_ns = 0
         self._is_keyframe_due, self._is_scan_awaited = False, True  # no scan since the robot was carried, or at all

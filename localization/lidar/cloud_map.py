@@ -126,6 +126,11 @@ class CloudMap:
         R = inverse @ (keep @ blocks.T @ blocks @ keep.T + _OPEN_INFORMATION) @ inverse
         return CloudMatch(pose, measured, R, float(counts[1]) / max(float(counts[0]), 1.0), int(counts[0]))
 
+    def inlier_share(self, points: FloatArray, pose: Transform3) -> float:
+        """Share of ``points`` (N, 3) within 3 sigma of a surface, as seen from ``pose`` (4, 4)."""
+        _, _, _, counts = _linearize(self._grid, points, pose, np.zeros((1, 6)))
+        return float(counts[1]) / max(len(points), 1)
+
     def _information(self, points: FloatArray, pose: Transform3, blocks: FloatArray) -> tuple[FloatArray, ...]:
         """M (6, 6), information M H, gradient M g, and counts as of `_linearize`: M takes off what comes from the noise of normals.
 

@@ -148,7 +148,7 @@ class Localizer:
         if self.state != "localized":
             return sigmoid(self._search_odds)
         A = se2.adjoint(se2.inverse(delta))
-        probability = sigmoid(self._track_odds) * _within(A @ self._cov @ A.T + cov)
+        probability = sigmoid(self._track_odds) * within(A @ self._cov @ A.T + cov)
         return min(probability, LIKELY) if self._is_doubtful else probability
 
     @property
@@ -364,7 +364,7 @@ def _agree(earlier: Pose2, pose: Pose2, cov: Cov3) -> bool:
     return mahalanobis(earlier, pose, cov + _SAME_COV) < _PRIOR_SQUARE
 
 
-def _within(cov: Cov3) -> float:
+def within(cov: Cov3) -> float:
     """Probability that a pose with ``cov`` (3, 3) is within `RIGHT_M` and `RIGHT_RAD`, its position equally uncertain on all sides."""
     variance, sigma = max(0.5 * float(np.trace(cov[:2, :2])), 1e-12), math.sqrt(max(float(cov[2, 2]), 1e-12))
     return (1.0 - math.exp(-0.5 * RIGHT_M**2 / variance)) * math.erf(RIGHT_RAD / (sigma * math.sqrt(2.0)))

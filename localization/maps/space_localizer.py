@@ -1,0 +1,211 @@
+"""Place of a robot in a saved map in space, and its probability: search around a given pose, then track until the map contradicts.
+
+The pose against the map's surfaces is a filter of its own over keyframes, as `localizer.Localizer` is in the plane: moved by the odometry,
+updated by clouds registered to the map. The map's own uncertainty is considered (Schmidt 1966): it is added to what is published, and no
+cloud reduces it. Odometry and map are both level by gravity, so that heading and position alone are searched: about a pose that is given
+or reckoned, else everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.maps.localizer import INITIAL_COV, LIKELY, State, within
+from localization.maps.place_probability import sigmoid
+from localization.maps.space_places import SpacePlace, SpacePlaces
+from motion_models import se3
+from motion_models.se2 import Cov3, FloatArray, Pose2
+from motion_models.se3 import Transform3
+
+_BEND = np.diag([5e-3, 5e-3, 5e-3, 5e-4, 5e-4, 5e-4]) ** 2
+"""Covariance of a map's surfaces against its nearest keyframe [m^2, rad^2]."""
+_LEVEL_COV = np.diag([0.0, 0.0, 0.3, 0.05, 0.05, 0.0]) ** 2
+"""Covariance of the height of the ground below a planar pose, and of gravity against the map's [m^2, rad^2]."""
+_PLANAR = [0, 1, 5]
+_INDEPENDENT_M = 1.0
+"""Way over which searches find the same place, from which on they are more than the same view again, as in the plane [m]."""
+_SAME_COV = np.diag([0.1, 0.1, 0.1, 0.03, 0.03, 0.03]) ** 2
+"""Covariance of a searched pose against another of the same place [m^2, rad^2]."""
+_GATE, _OUTLIER = 9.0, 25.0
+"""Squared Mahalanobis distances of 3 sigma, within which places agree, and of 5 sigma, beyond which a cloud contradicts the place."""
+_ON, _OFF, _OFFSET = 10.0, -20.0, -4.0
+"""Log-odds of a place by the shares of a cloud's points on and off the map's surfaces."""
+_MAX_LOG_ODDS = 6.0
+_LOST = 0.5
+"""Probability of a tracked place below which the robot is lost."""
+_KNOWN_SHARE = 0.3
+"""Share of points near surfaces of the map, below which a cloud is no evidence for or against the place."""
+_TRACKED_M, _TRACKED_RAD = 0.5, 0.3
+"""Sigma of a pose that is tracked, at most, as in the plane."""
+_NEAR_M, _NEAR_RAD = 1.0, 0.4
+"""Sigma of a pose by odometry since it was known, up to which it is searched about that: 3 sigma are searched in seconds."""
+_NEAR_KEYFRAMES = 10
+"""Keyframes after which a given or reckoned pose that no cloud confirms is dropped."""
+_PATIENCE, _MAX_WAIT = 6, 3
+"""After each so many searches in vain, one more keyframe is left out between them, at most the second number, as in the plane."""
+
+
+class SpaceMotion(NamedTuple):
+    """Motion since the last keyframe."""
+
+    delta: Transform3
+    """(4, 4)"""
+    cov: FloatArray
+    """(6, 6) of its right perturbation."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceHypothesis:
+    """A place where the robot may be."""
+
+    pose: Transform3
+    """(4, 4) ``map_T_body`` at the last keyframe."""
+    probability: float
+    cov: FloatArray
+    """(6, 6) of the pose if the place is the right one, by the cloud."""
+    way_m: float = 0.0
+    """Way over which all searches have found it [m]."""
+
+
+class SpaceLocalizer:
+    """`add` keyframe after keyframe; `state`, `probability`, `pose` and `covariance` are those at the last one."""
+
+    def __init__(self, places: SpacePlaces, initial: Pose2 | None = None, initial_cov: Cov3 = INITIAL_COV) -> None:
+        """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3)."""
+        self.places = places
+        self.state: State = "searching"
+        self._log_odds = -_MAX_LOG_ODDS
+        self.hypotheses: list[SpaceHypothesis] = []
+        """Places that the last search found, the most probable first."""
+        self._since = SpaceMotion(np.eye(4), np.zeros((6, 6)))  # that search
+        self.is_outside = False
+        """Whether most of the last cloud is where the map has nothing: the tracked pose is by odometry meanwhile."""
+        self._near_left = 0 if initial is None else _NEAR_KEYFRAMES
+        self._failures = self._wait = 0
+        planar, cov = (places.centre, places.extent_cov) if initial is None else (initial, initial_cov)
+        self.pose, self._cov = places.on_ground(planar, np.eye(3)), _LEVEL_COV.copy()
+        self._cov[np.ix_(_PLANAR, _PLANAR)] = cov
+
+    @property
+    def probability(self) -> float:
+        """That the robot is within 0.5 m and 0.2 rad of `pose`; while it is searched, that it is at the first of `hypotheses`."""
+        if self.state != "localized":
+            return min(sigmoid(self._log_odds), LIKELY)
+        return sigmoid(self._log_odds) * within(self._cov[np.ix_(_PLANAR, _PLANAR)])
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6) of the right perturbation of `pose`, with the map's own."""
+        return np.asarray(self._cov + self.places.mapped.cov_at(self.pose))
+
+    def add(self, cloud: FloatArray, motion: SpaceMotion, rotation: FloatArray) -> None:
+        """A keyframe with ``cloud`` (N, 3) of the body frame [m], after ``motion`` since the one before.
+
+        ``rotation`` (3, 3): by the odometry, from the body's axes to level ones.
+        """
+        A = se3.adjoint(se3.inverse(motion.delta))
+        self.pose, self._cov = self.pose @ motion.delta, A @ self._cov @ A.T + motion.cov
+        self._since = SpaceMotion(self._since.delta @ motion.delta, A @ self._since.cov @ A.T + motion.cov)
+        self.hypotheses = [replace(found, pose=found.pose @ motion.delta) for found in self.hypotheses]
+        if self.state == "localized" and _is_within(self._cov, _TRACKED_M, _TRACKED_RAD):
+            self._track(cloud)
+            return
+        if self.state == "localized":  # by odometry for long: the place is searched about the pose, or everywhere
+            self.state, self.hypotheses, self._log_odds = "searching", [], -_MAX_LOG_ODDS
+            self._near_left = _NEAR_KEYFRAMES
+        self._search(cloud, rotation)
+
+    def _track(self, cloud: FloatArray) -> None:
+        """Register near the pose. Where that contradicts, again and again, the robot is lost."""
+        place = self.places.align(cloud, self.pose, self._cov + _BEND)
+        self.is_outside = place.on_surfaces + place.off_surfaces < _KNOWN_SHARE
+        if self.is_outside:
+            return
+        R = place.cov + _BEND
+        off = se3.local(self.pose, place.match.measured)
+        is_outlier = bool(off @ np.linalg.solve(self._cov + R, off) > _OUTLIER)
+        evidence = min(_evidence(place), -1.0) if is_outlier else _evidence(place)
+        self._log_odds = min(self._log_odds + 0.5 * evidence, _MAX_LOG_ODDS)
+        if sigmoid(self._log_odds) < _LOST:
+            self._lose()
+        elif not is_outlier:
+            K = np.linalg.solve(self._cov + R, self._cov).T
+            self.pose = se3.retract(self.pose, K @ off)
+            self._cov = np.asarray((np.eye(6) - K) @ self._cov @ (np.eye(6) - K).T + K @ R @ K.T)
+
+    def _lose(self) -> None:
+        """The place was wrong, or the map is."""
+        self.state, self.hypotheses, self._log_odds = "lost", [], -_MAX_LOG_ODDS
+        self._failures = self._wait = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        """The robot may be anywhere in the map."""
+        self._near_left, self._cov = 0, _LEVEL_COV.copy()
+        self._cov[np.ix_(_PLANAR, _PLANAR)] = self.places.extent_cov
+
+    def _search(self, cloud: FloatArray, rotation: FloatArray) -> None:
+        """Search ``cloud`` (N, 3) of the last keyframe, and take the best place where searches over some way agree."""
+        self._wait -= 1
+        if self._wait > 0:
+            return
+        self._failures += 1
+        self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
+        yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+        level = se3.rotation(np.array([0.0, 0.0, -yaw])) @ rotation
+        if self._near_left and _is_within(self._cov, _NEAR_M, _NEAR_RAD):
+            near = np.array([*self.pose[:2, 3], math.atan2(self.pose[1, 0], self.pose[0, 0])])
+            places = self.places.search(cloud, near, 3.0 * np.sqrt(np.diagonal(self._cov)[_PLANAR]), level)
+        else:
+            places = self.places.search_everywhere(cloud, level)
+        self._conclude(places)
+        if self.state != "localized" and self._near_left:
+            self._near_left -= 1
+            if not self._near_left:
+                self._forget()
+
+    def _conclude(self, places: Sequence[SpacePlace]) -> None:
+        """Take the best of ``places``, if it is probable and the searches before agree."""
+        before, since = self.hypotheses, self._since
+        self.hypotheses, self._since = _weigh(places), SpaceMotion(np.eye(4), np.zeros((6, 6)))
+        self._log_odds = -_MAX_LOG_ODDS
+        if not self.hypotheses:
+            return
+        best = self.hypotheses[0]
+        self._log_odds = math.log(best.probability / (1.0 - best.probability))
+        way = max((found.way_m for found in before if _agree(found.pose, best.pose, since.cov + _SAME_COV)), default=-math.inf)
+        way = max(way + math.hypot(*since.delta[:3, 3]), 0.0)
+        self.hypotheses[0] = replace(best, way_m=way)
+        if best.probability >= LIKELY and way >= _INDEPENDENT_M:
+            self.state, self.pose, self._cov = "localized", best.pose, best.cov + _BEND
+            self._near_left = self._failures = self._wait = 0
+
+
+def _is_within(cov: FloatArray, sigma_m: float, sigma_rad: float) -> bool:
+    """Whether a pose with ``cov`` (6, 6) has at most these sigmas of position in the plane and heading."""
+    return bool(cov[0, 0] + cov[1, 1] < sigma_m**2 and cov[5, 5] < sigma_rad**2)
+
+
+def _evidence(place: SpacePlace) -> float:
+    return _ON * place.on_surfaces + _OFF * place.off_surfaces + _OFFSET
+
+
+def _weigh(places: Sequence[SpacePlace]) -> list[SpaceHypothesis]:
+    """``places``, the best first, with their probabilities: those that fit as well share it."""
+    if not places:
+        return []
+    odds = np.array([_evidence(place) for place in places])
+    rivals = np.exp(odds - odds[0])
+    first = min(max(float(odds[0]), -_MAX_LOG_ODDS), _MAX_LOG_ODDS)
+    probabilities = sigmoid(first) * rivals / rivals.sum()
+    return [SpaceHypothesis(place.pose, float(p), place.cov) for place, p in zip(places, probabilities, strict=True)]
+
+
+def _agree(a: Transform3, b: Transform3, cov: FloatArray) -> bool:
+    off = se3.local(a, b)
+    return bool(off @ np.linalg.solve(cov, off) < _GATE)
