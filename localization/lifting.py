@@ -17,7 +17,7 @@ import numpy as np
 from localization.attitude import AttitudeFilter
 from localization.output import whole_file
 from localization.trajectory import IntArray, Trajectory
-from motion_models import se2
+from motion_models import se2, se3
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
 _PLANAR = [0, 1, 5]
@@ -92,8 +92,7 @@ class Lifting:
 
 
 def _yaw(angle: float) -> FloatArray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return se3.lift(np.array([0.0, 0.0, angle]))[:3, :3]
 
 
 def aligning(a: FloatArray, b: FloatArray) -> FloatArray:

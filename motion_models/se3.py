@@ -13,7 +13,8 @@ import math
 
 import numpy as np
 
-from motion_models.se2 import FloatArray
+from motion_models import se2
+from motion_models.se2 import FloatArray, Pose2
 
 Transform3 = FloatArray
 """(4, 4) homogeneous matrix of SE(3)."""
@@ -40,6 +41,15 @@ def inverse(a: Transform3) -> Transform3:
     out = np.eye(4)
     out[:3, :3] = a[:3, :3].T
     out[:3, 3] = -a[:3, :3].T @ a[:3, 3]
+    return out
+
+
+def lift(planar: Pose2) -> Transform3:
+    """(4, 4) of a pose or motion ``planar`` (3,) in the plane."""
+    x, y, yaw = planar.tolist()
+    out = np.eye(4)
+    out[:2, :2] = se2.rotation(yaw)
+    out[0, 3], out[1, 3] = x, y
     return out
 
 

@@ -17,10 +17,9 @@ from localization.bounded_settings import Settings, at_least
 from localization.core.filter import Measurement, Transition
 from localization.core.state import Group, Layout, Perturbation, State, Vector
 from localization.events import BodyTurn, Gravity, Step
-from motion_models import se2, se3
+from motion_models import se3
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
-from motion_models.se3 import Transform3
 from motion_models.slope import GRAVITY
 
 
@@ -87,15 +86,6 @@ def start_at(state: State, position: FloatArray, rotation: FloatArray, cov: Floa
     return State(state.layout, {**state.means, "pose": pose}, P)
 
 
-def lift(planar: FloatArray) -> Transform3:
-    """(4, 4) of a planar motion (3,)."""
-    x, y, yaw = planar.tolist()
-    out = np.eye(4)
-    out[:2, :2] = se2.rotation(yaw)
-    out[0, 3], out[1, 3] = x, y
-    return out
-
-
 def lifted_transition(state: State, step: Step, gyro: GyroNoise, config: SpaceConfig) -> Transition:
     """The wheels' planar motion in the body's plane, which the terrain tilts and moves along its normal meanwhile:
 
@@ -103,7 +93,7 @@ def lifted_transition(state: State, step: Step, gyro: GyroNoise, config: SpaceCo
 
     Turns by the terrain are constant in a step: a turn a over the way d moves the end by a x d / 2.
     """
-    dt, delta = step.duration, lift(step.predicted.delta)
+    dt, delta = step.duration, se3.lift(step.predicted.delta)
     A = se3.adjoint(se3.inverse(delta))
     end = -se3.inverse(delta)[:3, 3]  # the way, in the body's axes at the end
     B = np.zeros((6, 3))

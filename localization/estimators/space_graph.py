@@ -18,7 +18,6 @@ import gtsam
 import numpy as np
 
 from localization.core.measurements.position import predict_position_in_space
-from localization.core.space import lift
 from localization.estimators.pose_graph import LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor, robust_loop_noise
 from localization.lidar.cloud_loops import CloudLoop
 from motion_models import se2, se3
@@ -71,6 +70,27 @@ class SpacePosition:
     """(2, 2) or (3, 3)"""
 
 
+@dataclass(frozen=True, eq=False)
+class SmoothedSpace:
+    """Keyframes by all measurements."""
+
+    poses: FloatArray
+    """(K, 4, 4)"""
+    covs: FloatArray
+    """(K, 6, 6) of their right perturbations."""
+    corrections: FloatArray
+    """(c,)"""
+    marginals: gtsam.Marginals
+
+    def relative_cov(self, a: int, b: int) -> FloatArray:
+        """(6, 6) covariance of the right perturbation of the motion from keyframe ``a`` to ``b``."""
+        keys = [gtsam.symbol("x", k) for k in (a, b)]
+        joint = self.marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+        cov = np.block([[joint.at(i, j)[np.ix_(_SWAP, _SWAP)] for j in keys] for i in keys])
+        J = np.hstack([-se3.adjoint(se3.inverse(self.poses[b]) @ self.poses[a]), np.eye(6)])
+        return np.asarray(J @ cov @ J.T)
+
+
 @dataclass
 class SpaceGraph:
     """`add` keyframes with what was measured since the last one; `smooth` gives their poses by all of it."""
@@ -90,29 +110,22 @@ class SpaceGraph:
     lever: FloatArray = field(default_factory=lambda: np.zeros(3))
     """(3,) of the positions' antenna in the body frame [m]."""
 
-    def smooth(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Poses (K, 4, 4), their covariances (K, 6, 6) and the corrections (c,). Raises `EstimatorError` where there is no solution."""
+    def smooth(self) -> SmoothedSpace:
+        """The keyframes by all measurements. Raises `EstimatorError` where there is no solution."""
         graph, values = self._factors()
         with check_solvable():
             if self.loops:  # a robust loss does not feel what is hundreds of its scales away
-                closed, _ = self._factors()
+                closed = gtsam.NonlinearFactorGraph()
+                closed.push_back(graph)
                 self._add_loops(closed, is_robust=False)
                 values = levenberg_marquardt(closed, values)
                 self._add_loops(graph, is_robust=True)
             values = levenberg_marquardt(graph, values)
             linear = graph.linearize(values)
-            marginals = self._marginals = gtsam.Marginals(linear, linear.optimize())
+            marginals = gtsam.Marginals(linear, linear.optimize())
             covs = [marginals.marginalCovariance(gtsam.symbol("x", k))[np.ix_(_SWAP, _SWAP)] for k in range(len(self.poses))]
-        found = self._smoothed = np.array([values.atPose3(gtsam.symbol("x", k)).matrix() for k in range(len(self.poses))])
-        return found, np.array(covs), np.asarray(values.atVector(_CORRECTIONS))
-
-    def relative_cov(self, a: int, b: int) -> FloatArray:
-        """(6, 6) covariance of the right perturbation of the motion from keyframe ``a`` to ``b``, as last smoothed."""
-        keys = [gtsam.symbol("x", k) for k in (a, b)]
-        joint = self._marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
-        cov = np.block([[joint.at(i, j)[np.ix_(_SWAP, _SWAP)] for j in keys] for i in keys])
-        J = np.hstack([-se3.adjoint(se3.inverse(self._smoothed[b]) @ self._smoothed[a]), np.eye(6)])
-        return np.asarray(J @ cov @ J.T)
+        found = np.array([values.atPose3(gtsam.symbol("x", k)).matrix() for k in range(len(self.poses))])
+        return SmoothedSpace(found, np.array(covs), np.asarray(values.atVector(_CORRECTIONS)), marginals)
 
     def _add_loops(self, graph: gtsam.NonlinearFactorGraph, is_robust: bool) -> None:
         for loop in self.loops:
@@ -175,7 +188,7 @@ def wheel_factor(k: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
         D = wheels.by_corrections
         shift = D @ (values.atVector(_CORRECTIONS) - wheels.at)
         a_T_b = se3.compose(se3.inverse(values.atPose3(keys[0]).matrix()), values.atPose3(keys[1]).matrix())
-        residual = se3.local(lift(se2.retract(wheels.delta, shift)), a_T_b)
+        residual = se3.local(se3.lift(se2.retract(wheels.delta, shift)), a_T_b)
         if H is not None:  # to first order in the residual
             H[0] = np.asfortranarray(-se3.adjoint(se3.inverse(a_T_b))[np.ix_(_PLANAR, _SWAP)])
             H[1] = np.asfortranarray(np.eye(6)[np.ix_(_PLANAR, _SWAP)])

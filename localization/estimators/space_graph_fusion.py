@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.core.policies.excitation import Excitation
-from localization.core.space import SE3, lift
+from localization.core.space import SE3
 from localization.core.state import clip_eigenvalues
 from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate, Estimator
@@ -128,7 +128,7 @@ class SpaceGraphFusion(Estimator):
             wheels = self._wheels.with_corrections(np.zeros(len(self._corrections.names)))
             by_wheels = np.diag([0.0, 0.0, _OPEN_M2, _OPEN_RAD2, _OPEN_RAD2, 0.0])
             by_wheels[np.ix_([0, 1, 5], [0, 1, 5])] = wheels.cov
-            between = subtract_information(SE3, delta, clip_eigenvalues(cov), lift(wheels.delta), by_wheels)
+            between = subtract_information(SE3, delta, clip_eigenvalues(cov), se3.lift(wheels.delta), by_wheels)
             self.graph.wheels.append(wheels)
             self.graph.betweens.append(Between(n - 1, *between))
         self.graph.poses.append(state["pose"])
@@ -145,9 +145,9 @@ class SpaceGraphFusion(Estimator):
         if self._is_smoothing and self.graph.poses:
             self._queue.add(sample)
 
-    def run_deferred(self) -> None:
+    def run_deferred(self) -> bool:
         """The filter's submap."""
-        self.odometry.run_deferred()
+        return self.odometry.run_deferred()
 
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory projected to the plane, at the stamps of ``filtered``; None unless smoothing, or with one keyframe."""
@@ -156,19 +156,19 @@ class SpaceGraphFusion(Estimator):
             return None
         self._align()
         try:
-            poses, covs, _ = self.graph.smooth()
+            keyframes = self.graph.smooth()
             if self._config.cloud_loops:
-                self.graph.loops = find_loops(self._clouds, poses, self.graph.relative_cov, self._range_noise_m)
+                self.graph.loops = find_loops(self._clouds, keyframes.poses, keyframes.relative_cov, self._range_noise_m)
             if self.graph.loops:
-                poses, covs, _ = self.graph.smooth()
+                keyframes = self.graph.smooth()
         except EstimatorError as error:
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
         stamps = np.array(self._stamps_ns, dtype=np.int64)
-        self._map = self._make_map(stamps[self._nodes], lift(self._map_T_odom) @ poses, covs)
+        self._map = self._make_map(stamps[self._nodes], se3.lift(self._map_T_odom) @ keyframes.poses, keyframes.covs)
         odometry, since = np.array(self._poses).reshape(-1, 4, 4), np.array(self._covs_since).reshape(-1, 6, 6)
-        smoothed, spread = through_nodes(SE3, odometry, since, np.array(self._nodes), poses, covs)
-        smoothed = lift(self._map_T_odom) @ smoothed
+        smoothed, spread = through_nodes(SE3, odometry, since, np.array(self._nodes), keyframes.poses, keyframes.covs)
+        smoothed = se3.lift(self._map_T_odom) @ smoothed
         table, planar = SpaceTable(), filtered.poses.copy()
         planar_covs = None if filtered.covariances is None else filtered.covariances.copy()
         rows = np.searchsorted(filtered.stamps_ns, stamps)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from motion_models import se3
 from motion_models.se2 import FloatArray, Pose2
 
 _NO_STAMPS = np.empty(0)
@@ -79,7 +80,7 @@ class KissIcp:
         pose = kiss.registration.align_points_to_map(
             points=source,
             voxel_map=kiss.local_map,
-            initial_guess=_matrix(guess),
+            initial_guess=se3.lift(guess),
             max_correspondance_distance=3.0 * sigma,  # the spelling is theirs
             kernel=sigma,
         )
@@ -89,7 +90,7 @@ class KissIcp:
         """Add ``points``, measured from ``pose`` (3,), to the map."""
         kiss = self._kiss
         downsampled = kiss.voxelize(kiss.preprocessor.preprocess(points, _NO_STAMPS, np.eye(4)))[1]
-        kiss.local_map.update(downsampled, _matrix(pose))
+        kiss.local_map.update(downsampled, se3.lift(pose))
 
     def point_cloud(self) -> FloatArray:
         """(M, 3) the map's points."""
@@ -138,11 +139,6 @@ class AdaptiveThreshold:
         if error > self._min_motion:
             self._squares += error * error
             self._count += 1
-
-
-def _matrix(pose: Pose2) -> FloatArray:
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    return np.array([[c, -s, 0.0, pose[0]], [s, c, 0.0, pose[1]], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def _planar(matrix: FloatArray) -> FloatArray:

@@ -10,7 +10,6 @@ from localization.core.measurements.scan import measure_scan
 from localization.core.space import (
     SpaceConfig,
     initial_space_state,
-    lift,
     lifted_transition,
     measure_body_turn,
     measure_gravity,
@@ -29,7 +28,7 @@ DELTA = np.array([0.08, 0.01, 0.12])
 
 def state_at(pose=POSE):
     made = initial_space_state(GyroNoise(), 0.01, SpaceConfig())
-    start = pose @ se3.inverse(lift(DELTA) @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, -0.02, 0.0])))
+    start = pose @ se3.inverse(se3.lift(DELTA) @ se3.exp(np.array([0.0, 0.0, 0.0, 0.01, -0.02, 0.0])))
     return State(made.layout, {**made.means, "pose": pose, "start": start, "gyro_scale": np.array([0.01])}, made.P)
 
 
