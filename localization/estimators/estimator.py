@@ -107,9 +107,10 @@ class Estimator(ABC):
     def step(self, step: Step) -> Estimate:
         """Return the estimate at the end of ``step``. Work that can wait until it is published waits for `run_deferred`."""
 
-    def run_deferred(self) -> None:
-        """Do the work that waits; otherwise `step` and `finish` do it first. Its results are in the next estimate."""
-        return
+    def run_deferred(self) -> bool:
+        """Do the work that waits; otherwise `step` and `finish` do it first. Its results are in the next estimate. Whether it has changed
+        `params`."""
+        return False
 
     def add_position(self, sample: PositionSample) -> None:
         """Add a measured position; estimators without a map frame leave it out."""

@@ -14,7 +14,7 @@ from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, initial_state, wheel_transition
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
-from localization.core.policies.outlier import PriorOutlier
+from localization.core.policies.outlier import NOTHING_MISSED, PriorOutlier
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
@@ -83,9 +83,8 @@ class EkfFusion(Estimator):
     def step(self, step: Step) -> Estimate:
         """Predict, update by the gyro, update by the scan."""
         self.run_deferred()
-        motion, unseen = replace(step.predicted, cov=self._wheel_noise.cov(step)), self._open_way.cov(step)
+        motion, unseen = replace(step.predicted, cov=self._wheel_noise.start_step(self.state, step)), self._open_way.cov(step)
         self._excitation.start_step(motion)
-        self._outlier.start_step()
         if step.restarts_calibration:
             self._restart_calibration()
         if step.restarts_map and self._sensor is not None:
@@ -94,25 +93,23 @@ class EkfFusion(Estimator):
         state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
         if unseen.any():  # the submap moves along
             state = inflate_both(state, ("pose", "map"), unseen)
-        self._wheel_noise.start_step(state, motion.cov)
         state, self._turn = self._update_turn(state, step)
-        self._scan = None
-        state, scan = self._update_scan(state, step)
-        motion = replace(motion, cov=motion.cov + unseen + self._outlier.cov)
+        state, scan, missed = self._update_scan(state, step)
+        self._scan = None if scan is None else replace(scan, S=scan.S - missed)
+        motion = replace(motion, cov=motion.cov + unseen + missed)
         self.wheels = WheelPrediction(motion, self.state["corrections"], self._excitation.is_turning)
         self.state = state
         self.counts_by_name["standing"] += step.is_standing
         twist, twist_cov = self._estimate_twist(step, is_measured=scan is not None)
         return Estimate(step.end_ns, state["pose"], state.cov("pose"), twist, twist_cov, None if scan is None else scan.nis)
 
-    def run_deferred(self) -> None:
+    def run_deferred(self) -> bool:
         """The last scan enters the submap, if it is a key scan. Deferred until its estimate is out."""
-        if not self._is_scan_pending or self._sensor is None:
-            return
-        self._is_scan_pending = False
-        if self._sensor.is_key(self.state["pose"]):
+        is_pending, self._is_scan_pending = self._is_scan_pending, False
+        if is_pending and self._sensor is not None and self._sensor.is_key(self.state["pose"]):
             error = self._sensor.insert_key_scan(self.state["pose"], self.state.cov("map"))
             self.state = propagate(self.state, key_scan_transition(self.state, error))
+        return False
 
     def start_key(self) -> None:
         """Clone the pose as "key": motions since the last keyframe count from here on."""
@@ -139,14 +136,15 @@ class EkfFusion(Estimator):
         self._wheel_noise.learn(innovation)
         return state, innovation
 
-    def _update_scan(self, state: State, step: Step) -> tuple[State, Innovation | None]:
-        """Match the scan of ``step`` and update by it, if there is one and it can be matched."""
+    def _update_scan(self, state: State, step: Step) -> tuple[State, Innovation | None, Cov3]:
+        """Match the scan of ``step`` and update by it, if there is one and it can be matched; with the covariance (3, 3) of what the wheels
+        missed."""
         sensor = self._sensor
         if sensor is None:
-            return state, None
+            return state, None, NOTHING_MISSED
         if step.scan is None:
             sensor.add_no_scan(step.end_ns, step.is_scan_excluded)
-            return state, None
+            return state, None, NOTHING_MISSED
         self.counts_by_name["scans"] += 1
         self._is_scan_pending = True
         if self._outlier.has_scene_moved and not step.rested_s:
@@ -154,18 +152,17 @@ class EkfFusion(Estimator):
             self._outlier.has_scene_moved = False
         swept, offset = self._slip.start_step(step)
         match = sensor.measure(swept, state["pose"], state.difference_cov("pose", "map"), offset)
-        state, match = self._outlier.apply(state, step, match, sensor.moved.cov(step))
+        match, missed = self._outlier.apply(step, match, None if match is not None else sensor.moved.cov(step))
+        state = inflate(state, "pose", missed) if missed.any() else state
         if match is None:
-            return state, None
+            return state, None, missed
         match, R = self._slip.refine(sensor, step, state["start"], match)
         R = R * (1.0 + step.rested_s / _REPEATED_S) ** 4
         self.counts_by_name["matched"] += 1
-        self._excitation.start_scan(state, R)
         self._open_way.add_scan(R, step)
-        state, innovation = update(state, measure_scan(state, match.measured, R), self._excitation.considered())
+        state, innovation = update(state, measure_scan(state, match.measured, R), self._excitation.considered_by_scan(state, R))
         self._wheel_noise.learn(innovation)
-        self._scan = replace(innovation, S=innovation.S - self._outlier.cov)
-        return state, innovation
+        return state, innovation, missed
 
     def _estimate_twist(self, step: Step, *, is_measured: bool) -> tuple[Twist2, Cov3 | None]:
         """Twist (3,) at the stamp and its covariance: by the motion in the step, how the wheels' rates changed in it, and the gyro."""
@@ -174,8 +171,10 @@ class EkfFusion(Estimator):
         mean, cov = mean_twist(*self.state.between("start", "pose"), step.duration)
         self._slip.end_step(step, mean, is_measured)
         twist, cov = twist_at_end(mean, cov, step.twist_change, math.inf if is_measured or not step.has_wheels else step.duration)
+        if step.turn is None or step.is_standing:
+            return twist, cov
         gyro = self.gyro_calibration
-        rate = None if gyro is None or step.turn is None or step.is_standing else gyro.correct_rate(step.turn)
+        rate = None if gyro is None else gyro.correct_rate(step.turn)
         return (twist, cov) if rate is None else fuse_turn(twist, cov, *rate)
 
     @property

@@ -126,12 +126,14 @@ class GraphFusion(FilteredOdometry):
         is_smaller = 0.0 < np.trace(odometry_cov[:2, :2]) < np.trace(cov[:2, :2])
         return odometry_cov.copy() if is_bound and is_smaller else cov
 
-    def run_deferred(self) -> None:
-        """Do what was deferred until the estimate was published: update the submap, add a keyframe, close loops, add positions."""
+    def run_deferred(self) -> bool:
+        """Do what was deferred until the estimate was published: update the submap, add a keyframe, close loops, add positions. Whether a
+        keyframe has changed the corrections."""
         self.odometry.run_deferred()
-        if self._is_keyframe_due:
-            self._is_keyframe_due = False
+        is_due, self._is_keyframe_due = self._is_keyframe_due, False
+        if is_due:
             self._add_keyframe()
+        return is_due
 
     def add_position(self, sample: PositionSample) -> None:
         """A position by GPS. It is placed once the odometry has come to its stamp."""

@@ -95,7 +95,7 @@ class MapFusion(FilteredOdometry):
             estimate, pose=pose, covariance=covariance, odometry=(estimate.pose, estimate.covariance), map_T_odom=self._map_T_odom
         )
 
-    def run_deferred(self) -> None:
+    def run_deferred(self) -> bool:
         """Do what was deferred until the estimate was published: update the submap, and localize the keyframe in the map."""
         self.odometry.run_deferred()
         passed_s, self._waiting_s = self._waiting_s, 0.0
@@ -110,6 +110,7 @@ class MapFusion(FilteredOdometry):
             self._n_losses += was_localized and self.localizer.state == "lost"
             self._take_pose()
             self._record()
+        return False
 
     def add_position(self, sample: PositionSample) -> None:
         """A position of the plane in which the map's drive fused its own, as by GNSS: it narrows where the robot may be."""

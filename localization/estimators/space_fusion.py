@@ -111,20 +111,21 @@ class SpaceFusion(Estimator):
         self._odom_T_map = pose @ se3.exp(state["map"]) @ se3.inverse(pose) @ self._odom_T_map
         return State(state.layout, {**state.means, "map": np.zeros(6)}, state.P)
 
-    def run_deferred(self) -> None:
+    def run_deferred(self) -> bool:
         """The last cloud enters the submap, if it is a key cloud. Deferred until its estimate is out."""
         cloud, self._cloud = self._cloud, None
         if cloud is None or self._map is None:
-            return
+            return False
         pose, c = self.state["pose"], self._lidar
         if self._last_key is not None:
             moved = se3.log(se3.inverse(self._last_key) @ pose)
             if math.hypot(*moved[:3]) < c.key_distance_m and math.hypot(*moved[3:]) < c.key_angle_rad:
-                return
+                return False
         self._last_key = pose
         share, new = self._map.insert(se3.inverse(self._odom_T_map) @ pose, cloud)
         noise = np.zeros((6, 6)) if self._cloud_cov is None else key_scan_noise(self._cloud_cov, new)
         self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(share, noise)))
+        return False
 
     def _update_cloud(self, step: Step) -> float | None:
         """Match the cloud of ``step`` and update by it; the NIS of x, y and yaw in the body's axes (3 degrees of freedom, as in the plane).
@@ -147,7 +148,7 @@ class SpaceFusion(Estimator):
         if self._map is None:
             self._map = CloudMap(c.voxel_size_m or choose_voxel_size(points), c.range_noise_m)
             self._cloud = thin(points, self._map.cell)
-            self._lost.add_matched(step.end_ns)
+            self._lost.add(step.end_ns)
             return None
         self._cloud = thin(points, self._map.cell)
         prior = se3.inverse(self._odom_T_map) @ self.state["pose"]
@@ -155,7 +156,7 @@ class SpaceFusion(Estimator):
         if match.mapped < _MIN_POINTS_MAPPED or match.overlap < c.lost_below:
             self._lost.add(step.end_ns, "lost")
             return None
-        self._lost.add_matched(step.end_ns)
+        self._lost.add(step.end_ns)
         self._counts["matched"] += 1
         cov = match.cov + SYSTEMATIC_COV
         if self._cloud_cov is None:  # the first cloud errs as this one does

@@ -37,17 +37,21 @@ class LostScans:
         self._lost_ns = 0
         self._longest: tuple[int, int] = (0, 0)  # length and start [ns]
 
-    def add_matched(self, stamp_ns: int) -> None:
-        """A scan that was matched."""
-        self._count(stamp_ns)
-        if self._last_ns > self._matched_ns:
-            self._close(stamp_ns)
-        self._matched_ns = self._last_ns = stamp_ns
-
-    def add(self, stamp_ns: int, cause: str) -> None:
-        """A scan that was not."""
-        self._count(stamp_ns)
-        self.causes[cause] = self.causes.get(cause, 0) + 1
+    def add(self, stamp_ns: int, cause: str = "") -> None:
+        """A scan, and why it was not matched; "" where it was."""
+        if self._first_ns is None:
+            self._first_ns = self._matched_ns = self._last_ns = stamp_ns
+        else:
+            self.add_no_scan(stamp_ns)
+            self._gaps_ns.append(stamp_ns - self._scan_ns)
+        self.scans += 1
+        self._scan_ns, self._is_silent = stamp_ns, False
+        if cause:
+            self.causes[cause] = self.causes.get(cause, 0) + 1
+        else:
+            if self._last_ns > self._matched_ns:
+                self._close(stamp_ns)
+            self._matched_ns = stamp_ns
         self._last_ns = stamp_ns
 
     def add_no_scan(self, stamp_ns: int) -> None:
@@ -80,15 +84,6 @@ class LostScans:
     def ongoing_s(self) -> float:
         """Time from the last match to the last scan, or until now where scans have ceased [s]."""
         return (self._last_ns - self._matched_ns) * 1e-9
-
-    def _count(self, stamp_ns: int) -> None:
-        if self._first_ns is None:
-            self._first_ns = self._matched_ns = self._last_ns = stamp_ns
-        else:
-            self.add_no_scan(stamp_ns)
-            self._gaps_ns.append(stamp_ns - self._scan_ns)
-        self.scans += 1
-        self._scan_ns, self._is_silent = stamp_ns, False
 
     @property
     def _period_ns(self) -> int:

@@ -60,10 +60,7 @@ class ScanMatchingSensor:
         """
         self._scan, self._prior, self._cov = None, prior, cov
         found, cause = self._measure(step, offset)
-        if cause:
-            self.lost.add(step.end_ns, cause)
-        else:
-            self.lost.add_matched(step.end_ns)
+        self.lost.add(step.end_ns, cause)
         return found
 
     def _measure(self, step: Step, offset: Tangent2) -> tuple[ScanMatch | None, str]:

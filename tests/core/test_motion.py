@@ -52,29 +52,28 @@ class Chain:
         self.config = config
         self.state = initial_state(GYRO, CORRECTED, config)
         self.noise, self.excitation = WheelNoiseScale(), Excitation(ROBOT.geometry.track_width_m, CORRECTED.min_track_over_radius)
-        self.noise.start_step(self.state, NOTHING)
+        at_rest = Step(0, 1, Motion(np.zeros(3), NOTHING), np.zeros(3), np.zeros(3), True, True)
+        self.noise.start_step(self.state, at_rest)
 
     def predict(self, step, is_turning=True):
-        motion = dataclasses.replace(step.predicted, cov=self.noise.cov(step))
+        motion = dataclasses.replace(step.predicted, cov=self.noise.start_step(self.state, step))
         self.excitation.is_turning = is_turning
         state = clone(self.state, "pose", "start")
         self.state = propagate(state, wheel_transition(state, step, motion, GYRO, CORRECTED, self.config))
-        self.noise.start_step(self.state, motion.cov)
 
-    def _update(self, measurement):
-        self.state, innovation = update(self.state, measurement, self.excitation.considered())
+    def _update(self, measurement, considered):
+        self.state, innovation = update(self.state, measurement, considered)
         self.noise.learn(innovation)
         return innovation.nis
 
     def update_turn(self, turn):
-        return self._update(measure_turn(self.state, turn))
+        return self._update(measure_turn(self.state, turn), self.excitation.considered())
 
     def update_scan(self, measured, R, outlier_cov):
         state = inflate(self.state, "pose", outlier_cov)
-        self.excitation.start_scan(state, R)
         before, self.state = self.state, state
         try:
-            return self._update(measure_scan(state, measured, R))
+            return self._update(measure_scan(state, measured, R), self.excitation.considered_by_scan(state, R))
         except EstimatorError:
             self.state = before
             raise
@@ -624,9 +623,9 @@ def test_wheel_noise_scale_does_not_change_steps_without_wheels():
     ekf = filter_at()
     ekf.noise.value = 4.0
     driven = step_of([0.1, 0.0, 0.0])
-    np.testing.assert_allclose(ekf.noise.cov(driven), 4.0 * driven.predicted.cov)
+    np.testing.assert_allclose(ekf.noise.start_step(ekf.state, driven), 4.0 * driven.predicted.cov)
     for step in (dataclasses.replace(driven, has_wheels=False), dataclasses.replace(driven, is_standing=True)):
-        np.testing.assert_array_equal(ekf.noise.cov(step), step.predicted.cov)
+        np.testing.assert_array_equal(ekf.noise.start_step(ekf.state, step), step.predicted.cov)
         ekf.predict(step)
         ekf.update_scan(se2.compose(ekf["pose"], np.array([0.5, 0.0, 0.0])), LIDAR, NOTHING)
         assert ekf.noise.value == 4.0

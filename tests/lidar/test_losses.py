@@ -31,7 +31,7 @@ def counted(matched: str) -> LostScans:
     """One scan a second: `m` matched, `l` lost, `s` stale, `x` excluded."""
     lost = LostScans()
     for second, kind in enumerate(matched):
-        lost.add_matched(second * S) if kind == "m" else lost.add(second * S, {"l": "lost", "s": "stale", "x": "excluded"}[kind])
+        lost.add(second * S) if kind == "m" else lost.add(second * S, {"l": "lost", "s": "stale", "x": "excluded"}[kind])
     return lost
 
 

@@ -14,7 +14,7 @@ def test_lost_scans_time_is_between_matches_but_for_one_period() -> None:
     matched = [True, True, False, False, True, True, False, True, True, False, False, False]
     for t, is_matched in enumerate(matched):
         if is_matched:
-            lost.add_matched(10 * S + t * S)
+            lost.add(10 * S + t * S)
         else:
             lost.add(10 * S + t * S, "lost" if t < 6 else "sparse")
     assert lost.scans == len(matched)
@@ -44,7 +44,7 @@ def test_lost_scans_count_silence_until_next_scan() -> None:
     lost, tenth = LostScans(), S // 10
     for k in range(120):
         is_scan = k <= 20 or 70 <= k <= 80
-        lost.add_matched(k * tenth) if is_scan else lost.add_no_scan(k * tenth)
+        lost.add(k * tenth) if is_scan else lost.add_no_scan(k * tenth)
         if k == 25:
             assert lost.ongoing_s == 0.0
         if k == 60:
@@ -60,7 +60,7 @@ def test_lost_scans_count_gap_without_steps_between() -> None:
     """Also where that scan is not matched; gaps as they are between few scans are none."""
     lost = LostScans()
     for t in (0, 1, 2, 3, 9, 10):
-        lost.add(t * S, "lost") if t == 9 else lost.add_matched(t * S)
+        lost.add(t * S, "lost") if t == 9 else lost.add(t * S)
     assert (lost.silences, lost.longest) == (1, (6.0, 3.0))
 
 
@@ -68,7 +68,7 @@ def test_lost_scans_after_silence_count_the_next_one_alike() -> None:
     """A silence does not make longer ones usual."""
     lost = LostScans()
     for t in (0.0, 0.1, 0.2, 100.1):
-        lost.add_matched(int(t * S))
+        lost.add(int(t * S))
     lost.add_no_scan(280 * S)
     assert lost.silences == 2
     assert lost.longest == (pytest.approx(179.9), pytest.approx(100.1))

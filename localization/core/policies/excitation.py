@@ -30,11 +30,12 @@ class Excitation:
         d = motion.delta
         self.is_turning = bool(abs(d[2]) * self._track_m >= self._min_track_over_radius * math.hypot(d[0], d[1]))
 
-    def start_scan(self, state: State, R: Cov3) -> None:
-        """A scan with covariance ``R`` (3, 3) follows. The way is open where the scan determines it less than ``state``, until the next
-        scan."""
+    def considered_by_scan(self, state: State, R: Cov3) -> set[str]:
+        """Names of the variables that have no gain by a scan with covariance ``R`` (3, 3). The way is open where the scan determines it
+        less than ``state``, until the next scan."""
         P, pose, submap = state.P, state.layout.rows["pose"].start, state.layout.rows["map"].start
         self._is_way_open = bool(R[0, 0] > P[pose, pose] + P[submap, submap] - 2.0 * P[pose, submap])
+        return self.considered()
 
     def considered(self) -> set[str]:
         """Names of the variables that have no gain."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.core.filter import inflate
-from localization.core.state import State
 from localization.events import Step
 from localization.lidar import ScanMatch
 from motion_models.se2 import Cov3
 
 _MIN_OVERLAP = 0.7
 """Share of a scan's points on the submap, from which on it fits: below it the matcher searches another pose (`LidarConfig`)."""
+
+NOTHING_MISSED: Cov3 = np.zeros((3, 3))
 
 
 class PriorOutlier:
@@ -20,18 +20,12 @@ class PriorOutlier:
     def __init__(self) -> None:
         self.count = 0
         """Matches for which the prior was an outlier."""
-        self.cov: Cov3 = np.zeros((3, 3))
-        """(3, 3) of what the wheels missed in the last step besides their noise."""
         self.has_scene_moved = False
         """The last scan of the robot at rest fitted elsewhere, or hardly: what the submap has there has moved."""
 
-    def start_step(self) -> None:
-        """No outlier yet."""
-        self.cov = np.zeros((3, 3))
-
-    def apply(self, state: State, step: Step, match: ScanMatch | None, moved_cov: Cov3 | None) -> tuple[State, ScanMatch | None]:
-        """The state before the update by the scan of ``step``, and ``match`` if it is to be used; ``moved_cov`` (3, 3) of a robot that was
-        moved by hand, or None.
+    def apply(self, step: Step, match: ScanMatch | None, moved_cov: Cov3 | None) -> tuple[ScanMatch | None, Cov3]:
+        """``match`` if it is to be used, and the covariance (3, 3) of what the wheels missed in ``step`` besides their noise;
+        ``moved_cov`` (3, 3) of a robot that was moved by hand, or None.
 
         The wheels of a robot at rest count nothing wrongly: a scan that fits elsewhere is no measurement of its pose.
         """
@@ -39,10 +33,8 @@ class PriorOutlier:
         if step.rested_s:
             if match is not None:
                 self.has_scene_moved = is_outlier or match.overlap < _MIN_OVERLAP
-            return state, None if is_outlier else match
+            return None if is_outlier else match, NOTHING_MISSED
         if is_outlier and match is not None:
             self.count += 1
-            self.cov = match.outlier_cov
-        elif match is None and moved_cov is not None:
-            self.cov = moved_cov
-        return inflate(state, "pose", self.cov) if self.cov.any() else state, match
+            return match, match.outlier_cov
+        return match, moved_cov if match is None and moved_cov is not None else NOTHING_MISSED

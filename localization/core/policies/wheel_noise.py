@@ -20,24 +20,20 @@ for the sum of many (ACES with a least scale of 1/4 for each axis: 0.099 -> 0.13
 
 
 class WheelNoiseScale:
-    """`cov` before the prediction, `start_step` after it, `learn` from each update of the step."""
+    """`start_step` before the prediction, `learn` from each update of the step."""
 
     def __init__(self) -> None:
         self.value = 1.0
         """Factor on variances."""
-        self._is_driving = False
         self._information, self._slip_cov = 0.0, np.zeros((0, 0))  # Fisher information; the part of P that is this step's slip
 
-    def cov(self, step: Step) -> Cov3:
-        """(3, 3) of the wheels' motion in ``step``, which begins, with the factor where the wheels move."""
-        self._is_driving = step.has_wheels and not step.is_standing
-        return step.cov * (self.value if self._is_driving else 1.0)
-
-    def start_step(self, state: State, cov: Cov3) -> None:
-        """``state`` was predicted by the wheels' motion of the step with ``cov`` (3, 3)."""
+    def start_step(self, state: State, step: Step) -> Cov3:
+        """(3, 3) of the wheels' motion in ``step``, which begins at ``state``, with the factor where the wheels move."""
+        is_driving = step.has_wheels and not step.is_standing
+        cov, rows = step.cov * (self.value if is_driving else 1.0), state.layout.rows["pose"]
         self._slip_cov = np.zeros_like(state.P)
-        rows = state.layout.rows["pose"]
-        self._slip_cov[rows, rows] = cov * self._is_driving
+        self._slip_cov[rows, rows] = cov * is_driving
+        return cov
 
     def learn(self, innovation: Innovation) -> None:
         """One step of Fisher scoring for log a, where S = a dS/da + ... and a dS/da = H (slip) H^T (maximum likelihood; Mehra 1970):
