@@ -140,14 +140,13 @@ class Pipeline:
         while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
             self.run_deferred()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
-            step = self.checks.apply(step)  # without faulty sensors
+            step = self.checks.apply(step, self.estimator)  # without faulty sensors
             if self.space_choice is not None and self.space_choice.has_clouds:
                 self.estimator = self.space_choice.choose(self.estimator, self.attitude, step.start_ns)
             estimate = self.estimator.step(step)  # predict, match, update
             if self.space_choice is not None and self.space_choice.has_clouds:
                 self.space_choice.add(estimate, self.attitude)
-            self.checks.compare_residuals(self.estimator)
-            estimate = self.checks.inflate(estimate)
+            estimate = self.checks.inflate(step, estimate, self.estimator)
             if estimate.nis is not None:
                 self.synchronizer.restart_gap()
             self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
@@ -158,8 +157,9 @@ class Pipeline:
     def run_deferred(self) -> None:
         """Do the work that published estimates need not wait for, and predict with what it has corrected. Left out, the next `process`
         does it first."""
-        self.estimator.run_deferred()
-        self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
+        self.checks.examine(self.estimator)
+        if self.estimator.run_deferred():
+            self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
 
     def finish(self) -> list[Estimate]:
         """The estimates that still waited for events when these ended."""
@@ -168,6 +168,7 @@ class Pipeline:
     def stream_rest(self) -> Iterator[Estimate]:
         """`finish`, one estimate at a time."""
         yield from self._estimates(is_last=True)
+        self.checks.examine(self.estimator, is_last=True)
         self.run_deferred()
 
     @property

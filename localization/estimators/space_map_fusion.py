@@ -62,7 +62,7 @@ class SpaceMapFusion(Estimator):
         map_T_odom = se2.compose(pose, se2.inverse(estimate.pose))
         return replace(estimate, pose=pose, covariance=covariance, odometry=(estimate.pose, estimate.covariance), map_T_odom=map_T_odom)
 
-    def run_deferred(self) -> None:
+    def run_deferred(self) -> bool:
         """Do what was deferred until the estimate was published: update the submap, and localize the keyframe in the map."""
         cloud, self._cloud = self._cloud, None
         if cloud is not None:
@@ -71,7 +71,7 @@ class SpaceMapFusion(Estimator):
             self._n_losses += was_localized and self.localizer.state == "lost"
             self.odometry.start_key()
             self._has_key = True
-        self.odometry.run_deferred()
+        return self.odometry.run_deferred()
 
     def _motion_since_keyframe(self) -> SpaceMotion:
         return SpaceMotion(*self.odometry.state.between("key", "pose")) if self._has_key else SpaceMotion(np.eye(4), np.zeros((6, 6)))

@@ -5,33 +5,47 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
-import numpy as np
-
-from localization.estimators import Estimate, Estimator
+from localization.estimators import Estimate, Estimator, Residuals
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.clocks import ClockCheck
-from localization.sensor_checks.contradictions import Contradictions, GyroRate
+from localization.sensor_checks.contradictions import Contradictions
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
+from localization.sensor_checks.gyro_rate import GyroRate, rate_off
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
-from localization.sensor_checks.moving_objects import MovingObjects
+from localization.sensor_checks.moving_objects import MAX_NIS, MovingObjects
 from localization.sensor_checks.own_body import OwnBody
+from localization.sensor_checks.reckoning import ESTIMATE
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
-from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import Pose2
+
+_TOGETHER_S = 0.5
+"""Steps of this time are examined together while no check acts [s]. Faults are found by windows of 2.5 s and more."""
+
+
+class _Record(NamedTuple):
+    """A step, and what the estimator has made of it."""
+
+    step: Step
+    estimate: Estimate
+    residuals: Residuals | None
 
 
 class SensorChecks:
-    """`apply` to each step before the estimator, `inflate` its estimate afterwards."""
+    """`apply` to each step before the estimator, `inflate` its estimate, and `examine` the steps that were published.
+
+    While the sensors agree, steps and estimates are as they came: they are recorded, and examined together afterwards. Where a check
+    changes them, or the wheels stand, each step is examined as it comes.
+    """
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, clock_sigma_s: float = 0.0) -> None:
         """``clock_sigma_s``: by how much the clock of the poses may be off [s]."""
@@ -44,8 +58,8 @@ class SensorChecks:
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
         self._clocks = ClockCheck(faults, clock_sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
-        self._step: Step | None = None
-        self._pose: Pose2 | None = None
+        self._records: list[_Record] = []
+        self._is_acting = True
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
@@ -55,60 +69,106 @@ class SensorChecks:
         """``scan`` with the times of its points as they were found to be."""
         return replace(scan, offsets=-scan.offsets) if self._sweep_times.is_reversed and scan.is_planar else scan
 
-    def apply(self, step: Step) -> Step:
-        """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain."""
+    def apply(self, step: Step, estimator: Estimator) -> Step:
+        """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain; ``estimator`` has made
+        the estimates so far."""
         if not math.isfinite(step.predicted.delta.sum()):
             return step  # the estimator refuses it
+        step = self._own_body.remove(step)
+        if not self._is_acting and not step.is_standing and (step.turn is None or not rate_off(step)):
+            return step
+        self._examine_records(estimator)
+        self._is_acting = True
+        step = self._examine_step(step, is_to_come=True)
+        if self._sweep_times.has_drawn_map:
+            self._sweep_times.has_drawn_map = False
+            step = replace(step, restarts_map=True)  # without the scans that were distorted
+        if self._faults.have_scans_led_away:
+            self._faults.have_scans_led_away = False
+            step = self._inflation.lead_back(step)
+        return step
+
+    def inflate(self, step: Step, estimate: Estimate, estimator: Estimator) -> Estimate:
+        """``estimate`` of ``estimator`` after ``step`` with the covariance of what faulty sensors have done to it; unchanged without one
+        (LiDAR alone)."""
+        record = _Record(step, estimate, estimator.residuals)
+        if self._is_acting:
+            self._add(record, estimator)
+        else:
+            self._records.append(record)
+            if estimate.nis is None or estimate.nis < MAX_NIS:
+                return estimate
+            self._examine_records(estimator)
+        estimate, self._is_acting = self._inflate(record, estimator), self._has_to_act()
+        return estimate
+
+    def examine(self, estimator: Estimator, *, is_last: bool = False) -> None:
+        """Examine the steps that ``estimator`` has published, once there are enough, or none ``is_last``."""
+        records = self._records
+        if records and (is_last or (records[-1].step.end_ns - records[0].step.start_ns) * 1e-9 >= _TOGETHER_S):
+            last = records[-1]
+            self._examine_records(estimator)
+            self._inflate(last, estimator)
+            self._is_acting = self._has_to_act()
+
+    def _has_to_act(self) -> bool:
+        """Whether a check changes the next step, or its estimate."""
+        is_led_away = self._sweep_times.has_drawn_map or self._faults.have_scans_led_away
+        is_step_changed = self._gyro_rate.is_acting or self._contradictions.is_acting or self._moving.is_acting
+        return is_led_away or is_step_changed or self._inflation.is_acting
+
+    def _examine_records(self, estimator: Estimator) -> None:
+        records, self._records = self._records, []
+        for record in records:
+            self._examine_step(record.step, is_to_come=False)
+            self._add(record, estimator)
+
+    def _examine_step(self, step: Step, *, is_to_come: bool) -> Step:
+        """``step`` as it should be for the estimator, for which it ``is_to_come``, or was."""
         self._faults.start_step(step)
         if step.scan is not None and not step.scan.is_planar:
             self._tilt.add(step.scan)
-        step = self._own_body.remove(step)
-        self._inflation.add_step(step)
-        was_reversed = self._sweep_times.is_reversed
+        self._own_body.report()
         if self._window.add(step, self._faults.now_s):
-            agree = self._contradictions.compare(self._window)
-            if self._sweep_times.compare(self._window) and agree:
+            self._sweep_times.compare(self._window)
+            if self._contradictions.compare(self._window) and self._sweep_times.are_likely_right:
                 self._inflation.restart()
-        if self._sweep_times.is_reversed and not was_reversed:
-            step = replace(step, restarts_map=True)  # without the scans that were distorted
-        excluded = self._contradictions.excluded if self._faults.declared else ()
+        excluded = self._contradictions.excluded if self._faults.declared and is_to_come else ()
         step = self._gyro_rate.apply(step)
         step = replace(step, turn=None) if "gyro" in excluded else step
         step = step.without_scan() if "LiDAR" in excluded else step
         step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
-        step = self._moving.apply(step)
-        if self._faults.has_left_scans_out:
-            step = self._inflation.lead_back(step)
-        self._step = step
-        return step
+        self._inflation.reckoning.predict(step)
+        return self._moving.apply(step, is_to_come=is_to_come)
 
-    def compare_residuals(self, estimator: Estimator) -> None:
-        """Compare the innovations of the last step, and the learned parameters, with their covariances.
+    def _add(self, record: _Record, estimator: Estimator) -> None:
+        """Compare innovations and learned parameters with their covariances.
 
         Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
         """
-        residuals, step = estimator.residuals, self._step
-        if step is None or residuals is None:
+        step, estimate, residuals = record
+        pose = estimate.pose if estimate.odometry is None else estimate.odometry[0]
+        self._inflation.reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
+        self._moving.keep_view()
+        if estimate.nis is not None:
+            self._standstill.restart()
+        if residuals is None:
             return
-        self._clocks.add(estimator)
         if step.scan is not None:
             self._is_lidar_placed = step.scan.frame_id in self._mounts
         self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)
 
-    def inflate(self, estimate: Estimate) -> Estimate:
-        """``estimate`` with the covariance of what faulty sensors have done to it; unchanged without one (LiDAR alone)."""
+    def _inflate(self, record: _Record, estimator: Estimator) -> Estimate:
+        """The estimate with the covariance of the distances from dead reckonings, and of clocks that are apart."""
+        scan, estimate = record.step.scan, record.estimate
         if estimate.covariance is None:
             return estimate
-        before, self._pose = self._pose, estimate.pose if estimate.odometry is None else estimate.odometry[0]
-        delta = np.zeros(3) if before is None else se2.between(before, self._pose)
-        if before is not None and self._step is not None:
-            if estimate.nis is not None:
-                self._standstill.restart()
-            self._moving.compare_estimate(delta, estimate.nis)
-            self._consistency.compare_estimate(delta, estimate.nis)
-        inflated = self._inflation.inflate(estimate, delta)
-        scan = None if self._step is None else self._step.scan
-        if scan is not None and self._places.update(lambda: self._window.profile(scan), self._pose):
+        self._clocks.add(estimator)
+        self._moving.compare_estimate(estimate.nis)
+        self._consistency.compare_estimate(estimate.nis)
+        inflated = self._inflation.inflate(estimate)
+        pose = self._inflation.reckoning.poses[ESTIMATE]
+        if scan is not None and self._places.update(lambda: self._window.profile(scan), pose):
             self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on
         return inflated
 

@@ -8,21 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from localization.events import Step
 from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, WAY, Comparison, Gain, Quantity, Sensor
 from localization.sensor_checks.faults import MEMORY_S, Evidence, FaultLog, SensorFault
+from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.window import WINDOW_BINS, Bins, Window
 
-GYRO_RATE = SensorFault(
-    "the gyro turns by {rate:.1f} rad/s against the wheels, more than slip explains. It is not used for 3 s after each time. Check"
-    " the units of the IMU's driver.",
-    reference="wheels",
-)
 GYRO_OPPOSITE = SensorFault(
     "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign{or_wheels}.",
     reference="wheels",
@@ -72,9 +66,6 @@ _REPEATED_RAD_S = 1e-7
 _MIN_STUCK_OFF_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 0.05, 0.002
 """A gyro that repeats is stuck where the wheels turn by something else, which its bias (ten prior sigmas of the shipped robots) does not
 explain; over a whole window, where the wheels turn at all [rad/s]."""
-_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE = 2.0, 3.0
-"""Difference of the gyro's rate from the wheels' that no slip explains, at least so large and so many times the wheels' rate. On the Husky
-outdoors it is 0.22 rad/s at most."""
 
 
 class Symptom(NamedTuple):
@@ -122,6 +113,7 @@ class Contradictions:
     def __init__(self, faults: FaultLog) -> None:
         self._faults, self._stuck = faults, Evidence()
         self._evidence = [Evidence(symptom.memory_s) for symptom in SYMPTOMS]
+        self._is_any_shown = False  # by the last comparison
 
     def compare(self, window: Window) -> bool:
         """Declare faults that last; whether turns of two sensors are equal, ways are where there are scans, and nothing contradicts."""
@@ -131,18 +123,23 @@ class Contradictions:
             if gain.is_equal:
                 equal[comparison.quantity] |= {comparison.first, comparison.second}
         agree = bool(equal[TURN]) and (bool(equal[WAY]) or not window.has_scans)
+        self._is_any_shown = is_repeating(window.bins)
+        self._stuck.add(self._is_any_shown, window.end_s, window.begin_s)
         for symptom, evidence in zip(SYMPTOMS, self._evidence, strict=True):
             is_shown = symptom.is_shown(gains)
             is_refuted = symptom.sensor in equal[symptom.comparison.quantity]
             evidence.add(True if is_shown else False if is_refuted else None, window.end_s, window.begin_s)
             if is_shown and evidence.is_lasting and evidence.is_majority:
                 self._faults.declare(symptom.fault, evidence.since_s, _numbers(symptom, gains))
-            agree &= not is_shown
-        is_stuck = is_repeating(window.bins)
-        self._stuck.add(is_stuck, window.end_s, window.begin_s)
+            self._is_any_shown |= is_shown
         if self._stuck.is_lasting and self._stuck.is_majority:
             self._faults.declare(GYRO_STUCK, self._stuck.since_s, {})
-        return agree and not is_stuck
+        return agree and not self._is_any_shown
+
+    @property
+    def is_acting(self) -> bool:
+        """Sensors are left out, or may have to be soon."""
+        return self._is_any_shown or bool(self._faults.declared and self.excluded)
 
     @property
     def excluded(self) -> set[Sensor]:
@@ -175,22 +172,3 @@ def is_repeating(bins: Bins) -> bool:
         return False
     is_off = float(np.mean((wheels - gyro) ** 2)) > _MIN_STUCK_OFF_RAD_S**2
     return is_off or (len(wheels) == WINDOW_BINS and float(wheels.std()) > _MIN_STUCK_WHEELS_RAD_S)
-
-
-class GyroRate:
-    """Leaves out a gyro whose rates no slip explains, at once, and for the next seconds."""
-
-    def __init__(self, faults: FaultLog) -> None:
-        self._faults = faults
-        self._last_s = -math.inf  # when the rate was last one that no slip explains
-
-    def apply(self, step: Step) -> Step:
-        """``step`` without the gyro, now and for the next seconds."""
-        now_s = self._faults.now_s
-        if step.turn is not None and step.has_wheels and step.duration > 0.0 and not step.is_standing:
-            by_wheels = float(step.predicted.delta[2]) / step.duration
-            off = abs(step.turn.angle / step.duration - by_wheels)
-            if off > max(_MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE * abs(by_wheels)):
-                self._last_s = now_s
-                self._faults.declare(GYRO_RATE, now_s, {"rate": off})
-        return replace(step, turn=None) if now_s - self._last_s < MEMORY_S else step

@@ -53,15 +53,15 @@ class FaultLog:
         self.declared: dict[SensorFault, DetectedFault] = {}
         """Faults that were declared, and are not explained by later ones."""
         self._start_ns: int | None = None
-        self.has_left_scans_out = False
-        """A fault of scans was found in this step."""
+        self.have_scans_led_away = False
+        """A fault of scans was found, and the estimate is where these have led it."""
         self._revised: dict[SensorFault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
         """Begin ``step``: faults declared from now on have its time."""
         if self._start_ns is None:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
-        self.now_s, self.has_left_scans_out = (step.end_ns - self._start_ns) * _NS, False
+        self.now_s = (step.end_ns - self._start_ns) * _NS
 
     def declare(self, fault: SensorFault, at_s: float, numbers: Mapping[str, float | str]) -> None:
         """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
@@ -70,7 +70,7 @@ class FaultLog:
         self.declared[fault] = DetectedFault(fault, max(at_s, 0.0), fault.message.format(**numbers))
         if fault.explains is not None:
             self.declared.pop(fault.explains, None)
-        self.has_left_scans_out |= fault.is_of_scans
+        self.have_scans_led_away |= fault.is_of_scans
         if fault.reference is not None:
             self.inflation.add_distance_from(fault.reference)
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from localization.estimators import Estimate
 from localization.events import Step
+from localization.sensor_checks.reckoning import ESTIMATE, GYRO, WHEELS, Reckoning
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Pose2
+from motion_models.se2 import Cov3, FloatArray
 
 DeadReckoning = Literal["wheels", "wheels and gyro"]
 """Motion by the wheels alone, and that with the turns by the gyro."""
@@ -21,7 +22,10 @@ class CovarianceInflation:
     """Differences that were added, carried along with the body as the covariance of an estimate is."""
 
     def __init__(self) -> None:
-        self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)  # motion since the sensors last agreed
+        self.reckoning = Reckoning()
+        """By the sensors, and by the estimate."""
+        self._agreed = self.reckoning.poses  # where the sensors last agreed
+        self._pose = np.zeros(3)  # of the estimate, of which `_spread` is a right perturbation
         self._pending, self._spread = np.zeros((3, 3)), np.zeros((3, 3))
         self._has_spread = False
         self._since_ns: int | None = None
@@ -40,20 +44,13 @@ class CovarianceInflation:
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
-        self._estimated, self._by_wheels, self._by_gyro = np.zeros(3), np.zeros(3), np.zeros(3)
-
-    def add_step(self, step: Step) -> None:
-        """Dead reckoning by the sensors."""
-        delta = step.predicted.delta
-        self._by_wheels = se2.compose(self._by_wheels, delta)
-        if step.turn is not None:
-            delta = np.array([delta[0], delta[1], step.turn.angle])
-        self._by_gyro = se2.compose(self._by_gyro, delta)
+        self._agreed = self.reckoning.poses
 
     def lead_back(self, step: Step) -> Step:
         """``step`` at whose end the estimate is where wheels and gyro lead, with the distance to there as its covariance; what was learned
         until then is dropped."""
-        off = se2.local(se2.compose(self._estimated, step.predicted.delta), self._by_gyro)
+        estimated = se2.compose(se2.between(self._agreed[ESTIMATE], self.reckoning.before), step.predicted.delta)
+        off = se2.local(estimated, se2.between(self._agreed[GYRO], self.reckoning.poses[GYRO]))
         motion = replace(step.predicted, delta=se2.retract(step.predicted.delta, off), cov=step.predicted.cov + np.outer(off, off))
         return replace(step, predicted=motion, turn=None, restarts_calibration=True)
 
@@ -61,21 +58,26 @@ class CovarianceInflation:
         """Inflate by how far the estimate is from ``reference``."""
         if self.are_wheels_outvoted:
             return
-        self.add(se2.local(self._estimated, self._by_wheels if reference == "wheels" else self._by_gyro))
+        self.add(self.reckoning.distance(self._agreed, WHEELS if reference == "wheels" else GYRO))
 
     def add(self, difference: FloatArray) -> None:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""
         self._pending, self.count, self._has_spread = self._pending + np.outer(difference, difference), self.count + 1, True
 
     @property
-    def is_inflating(self) -> bool:
-        """Whether the covariance has anything of a fault."""
-        return (self._has_spread or bool(self.lasting)) and bool(self.total.any())
+    def is_acting(self) -> bool:
+        """Whether estimates get another covariance."""
+        return self.is_inflating or self.possible is not None or self.late_s > 0.0
 
     @property
-    def lasting(self) -> list[FloatArray]:
-        """(3,) each: differences of sensors that disagree at present."""
-        return [difference for difference in (self.ongoing_pair, self.ongoing_scene) if difference is not None]
+    def is_inflating(self) -> bool:
+        """Whether the covariance has anything of a fault."""
+        return (self._has_spread or self.is_lasting) and bool(self.total.any())
+
+    @property
+    def is_lasting(self) -> bool:
+        """Whether sensors differ at present."""
+        return self.ongoing_pair is not None or self.ongoing_scene is not None
 
     @property
     def spread(self) -> Cov3:
@@ -87,11 +89,11 @@ class CovarianceInflation:
         self._spread, self._pending, self._has_spread = spread, np.zeros((3, 3)), True
         self.restart()
 
-    def inflate(self, estimate: Estimate, delta: Pose2) -> Estimate:
-        """``estimate``, which moved by ``delta`` (3,) in the last step, with the covariance of all differences so far."""
-        self._estimated = se2.compose(self._estimated, delta)
+    def inflate(self, estimate: Estimate) -> Estimate:
+        """``estimate``, the last of `reckoning`, with the covariance of all differences so far."""
+        before, self._pose = self._pose, self.reckoning.poses[ESTIMATE]
         if self._has_spread:
-            A = se2.adjoint(se2.inverse(delta))
+            A = se2.adjoint(se2.between(self._pose, before))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
         if self.late_s and estimate.twist is not None:
@@ -121,7 +123,10 @@ class CovarianceInflation:
     @property
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        return self._spread + self._pending + sum((np.outer(d, d) for d in self.lasting), np.zeros((3, 3)))
+        total = self.spread
+        for difference in (self.ongoing_pair, self.ongoing_scene):
+            total = total if difference is None else total + np.outer(difference, difference)
+        return total
 
 
 def _widen(estimate: Estimate, spread: Cov3) -> Estimate:

@@ -54,7 +54,7 @@ class Bin(NamedTuple):
     regressors: Regressors
     """What faults would add within this bin alone."""
     poses: FloatArray
-    """(k, 3) by the estimate and by dead reckonings, before its last step."""
+    """(5, 3) at its end, as `Reckoning` has them."""
 
 
 class InnovationWindow(NamedTuple):
@@ -103,8 +103,8 @@ class InnovationWindows:
         self._regressors = _NONE
 
     def add(self, innovation: float, variance: float, regressors: Regressors, now_s: float, poses: FloatArray) -> bool:
-        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``regressors`` since the last one; ``poses`` (k, 3)
-        before it."""
+        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``regressors`` since the last one; ``poses`` (5, 3)
+        after it."""
         if not self.bins:
             self.bins.append(Bin(now_s - regressors[SECONDS], 0.0, 0.0, 0.0, _NONE, poses))
         self._innovation, self._variance = self._innovation + innovation, self._variance + variance

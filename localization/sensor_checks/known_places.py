@@ -50,7 +50,7 @@ class KnownPlaces:
 
         Returns whether a place has shown the pose: differences of sensors count from here on."""
         inflation, now_s = self._inflation, self._faults.now_s
-        is_lasting = bool(inflation.lasting)
+        is_lasting = inflation.is_lasting
         if (is_lasting and not self._was_lasting) or inflation.count > self._count:
             begin_s = self._faults.latest_s
             self._places = [p for i, p in enumerate(self._places) if not i or p.at_s < begin_s - _MARGIN_S]

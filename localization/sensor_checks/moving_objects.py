@@ -13,6 +13,7 @@ from localization.events import Step
 from localization.sensor_checks.contradictions import LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
+from localization.sensor_checks.reckoning import ESTIMATE, GYRO
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, explain
 from localization.sensor_checks.standstill import WHEELS_STANDING
@@ -44,7 +45,7 @@ from where on labels show whether they do [m]."""
 _MAX_SLIP_M, _MAX_TURN_SLIP_RAD = 0.15, 0.2
 """Distance of the estimate from the motion by the wheels since that view, up to which the wheels slip as they do without moving objects
 [m, rad]: a way of .6 m, along which fr079's robot slides by up to 14 deg."""
-_MAX_NIS = 16.3
+MAX_NIS = 16.3
 """NIS of a matched scan that contradicts the wheels: one of 1,000 by chance (chi^2 of 3 degrees of freedom)."""
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
 """Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
@@ -99,8 +100,6 @@ class MovingObjects:
 
     def __init__(self, faults: FaultLog, window: Window) -> None:
         self._faults, self._window = faults, window
-        self._poses = np.zeros((2, 3))  # by the wheels, and by the estimate, which has the wheels' motion in a step until its end
-        self._estimated = np.zeros(3)  # pose by the estimate at the begin of the step
         self._lidars: dict[str, _Lidar] = {}
         self._next_view: tuple[_Lidar, float, Profile, bool] | None = None
         """LiDAR, time [s] and profile of the last scan, and whether the robot stood: a view once the pose at its step's end is known."""
@@ -118,21 +117,20 @@ class MovingObjects:
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
         self._is_by_scans = False
         """The estimate is by scans, too: one by wheels alone is where they lead."""
+        self._is_led_away = False
+        """Scans have led the estimate away from where wheels lead since `_since`."""
         self._explained: tuple[SensorFault, ...] = ()
         """Named faults so far that explain what was taken for moving objects."""
         self.report = _Report(faults)
 
-    def apply(self, step: Step) -> Step:
-        """``step`` whose scan has the still world alone, while more than a few objects move."""
-        if self._next_view is not None:
-            of_lidar, at_s, last, was_standing = self._next_view
-            view, self._next_view = _View(at_s, self._poses, last), None
-            of_lidar.views.append(view)
-            of_lidar.standing = view if was_standing and of_lidar.standing is None else of_lidar.standing
-        delta = step.predicted.delta
-        if step.turn is not None and not step.is_standing:
-            delta = np.array([delta[0], delta[1], step.turn.angle])
-        self._estimated, self._poses = self._poses[1], se2.compose(self._poses, delta)
+    @property
+    def is_acting(self) -> bool:
+        """Objects move: scans have the still world alone."""
+        return any(lidar.is_active for lidar in self._lidars.values())
+
+    def apply(self, step: Step, *, is_to_come: bool) -> Step:
+        """``step`` whose scan has the still world alone, while more than a few objects move; ``is_to_come``: the estimator will have it,
+        so that it can lead the estimate back."""
         declared = self._faults.declared
         if declared and any(fault in declared for fault in _EXPLAINING if fault not in self._explained):
             self._explained = tuple(fault for fault in _EXPLAINING if fault in declared)
@@ -144,7 +142,7 @@ class MovingObjects:
             self._restart()
         if scan is None or not scan.is_planar or not step.has_wheels:
             return step
-        lidar = self._lidars.setdefault(scan.frame_id, _Lidar())
+        lidar = self._lidars[scan.frame_id] = self._lidars.get(scan.frame_id) or _Lidar()
         if lidar.standing is not None and not self._is_near(lidar.standing):
             lidar.standing = None
         is_due = scan is self._window.registered
@@ -157,10 +155,9 @@ class MovingObjects:
         references = self._references(lidar)
         if references:
             found = self._label(references[0], profile, points)
-            was_moving = self._since is not None
             self._update(step, lidar, found)
             if lidar.is_active:
-                step = self._lead_back(step) if self._is_by_scans and not was_moving else step
+                step = self._lead_back(step) if self._is_led_away and is_to_come else step
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
                 step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
         elif lidar.is_active:
@@ -169,22 +166,36 @@ class MovingObjects:
             self._next_view = lidar, now_s, profile, step.is_standing
         return step
 
-    def compare_estimate(self, delta: FloatArray, nis: float | None) -> None:
-        """Odometry by the estimate, and how far it is from that by the wheels while the scene may move."""
-        self._poses = np.array([self._poses[0], se2.compose(self._estimated, delta)])
+    def keep_view(self) -> None:
+        """The pose is known at which the last scan was taken: compare later ones with it."""
+        if self._next_view is not None:
+            lidar, at_s, profile, was_standing = self._next_view
+            view, self._next_view = _View(at_s, self._poses, profile), None
+            lidar.views.append(view)
+            lidar.standing = view if was_standing and lidar.standing is None else lidar.standing
+
+    @property
+    def _poses(self) -> FloatArray:
+        """(2, 3) by the wheels with the gyro's turns, and by the estimate."""
+        return self._faults.inflation.reckoning.poses[GYRO : ESTIMATE + 1]
+
+    def compare_estimate(self, nis: float | None) -> None:
+        """How far the estimate is from the motion by the wheels while the scene may move; ``nis`` of the last scan, if one was matched."""
         self._is_by_scans |= nis is not None
         inflation, view = self._faults.inflation, self._compared
         if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
             self._settle(self._since)
-            self._since = self._poses.copy()
+            self._since = self._poses
         inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
         inflation.possible = None
         begin = self._suspected
+        if self._since is not None:
+            return
         if begin is None and view is not None and (self._is_unsure or self._is_near(view)):
             begin = view.poses
-        if self._since is None and begin is not None:
+        if begin is not None:
             off = self._distance(begin)
-            is_off = self._is_unsure or self._is_undecided(math.hypot(off[0], off[1])) or (nis is not None and nis > _MAX_NIS)
+            is_off = self._is_unsure or self._is_undecided(math.hypot(off[0], off[1])) or (nis is not None and nis > MAX_NIS)
             inflation.possible = off if is_off else None
 
     def _is_undecided(self, distance: float) -> bool:
@@ -210,12 +221,14 @@ class MovingObjects:
     def _lead_back(self, step: Step) -> Step:
         """``step`` at whose end the estimate is where the wheels lead from `_since`, with the distance to there as its covariance."""
         assert self._since is not None
+        self._is_led_away = False
         motion, by_wheels = step.predicted, se2.between(self._since[0], self._poses[0])
-        off = se2.local(se2.compose(se2.between(self._since[1], self._estimated), motion.delta), by_wheels)
+        before = self._faults.inflation.reckoning.before
+        off = se2.local(se2.compose(se2.between(self._since[1], before), motion.delta), by_wheels)
         if math.hypot(off[0], off[1]) >= _MIN_OFF_M:
             motion = replace(motion, delta=se2.retract(motion.delta, off), cov=motion.cov + np.outer(off, off))
             step = replace(step, predicted=motion, turn=None)
-        self._since = np.array([self._poses[0], se2.compose(self._estimated, motion.delta)])
+        self._since = np.array([self._poses[0], se2.compose(before, motion.delta)])
         for lidar in self._lidars.values():
             lidar.views = deque((self._led_back(view, self._since) for view in lidar.views), maxlen=_MAX_VIEWS)
         return step
@@ -277,6 +290,7 @@ class MovingObjects:
             self.report.add(moved_share)
             if self._since is None:
                 self._since = found.view.poses if self._suspected is None else self._suspected
+                self._is_led_away = self._is_by_scans
         elif self._since is not None and not any(other.is_active for other in self._lidars.values()):
             self._end()
 
@@ -285,6 +299,7 @@ class MovingObjects:
         if self._since is not None:
             self._settle(self._since)
             self._since = self._suspected = None
+        self._is_led_away = False
 
     def _restart(self) -> None:
         """The wheels' motion is not known: scans are compared from here on."""

@@ -39,6 +39,7 @@ class OwnBody:
         self._faults = faults
         self._way = self._heading = 0.0  # since the first step [m, rad]
         self._lidars: dict[str, tuple[FloatArray, float]] = {}  # by frame: bearings as `_find_own` has them, and the way at the last scan
+        self._share = 0.0  # largest of a scan since the last report
 
     def remove(self, step: Step) -> Step:
         """``step`` without these points. Only planar scans are examined."""
@@ -51,9 +52,14 @@ class OwnBody:
         self._lidars[scan.frame_id] = bearings, self._way
         is_own = np.zeros(len(scan.points), dtype=bool)
         share = _find_own(scan.points, self._way - way, self._heading, bearings, is_own) / len(scan.points)
-        if share > _MIN_OWN_SHARE:
-            self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * share})
+        self._share = max(self._share, share)
         return step if share < _MIN_BODY_SHARE else replace(step, scan=scan.select(~is_own))
+
+    def report(self) -> None:
+        """Declare what was left out, if it is more than a few points."""
+        if self._share > _MIN_OWN_SHARE:
+            self._faults.declare(LIDAR_OWN_BODY, self._faults.now_s, {"percent": 100.0 * self._share})
+        self._share = 0.0
 
 
 @kernel

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from localization.sensor_checks.clocks import CLOCKS_APART
 from localization.sensor_checks.contradictions import (
     GYRO_OPPOSITE,
-    GYRO_RATE,
     GYRO_STUCK,
     GYRO_UNIT,
     LIDAR_DIRECTION,
@@ -16,6 +15,7 @@ from localization.sensor_checks.contradictions import (
     WHEELS_OPPOSITE,
 )
 from localization.sensor_checks.faults import SensorFault
+from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.sweep_times import REVERSED_TIMES

@@ -10,15 +10,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.innovations import TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
-from motion_models import se2
-from motion_models.se2 import FloatArray, Pose2
+from localization.sensor_checks.reckoning import FILE, FILE_GYRO
+from motion_models.se2 import FloatArray
 
 DIFFERENCES: Mapping[Pair, SensorFault] = {
     pair: SensorFault(
@@ -61,9 +59,9 @@ class _Episode(NamedTuple):
 
     begin_s: float
     poses: FloatArray
-    """(3, 3) poses at its begin: see `SensorConsistency`."""
-    reckoning: int
-    """Row of the dead reckoning that the estimate is compared with."""
+    """(5, 3) at its begin, as `Reckoning` has them."""
+    row: int
+    """Of these, that of the dead reckoning that the estimate is compared with."""
     is_by_lidar: bool = False
     """The LiDAR's stamps explain the difference: matched scans do not decide."""
 
@@ -75,10 +73,6 @@ class _Reported(NamedTuple):
     sigmas: float
 
 
-_ESTIMATED, _BY_FILE, _BY_GYRO = range(3)
-"""Rows of the poses: by the estimate, by the wheels with the robot file's parameters, by these with the gyro's turns."""
-
-
 class SensorConsistency:
     """Leaves out nothing, as either sensor may be right. While a pair differs the covariance has the distance of the estimate from the
     dead reckoning by the wheels with the robot file's parameters (LiDAR and gyro: with the gyro's turns); it stays afterwards, as no scan
@@ -87,10 +81,9 @@ class SensorConsistency:
     def __init__(self, faults: FaultLog) -> None:
         self._faults, self._clipping = faults, _Clipping()
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
-        self._poses, self._file_delta = np.zeros((3, 3)), np.zeros(3)
+        self._reckoning = faults.inflation.reckoning
         self._totals: Regressors = (0.0, 0.0, 0.0, 0.0)  # what causes are proportional to, since the first step
         self._totals_at = dict.fromkeys(NAMED, self._totals)  # at the last measurement of each pair
-        self._gyro_turn = math.nan  # in the last step [rad]
         self._has_moved = False
         self._matched_s = -math.inf
         self._episodes: dict[SensorFault, _Episode] = {}
@@ -98,8 +91,6 @@ class SensorConsistency:
 
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
-        self._file_delta = residuals.file_delta
-        self._gyro_turn = math.nan if step.turn is None else step.turn.angle
         self._has_moved |= not step.is_standing
         self._add_totals(step)
         if not self._has_moved:
@@ -112,7 +103,7 @@ class SensorConsistency:
                 continue
             (a, b, c, d), (e, f, g, h), self._totals_at[pair] = self._totals, self._totals_at[pair], self._totals
             regressors = a - e, b - f, c - g, d - h
-            if self._windows[pair].add(*innovation, regressors, self._faults.now_s, self._poses):
+            if self._windows[pair].add(*innovation, regressors, self._faults.now_s, self._reckoning.poses):
                 self._compare(pair)
                 has_ended = True
         if has_ended:
@@ -126,10 +117,8 @@ class SensorConsistency:
         rate = (turn if step.turn is None else step.turn.angle) / step.duration
         self._totals = seconds + step.duration, turns + turn, ways + way, rate
 
-    def compare_estimate(self, delta: Pose2, nis: float | None) -> None:
-        """The last step moved the estimate by ``delta`` (3,); ``nis`` of its scan, if one was matched."""
-        by_gyro = self._file_delta if math.isnan(self._gyro_turn) else np.array([*self._file_delta[:2], self._gyro_turn])
-        self._poses = se2.compose(self._poses, np.array([delta, self._file_delta, by_gyro]))
+    def compare_estimate(self, nis: float | None) -> None:
+        """Compare the estimate with dead reckonings while a pair differs; ``nis`` of the last scan, if one was matched."""
         if nis is not None:
             self._matched_s = self._faults.now_s
         inflation = self._faults.inflation
@@ -143,7 +132,7 @@ class SensorConsistency:
 
     def restart(self) -> None:
         """The pose is known: differences that last count from here on."""
-        self._episodes = {fault: episode._replace(poses=self._poses) for fault, episode in self._episodes.items()}
+        self._episodes = {fault: episode._replace(poses=self._reckoning.poses) for fault, episode in self._episodes.items()}
 
     @property
     def _has_scans(self) -> bool:
@@ -154,8 +143,7 @@ class SensorConsistency:
 
     def _difference(self, episode: _Episode) -> FloatArray:
         """(3,) of the dead reckoning from the estimate since the begin of ``episode``."""
-        moved = se2.between(episode.poses, self._poses)
-        return se2.local(moved[_ESTIMATED], moved[episode.reckoning])
+        return self._reckoning.distance(episode.poses, episode.row)
 
     def _compare(self, pair: Pair) -> None:
         """Report whether ``pair`` differs now, and begin or end an episode."""
@@ -170,8 +158,8 @@ class SensorConsistency:
         is_by_lidar = regressor == TURN_CHANGE
         before = self._episodes.get(fault)
         begin_s, poses = (worst.bins[1].end_s, worst.bins[1].poses) if before is None else (before.begin_s, before.poses)
-        reckoning = _BY_GYRO if pair == LIDAR_GYRO else _BY_FILE
-        episode = self._episodes[fault] = _Episode(begin_s, poses, reckoning, is_by_lidar)
+        row = FILE_GYRO if pair == LIDAR_GYRO else FILE
+        episode = self._episodes[fault] = _Episode(begin_s, poses, row, is_by_lidar)
         unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
         numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
         self._report(fault, episode, worst.sigmas, numbers)
@@ -183,7 +171,7 @@ class SensorConsistency:
             self._end(PARAMETER_FAR)
             return
         bins = next(window.bins for window in self._windows.values() if window.bins)
-        episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, _BY_FILE))
+        episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
         numbers: dict[str, float | str] = {"name": off.name, "value": off.value, "sigma": off.sigma, "file": off.file_value}
         self._report(PARAMETER_FAR, episode, abs(off.value - off.file_value) / off.sigma, numbers)
 

@@ -55,39 +55,43 @@ class SweepTimes:
         self._before: _TimedProfile | None = None  # that at the end of the bin before
         self._factor = _WeightedMean()
         self._is_decided = False
+        self.are_likely_right = True
+        """The times are likelier right than reversed."""
         self.is_reversed = False
         """The sweep goes the other way than the scans' times have it."""
+        self.has_drawn_map = False
+        """Scans of the submap were distorted: it is to begin anew."""
 
-    def compare(self, window: Window) -> bool:
-        """Take the scan that ended a bin; False while the times are likelier reversed than not."""
+    def compare(self, window: Window) -> None:
+        """Take the scan that ended a bin."""
         scan, before, last = window.registered, self._before, self._last
         if self._is_decided or scan is None or not scan.is_planar or not len(scan.offsets):
-            return True
+            return
         profile = window.profile(scan)
         self._last = None if profile is None or (last is not None and scan is last[0]) else (scan, profile)
         rates = window.bins.lidar[-2:] / window.bins.durations_s[-2:, None]
         self._before = None
         if last is None or self._last is None or not np.isfinite(rates).all():
-            return True
+            return
         twist = rates.mean(axis=0)
         now = self._before = _TimedProfile(last[1], _skew(last[1], window.points_about_lidar(last[0]), last[0].times_from_middle, twist))
         if before is None or float(np.abs(rates[:, 2]).max()) < _MIN_RATE_RAD_S:
-            return True
+            return
         found = _fit_factor(before, now, window.bins.lidar[-2])
         if found is not None:
             self._factor.add(*found)
-        return self._decide()
+        self._decide()
 
-    def _decide(self) -> bool:
+    def _decide(self) -> None:
         """Whether the times are likelier right than reversed; declare that they are reversed once it is certain."""
         if self._factor.count < _MIN_PAIRS:
-            return True
+            return
         sigmas = self._factor.mean / self._factor.sigma
         self._is_decided = abs(sigmas) > _SIGMAS
+        self.are_likely_right = self._is_decided or sigmas > 0.0  # as they are corrected from then on
         if self._is_decided and sigmas < 0.0:
-            self.is_reversed = True
+            self.is_reversed = self.has_drawn_map = True
             self._faults.declare(REVERSED_TIMES, self._faults.now_s, {"sigmas": -sigmas})
-        return sigmas > 0.0
 
 
 @dataclass

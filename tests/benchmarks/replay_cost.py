@@ -76,7 +76,7 @@ def checks_share(seconds: float = 200.0) -> tuple[float, float]:
 
             return call
 
-        for name in ("apply", "compare_residuals", "inflate"):
+        for name in ("apply", "inflate", "examine"):
             setattr(pipeline.checks, name, timed(getattr(pipeline.checks, name)))
         begin = time.process_time()
         for event in events:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from localization.estimators import Estimate
+from localization.estimators.baselines import DeadReckoning
 from localization.events import Scan, Step, Turn
 from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
@@ -36,6 +37,7 @@ class CheckedDrive:
         self.gyro, self.wheels, self.scan, self.has_scans = gyro, wheels, scan, has_scans
         self.nis = nis
         self.checks = SensorChecks({}, LidarConfig(), StepConfig())
+        self.estimator = DeadReckoning()  # of which estimates have no innovations
         self.applied: list[Step] = []
         self.estimates: list[Estimate] = []
 
@@ -61,8 +63,11 @@ class CheckedDrive:
                 turn,
                 scan,
             )
-            self.applied.append(self.checks.apply(step))
-            self.estimates.append(self.checks.inflate(Estimate(step.end_ns, pose, 1e-6 * np.eye(3), np.zeros(3), None, self.nis)))
+            self.applied.append(self.checks.apply(step, self.estimator))
+            estimate = Estimate(step.end_ns, pose, 1e-6 * np.eye(3), np.zeros(3), None, self.nis)
+            self.estimates.append(self.checks.inflate(self.applied[-1], estimate, self.estimator))
+            self.checks.examine(self.estimator)
+        self.checks.examine(self.estimator, is_last=True)
         return self.checks
 
     def _scan(self, pose: tuple[float, float, float], stamp_ns: int, rng: np.random.Generator) -> Scan:

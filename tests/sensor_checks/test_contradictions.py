@@ -10,7 +10,6 @@ import pytest
 
 from localization.sensor_checks.contradictions import (
     GYRO_OPPOSITE,
-    GYRO_RATE,
     GYRO_STUCK,
     GYRO_UNIT,
     LIDAR_DIRECTION,
@@ -18,6 +17,7 @@ from localization.sensor_checks.contradictions import (
     WHEELS_OPPOSITE,
 )
 from localization.sensor_checks.faults import SensorFault
+from localization.sensor_checks.gyro_rate import GYRO_RATE
 from tests.helpers.checked_drive import CheckedDrive, turned
 from tests.helpers.event_faults import turn_scans, without_gyro
 from tests.helpers.fault_drives import in_room, run

@@ -20,9 +20,12 @@ def test_fault_inflates_the_covariance_by_what_it_has_done() -> None:
     robot = CheckedDrive(scan=lambda points: turned(points, 30.0))
     world_T_drive = np.array([0.0, 0.0, math.radians(30.0)])
     own = robot.checks.inflate
-    robot.checks.inflate = lambda e: own(  # type: ignore[method-assign]
-        Estimate(e.stamp_ns, se2.compose(se2.compose(world_T_drive, e.pose), se2.inverse(world_T_drive)), e.covariance, e.twist, None)
-    )
+
+    def inflate(step, e, estimator):
+        pose = se2.compose(se2.compose(world_T_drive, e.pose), se2.inverse(world_T_drive))
+        return own(step, Estimate(e.stamp_ns, pose, e.covariance, e.twist, None), estimator)
+
+    robot.checks.inflate = inflate  # type: ignore[method-assign]
     robot.drive()
     found = next(iter(robot.checks.found.values()))
     assert found.fault == LIDAR_DIRECTION

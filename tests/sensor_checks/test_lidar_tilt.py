@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from localization.estimators.baselines import DeadReckoning
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
@@ -56,7 +57,7 @@ def test_tilted_clouds_of_steps_are_reported_by_the_checks() -> None:
         scan = Scan(k * 500_000_000, points, frame_id="laser", is_planar=False)
         motion = Motion(np.zeros(3), np.eye(3))
         step = Step(scan.stamp_ns, scan.stamp_ns + 500_000_000, motion, np.zeros(3), np.zeros(3), True, True, None, scan)
-        assert checks.apply(step).scan is scan
+        assert checks.apply(step, DeadReckoning()).scan is scan
     (warning,) = checks.warnings()
     assert "by 5.0 deg" in warning
 

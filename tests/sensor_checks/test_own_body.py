@@ -35,6 +35,7 @@ def test_post_on_driving_and_turning_robot_is_removed() -> None:
     sizes = [len(body.remove(step(k, rng, np.array([0.1, 0.0, 0.05]))).scan.points) for k in range(30)]
     assert sizes[0] == len(ANGLES)
     assert sizes[-1] == len(ANGLES) - 20
+    body.report()
     assert list(faults.found) == [LIDAR_OWN_BODY]
 
 
@@ -42,6 +43,7 @@ def test_nothing_is_removed_from_scans_of_a_robot_at_rest() -> None:
     faults, rng = FaultLog(CovarianceInflation()), np.random.default_rng(0)
     body = OwnBody(faults)
     assert all(len(body.remove(step(k, rng, np.zeros(3))).scan.points) == len(ANGLES) for k in range(30))
+    body.report()
     assert faults.found == {}
 
 
@@ -73,7 +75,7 @@ def test_beams_of_two_lidars_on_the_robot_are_left_out() -> None:
         motion = Motion(np.array([0.1, 0.0, 0.05]), 1e-6 * np.eye(3))
         stamps = k * checked_drive.S // 10, (k + 1) * checked_drive.S // 10
         one = Step(*stamps, motion, np.zeros(3), np.zeros(3), False, True, None, Scan(stamps[1], points, frame_id=frame))
-        applied = robot.checks.apply(one).scan
+        applied = robot.checks.apply(one, robot.estimator).scan
         assert applied is not None
         is_own.append((np.hypot(applied.points[:, 0], applied.points[:, 1]) < 1.0).mean())
     assert is_own[0] == is_own[1] == 100 / 360

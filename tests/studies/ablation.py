@@ -166,7 +166,7 @@ PATCHES: Mapping[str, Patch] = {
     "scale of the wheel noise": _attribute(wheel_noise, "_MAX_NOISE_SCALE", 1.0),
     "excitation gate of corrections": _attribute(Excitation, "start_step", lambda self, motion: None),
     "ways by wheels alone": _attribute(OpenWay, "cov", lambda self, step: np.zeros((3, 3))),
-    "moving objects left out": _attribute(MovingObjects, "apply", lambda self, step: step),
+    "moving objects left out": _attribute(MovingObjects, "apply", lambda self, step, **_: step),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
