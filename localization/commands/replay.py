@@ -217,6 +217,8 @@ class Replay:
             return PriorMap(PlaceMap(saved.map, noise_m), self._initial())
         if self.extend_map is not None:
             saved.planar(self.map, "--extend-map")
+        if self.positions is not None and "graph" not in names(self.estimator, "--estimator"):
+            saved.planar(self.map, "--positions without the estimator graph")
         if not has_clouds or self.config.step.planar:
             why = "--config.step.planar keeps poses in the plane" if has_clouds else "the LiDAR of this log is planar"
             raise MapError(

@@ -62,7 +62,7 @@ def test_map_in_space_for_a_planar_lidar_is_refused_before_the_run(tmp_path: Pat
     path, room = tmp_path / "hill.skidmap", bags.write_mcap(tmp_path / "room.mcap", rooms.drive(2.0))
     save_map(path, SavedMap(hill_map.make_map(hill_map.scene_around(np.zeros((2, 2))), hill_map.WAY[:2]), {}))
     before = path.read_bytes()
-    for more in ([], ["--extend-map", tmp_path / "more.skidmap"]):
+    for more in ([], ["--extend-map", tmp_path / "more.skidmap"], ["--positions", "/fix"]):
         assert replay(room, tmp_path / "out", "--estimator", "map", "--map", path, *more, robot="vaultbot") == 2
         assert "holds clouds in space" in capsys.readouterr().err
     assert path.read_bytes() == before
