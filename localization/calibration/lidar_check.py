@@ -40,6 +40,11 @@ _MIN_COHERENCE = 0.9
 _MAX_SLIDE_RAD = math.radians(20.0)
 """Largest angle between the ways by wheels and LiDAR that a slide explains [rad], as in the sensor check of the direction of travel: no
 slide of 99.9 % of the windows of three buildings is larger."""
+_MAX_LATE_M, _MAX_SLIP = 0.08, 0.15
+"""Largest difference of the ways by wheels and LiDAR [m], and its growth with the way by slip and tyres: a latency of 0.1 s has less up to
+some m/s, one of 0.35 s more from 0.35 m/s on."""
+_MAX_START_NS = 600_000_000
+"""Longest time from the first motion of the wheels to the stamp of the first scan after it, of LiDARs that are on."""
 _MIN_PART = 0.15
 """Smallest part of the way on each side of a change of the mount."""
 _SNAP_RAD = math.radians(4.0)
@@ -94,7 +99,7 @@ class LidarCheck:
         self._moving_ns: int | None = None
         self._scans, self._next_scan, self._way_m = 0, 0, 0.0
         self.contradicted_way_m = 0.0
-        """By the wheels since the start, while a LiDAR travels in another direction than they do [m]; else 0."""
+        """By the wheels since the start, while a LiDAR travels in another direction than they do; what one lags behind them [m]; else 0."""
         self.is_done = False
         """The mount agrees, or is certainly wrong, or a minute has passed."""
 
@@ -114,8 +119,10 @@ class LidarCheck:
             travel = self._travels[event.frame_id]
             intervals = len(travel.rows)
             _register(travel, event, self._mounts.get(event.frame_id, Mount()), self._config)
-            is_contradicted = self._is_contradicted(event.frame_id) if len(travel.rows) > intervals else self.contradicted_way_m > 0.0
-            self.contradicted_way_m = self._way_m if is_contradicted else 0.0
+            if self._scans == 1 and self._moving_ns is not None and travel.begin_ns - self._moving_ns < _MAX_START_NS:
+                travel.begin_ns = min(travel.begin_ns, self._moving_ns)  # where it stood until now, whatever this scan's stamp
+            if len(travel.rows) > intervals:
+                self.contradicted_way_m = self._contradicted_m(event.frame_id)
             if self._way_m > _SURE_WAY_M and self._scans >= self._next_scan:
                 self._next_scan = self._scans + _SCANS_PER_RESULT
                 is_healthy = all(self._is_healthy(frame) for frame in self._travels)
@@ -158,9 +165,18 @@ class LidarCheck:
         t, ways = _ways(self._wheels, self._radius_m)
         return compare_clocks(self._travels[frame].rows, (t, ways[:, 1] - ways[:, 0]), self._wheels[0].stamp_ns)
 
-    def _is_contradicted(self, frame: str) -> bool:
+    def _contradicted_m(self, frame: str) -> float:
+        """The way by the wheels, where it travels in another direction than they do; what it lags behind them, where scans that are late
+        begin to move late; else 0 [m]."""
         by_wheels, by_scans, _ = self._compare(frame)
-        return len(by_wheels) > 0 and abs(float(np.angle(np.sum(by_scans * by_wheels.conj())))) > _MAX_SLIDE_RAD
+        if not len(by_wheels):
+            return 0.0
+        if abs(float(np.angle(np.sum(by_scans * by_wheels.conj())))) > _MAX_SLIDE_RAD:
+            return self._way_m
+        ways = np.abs(by_wheels)
+        behind = np.abs(np.cumsum(ways - np.abs(by_scans)))
+        is_late = behind > _MAX_LATE_M + _MAX_SLIP * np.cumsum(ways)
+        return float(behind[is_late].max(initial=0.0))
 
     def _compare(self, frame: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Way of the sensor by the wheels and by the scans (n,) complex [m] on gentle arcs, and turns (m, 2) by wheels, up to a scale, and

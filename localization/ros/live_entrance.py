@@ -57,7 +57,7 @@ class LiveEntrance:
 
     @property
     def largest_error_m(self) -> float:
-        """Largest error of the position [m]: twice the way by the wheels, while the LiDAR travels in another direction; else 0."""
+        """Largest error of the position [m]: twice the way while the LiDAR travels in another direction, or what it lags; else 0."""
         return 0.0 if self._lidar is None else 2.0 * self._lidar.contradicted_way_m
 
     def keep(self, received: Received) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.calibration.lidar_check import check_lidar, corrected, open_log_checked
+from localization.calibration.lidar_check import LidarCheck, check_lidar, corrected, open_log_checked
 from localization.evaluation.references import reference_track
 from localization.evaluation.scores import score
 from localization.events import ImuSample, Scan, WheelSample
@@ -99,6 +99,21 @@ def test_lidar_yaw_without_a_turn_names_both_causes(monkeypatch: pytest.MonkeyPa
     assert found is not None
     assert found.mount is None
     assert "or all wheels count backwards" in found.text
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.35])
+def test_lidar_that_begins_to_move_late_is_contradicted_by_wheels(tmp_path: Path, late_s: float) -> None:
+    """As live: in order of arrival, with stamps of another clock; while it drives straight on, before a turn shows the clock."""
+    vehicle = Vehicle(scan_hz=10.0, beams=90, seed=7)
+    log = open_log(write(tmp_path / "log.mcap", vehicle, drive(vehicle), Publishing()), vehicle.robot())
+    check, found = LidarCheck(log.mounts, log.robot, "/scan", has_gyro=True), []
+    for event in log.events():
+        late_ns = round(late_s * 1e9) if isinstance(event, Scan) else 0
+        check.add(dataclasses.replace(event, stamp_ns=event.stamp_ns + late_ns))
+        found.append(check.contradicted_way_m)
+        if check.is_done or len(found) > 600:
+            break
+    assert max(found) == pytest.approx(0.5 * late_s, abs=0.1) if late_s else max(found) == 0.0
 
 
 @pytest.mark.extended
