@@ -22,6 +22,7 @@ from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
     Gain,
+    confirmed_findings,
     correctable_findings,
     describe_loss,
     describe_standstill_turn,
@@ -145,7 +146,21 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
     if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
         searched, chosen = searched._replace(linearization=searched.first), ()
-    return _conclude(searched, chosen, rng, config)
+    return _with_confirmed_names(searched, _conclude(searched, chosen, rng, config), config)
+
+
+def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
+    """``found`` with the names alone that improve what they were not fitted to, where a part of the drive stays unexplained, and those
+    of sizes that no robot has: others stand for what has no name, and what they had taken of it is unexplained as well."""
+    d = found.diagnosis
+    confirmed = confirmed_findings(d)
+    kept = {f.definition.key for f in d.findings if f in confirmed or f.cause == MISSING_MESSAGES.id or not f.is_plausible}
+    if d.verdict != "unexplained" or all(f.definition.key in kept for f in d.findings):
+        return found
+    linearization = searched.linearization if kept else searched.first
+    chosen = tuple(i for i, cause in enumerate(linearization.causes) if cause.key in kept)
+    again = _conclude(searched._replace(linearization=linearization), chosen, np.random.default_rng(config.seed), config)
+    return again if again.diagnosis.verdict == "unexplained" else found
 
 
 def _is_worse_with(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...]) -> bool:

@@ -256,8 +256,9 @@ def _with_extension(again: DiagnosisResult, extension: Extension, before: Diagno
     verdict = "extended" if d.verdict in ("consistent", "explained") else d.verdict
     rest = "" if d.verdict == "consistent" else f" {d.sentence}"
     rest = f" {extension.describe_effects()}{rest}" if extension.effects else rest
-    text = extension.describe()
-    return dataclasses.replace(again, diagnosis=dataclasses.replace(d, verdict=verdict, sentence=f"{text[0].upper()}{text[1:]}.{rest}"))
+    if d.verdict == "consistent" and d.suspected is not None:  # too weak to be named, and so is the drive that would settle it
+        d = dataclasses.replace(d, suspected=None, next_drive="")
+    return dataclasses.replace(again, diagnosis=dataclasses.replace(d, verdict=verdict, sentence=f"{extension.describe()}.{rest}"))
 
 
 def _robot_by(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> tuple[CorrectedRobot, dict[Cause, float]]:

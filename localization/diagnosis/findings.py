@@ -208,7 +208,8 @@ class Trend:
         """The trend in a sentence, with t and p or log-likelihood."""
         if self.instead_of and self.lead > 0.0:
             return (
-                f"{self.component} follows {self.along} better than {self.instead_of} (t = {self.t:+.1f}, log-likelihood +{self.lead:.0f})"
+                f"{self.component} is explained better by {self.along} than by {self.instead_of} (t = {self.t:+.1f}, "
+                f"log-likelihood +{self.lead:.0f})"
             )
         if self.instead_of:
             return f"{self.component} follows {self.along}, one trend in place of {self.instead_of} (log-likelihood {self.lead:+.0f})"
@@ -419,10 +420,10 @@ def describe_row(row: Component) -> str:
         return ""
     mixed = any(a.is_named for a in row.attributions)
     by = ", ".join(f"{a.cause} {100 * a.share:.0f} %{' (tolerated)' * (mixed and not a.is_named)}" for a in row.attributions)
-    if row.status == "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE:
-        return f"unexplained: the noise is {row.noise_over_reference:.1f} times the reference's own"
     if row.trend:
         return f"unexplained: follows {row.trend}" + (f" beside {by}" if by else "")
+    if row.status == "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE:
+        return f"unexplained: the noise is {row.noise_over_reference:.1f} times the reference's own"
     if row.status == "unexplained":
         return f"unexplained ({by} and no more)" if by else "unexplained"
     if not by:

@@ -83,6 +83,7 @@ def test_extend_slip_in_left_turns_is_friction_and_a_term(nominal: Drive) -> Non
 def assert_unexplained(found: Diagnosis) -> None:
     """It is said that something has no name, and no change on the way is ordered in its place."""
     assert found.verdict == "unexplained"
+    assert all(f in confirmed_findings(found) or not f.is_plausible for f in found.findings)  # no other name
     is_implausible = any(not f.is_plausible for f in found.findings)
     assert is_implausible or any(row.status == "unexplained" for row in found.discrepancy.values())
     assert "without a name" in found.sentence or "not in a way that has a name" in found.sentence
