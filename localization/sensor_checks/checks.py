@@ -19,7 +19,7 @@ from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MAX_NIS, MovingObjects
 from localization.sensor_checks.own_body import OwnBody
-from localization.sensor_checks.reckoning import ESTIMATE
+from localization.sensor_checks.reckoning import ESTIMATE, Reckoning
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
@@ -27,6 +27,7 @@ from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
 from motion_models.robot import Mount
+from motion_models.se2 import Pose2
 
 _TOGETHER_S = 0.5
 """Steps of this time are examined together while no check acts [s]. Faults are found by windows of 2.5 s and more."""
@@ -38,6 +39,11 @@ class _Record(NamedTuple):
     step: Step
     estimate: Estimate
     residuals: Residuals | None
+
+    @property
+    def odometry(self) -> Pose2:
+        """(3,) the estimate's pose where it never jumps."""
+        return self.estimate.pose if self.estimate.odometry is None else self.estimate.odometry[0]
 
 
 class SensorChecks:
@@ -59,6 +65,7 @@ class SensorChecks:
         self._clocks = ClockCheck(faults, clock_sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
         self._records: list[_Record] = []
+        self._recorded = Reckoning()  # up to the last step, recorded or not
         self._is_acting = True
 
     def insert_imu(self, sample: ImuSample) -> None:
@@ -95,8 +102,8 @@ class SensorChecks:
         if self._is_acting:
             self._add(record, estimator)
         else:
-            self._records.append(record)
-            if estimate.nis is None or estimate.nis < MAX_NIS:
+            self._record(record)
+            if not self._moving.is_off(self._recorded.poses) and (estimate.nis is None or estimate.nis < MAX_NIS):
                 return estimate
             self._examine_records(estimator)
         estimate, self._is_acting = self._inflate(record, estimator), self._has_to_act()
@@ -116,6 +123,13 @@ class SensorChecks:
         is_led_away = self._sweep_times.has_drawn_map or self._faults.have_scans_led_away
         is_step_changed = self._gyro_rate.is_acting or self._contradictions.is_acting or self._moving.is_acting
         return is_led_away or is_step_changed or self._inflation.is_acting
+
+    def _record(self, record: _Record) -> None:
+        if not self._records:
+            self._recorded.poses = self._inflation.reckoning.poses
+        self._records.append(record)
+        self._recorded.predict(record.step)
+        self._recorded.correct(record.step, record.odometry, None)
 
     def _examine_records(self, estimator: Estimator) -> None:
         records, self._records = self._records, []
@@ -147,8 +161,7 @@ class SensorChecks:
         Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
         """
         step, estimate, residuals = record
-        pose = estimate.pose if estimate.odometry is None else estimate.odometry[0]
-        self._inflation.reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
+        self._inflation.reckoning.correct(step, record.odometry, None if residuals is None else residuals.file_delta)
         self._moving.keep_view()
         if estimate.nis is not None:
             self._standstill.restart()

@@ -198,15 +198,20 @@ class MovingObjects:
             is_off = self._is_unsure or self._is_undecided(math.hypot(off[0], off[1])) or (nis is not None and nis > MAX_NIS)
             inflation.possible = off if is_off else None
 
+    def is_off(self, poses: FloatArray) -> bool:
+        """Whether the estimate is off the motion by the wheels at ``poses`` (5, 3) of a `Reckoning`, to which no step was applied: since
+        the oldest view that a scan would be compared with."""
+        now = poses[GYRO : ESTIMATE + 1]
+        oldest = (next((view for view in lidar.views if self._is_near(view, now)), None) for lidar in self._lidars.values())
+        return any(view is not None and self._is_undecided(math.hypot(*_distance(view.poses, now)[:2])) for view in oldest)
+
     def _is_undecided(self, distance: float) -> bool:
         """Whether the estimate is farther from the motion by the wheels than these slip as a rule [m], and labels do not show that they
         do."""
         return distance > _MIN_OFF_M and (distance < _MAX_OFF_M or not self._have_wheels_slipped)
 
-    def _distance(self, poses: FloatArray) -> FloatArray:
-        """(3,) of the motion by the wheels since ``poses`` (2, 3) from that by the estimate."""
-        by_wheels, by_estimate = se2.between(poses, self._poses)
-        return se2.local(by_estimate, by_wheels)
+    def _distance(self, since: FloatArray) -> FloatArray:
+        return _distance(since, self._poses)
 
     def _agree(self, poses: FloatArray) -> bool:
         """Whether wheels and estimate have moved alike since ``poses`` (2, 3)."""
@@ -248,8 +253,8 @@ class MovingObjects:
             views.popleft()
         return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
 
-    def _is_near(self, view: _View) -> bool:
-        (x, y, turn), (u, v, other_turn) = se2.between(view.poses, self._poses).tolist()
+    def _is_near(self, view: _View, now: FloatArray | None = None) -> bool:
+        (x, y, turn), (u, v, other_turn) = se2.between(view.poses, self._poses if now is None else now).tolist()
         return max(math.hypot(x, y), math.hypot(u, v)) < _MAX_WAY_M and max(abs(turn), abs(other_turn)) < _MAX_TURN_RAD
 
     def _label(self, view: _View, profile: Profile, points: Points2) -> _Comparison:
@@ -352,6 +357,12 @@ class _Comparison:
             unique = float(np.sum((self.scene.labels == STILL) & (other.labels != STILL)))
             least = min(least, unique / max(float(np.sum(other.labels != STILL)), _MIN_UNEXPLAINED * len(self.points)))
         return least
+
+
+def _distance(since: FloatArray, now: FloatArray) -> FloatArray:
+    """(3,) of the motion by the wheels from that by the estimate, between the poses ``since`` and ``now``, (2, 3) of both."""
+    by_wheels, by_estimate = se2.between(since, now)
+    return se2.local(by_estimate, by_wheels)
 
 
 def _with_still(step: Step, is_still: BoolArray) -> Step:
