@@ -136,13 +136,13 @@ class SensorChecks:
         for record in records:
             self._examine_step(record.step, is_to_come=False)
             self._add(record, estimator)
+        self._own_body.report()  # of steps up to here, whose sensors are compared
 
     def _examine_step(self, step: Step, *, is_to_come: bool) -> Step:
         """``step`` as it should be for the estimator, for which it ``is_to_come``, or was."""
         self._faults.start_step(step)
         if step.scan is not None and not step.scan.is_planar:
             self._tilt.add(step.scan)
-        self._own_body.report()
         if self._window.add(step, self._faults.now_s):
             self._sweep_times.compare(self._window)
             if self._contradictions.compare(self._window) and self._sweep_times.are_likely_right:
@@ -165,11 +165,13 @@ class SensorChecks:
         self._moving.keep_view()
         if estimate.nis is not None:
             self._standstill.restart()
-        if residuals is None:
-            return
-        if step.scan is not None:
-            self._is_lidar_placed = step.scan.frame_id in self._mounts
-        self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)
+        if residuals is not None:
+            if step.scan is not None:
+                self._is_lidar_placed = step.scan.frame_id in self._mounts
+            self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)
+        if estimate.covariance is not None:
+            self._moving.compare_estimate(estimate.nis)
+            self._consistency.compare_estimate(estimate.nis)
 
     def _inflate(self, record: _Record, estimator: Estimator) -> Estimate:
         """The estimate with the covariance of the distances from dead reckonings, and of clocks that are apart."""
@@ -177,8 +179,6 @@ class SensorChecks:
         if estimate.covariance is None:
             return estimate
         self._clocks.add(estimator)
-        self._moving.compare_estimate(estimate.nis)
-        self._consistency.compare_estimate(estimate.nis)
         inflated = self._inflation.inflate(estimate)
         pose = self._inflation.reckoning.poses[ESTIMATE]
         if scan is not None and self._places.update(lambda: self._window.profile(scan), pose):

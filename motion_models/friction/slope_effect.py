@@ -13,8 +13,8 @@ from motion_models.se2 import FloatArray
 from motion_models.slope import Slope, SlopeTwist
 
 _DEFLECTION = 0.01
-"""Deflection of a tyre by a quarter of the weight, over the wheel's radius [-]. An assumption: MuJoCo's wheels give way by 0.004 (0.6 mm on a
-Husky), and no tyre of these robots was measured."""
+"""Deflection of a tyre by a quarter of the weight, over the wheel's radius [-]. An assumption: MuJoCo's wheels give way by 0.004 (0.6 mm on
+a Husky), and no tyre of these robots was measured."""
 _WARP = FrictionModel.param_names.index("warp")
 
 
