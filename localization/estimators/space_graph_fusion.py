@@ -14,14 +14,13 @@ from localization.core.policies.excitation import Excitation
 from localization.core.space import SE3
 from localization.core.state import clip_eigenvalues
 from localization.errors import EstimatorError
-from localization.estimators.estimator import Estimate, Estimator
+from localization.estimators.estimator import Estimate
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
 from localization.estimators.pose_graph import through_nodes
 from localization.estimators.position_queue import PositionQueue, align_map
-from localization.estimators.space_fusion import SpaceFusion
+from localization.estimators.space_fusion import FilteredSpaceOdometry, SpaceFusion
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from localization.events import PositionSample, Step
-from localization.lidar import LostScans
 from localization.lidar.cloud_loops import find_loops, make_map_closures
 from localization.lifting import Pose3, SpaceTable, Trajectory3
 from localization.maps import SpaceMap
@@ -56,7 +55,7 @@ class SpaceGraphSettings:
             make_map_closures(1.0)  # a missing extra is an error before the drive
 
 
-class SpaceGraphFusion(Estimator):
+class SpaceGraphFusion(FilteredSpaceOdometry):
     """`SpaceFusion`, whose keyframes a `SpaceGraph` smooths at the end; its live poses are the filter's.
 
     The filter's submap grows with the drive and is never left, so that a place that is visited again is matched by the filter itself. Where
@@ -220,20 +219,6 @@ class SpaceGraphFusion(Estimator):
     def smoothed_in_space(self) -> Trajectory3 | None:
         """Poses in space by all measurements, once `finish` has smoothed them."""
         return self._smoothed
-
-    @property
-    def clock_offset_s(self) -> float:
-        """See `SpaceFusion.clock_offset_s`."""
-        return self.odometry.clock_offset_s
-
-    @property
-    def lost(self) -> LostScans:
-        """See `SpaceFusion.lost`."""
-        return self.odometry.lost
-
-    def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """See `SpaceFusion.parameters`."""
-        return self.odometry.parameters()
 
     def counts(self) -> Mapping[str, int]:
         """Counts of the filter, of keyframes and of positions in the graph."""

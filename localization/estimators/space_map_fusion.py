@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 from localization.errors import EstimatorError
-from localization.estimators.estimator import Estimate, Estimator
-from localization.estimators.space_fusion import SpaceFusion
+from localization.estimators.estimator import Estimate
+from localization.estimators.space_fusion import FilteredSpaceOdometry, SpaceFusion
 from localization.events import Step
-from localization.lidar import LostScans
 from localization.lifting import Pose3, SpaceTable, Trajectory3
 from localization.maps.space_localizer import SpaceLocalizer, SpaceMotion
 from localization.maps.space_places import SpacePlaces
@@ -28,7 +27,7 @@ _KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
 """A keyframe follows when the robot has moved this far, as in the plane."""
 
 
-class SpaceMapFusion(Estimator):
+class SpaceMapFusion(FilteredSpaceOdometry):
     """`SpaceFusion` with a `SpaceLocalizer` behind it; estimates are those seen from above, `smoothed_in_space` has all of the pose."""
 
     def __init__(self, odometry: SpaceFusion, places: SpacePlaces, initial: Pose2 | None, is_recording: bool = False) -> None:
@@ -112,20 +111,6 @@ class SpaceMapFusion(Estimator):
             "losses": self._n_losses,
             "places": [{"pose": _from_above(place.pose), "probability": place.probability} for place in places],
         }
-
-    @property
-    def clock_offset_s(self) -> float:
-        """See `SpaceFusion.clock_offset_s`."""
-        return self.odometry.clock_offset_s
-
-    @property
-    def lost(self) -> LostScans:
-        """See `SpaceFusion.lost`."""
-        return self.odometry.lost
-
-    def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """See `SpaceFusion.parameters`."""
-        return self.odometry.parameters()
 
     def counts(self) -> Mapping[str, int]:
         """Number of occurrences by name, as the filter counts them."""
