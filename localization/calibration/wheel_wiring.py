@@ -480,7 +480,7 @@ def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, meas
     entries = "; ".join(f"{key} = {value}" for key, value in keys.items())
     what = wiring.text
     if len(wiring.reversed) == len(names) and "speed by the LiDAR" in measured:
-        what += " (or left and right are swapped and the LiDAR looks backwards: only the robot's front tells)"
+        what += " (or left and right are swapped and the LiDAR is mounted backwards: check which end of the robot is its front)"
     text = (
         f"{wheels}: {what}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
         f" so. {CORRECTED} {entries}."

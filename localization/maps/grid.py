@@ -101,8 +101,8 @@ def _clear_ends(starts: Points2, ends: Points2, keys: IntArray, distance: float)
     """(M, 2) up to where beams from ``starts`` to ``ends`` (M, 2), of keyframes ``keys`` (M,), are farther than ``distance`` from the
     surface that they end on [m]: a beam along a wall is beside it for metres, and passes cells of the wall.
 
-    The surface goes through the end and those of the beams beside it. At the edge of an object it is that which the beam meets most
-    steeply.
+    The surface goes through the end and those of the beams beside it. At the edge of an object, of the surfaces by the neighbours on each
+    side, it is the one at the largest angle to the beam.
     """
     beams = ends - starts
     order = np.lexsort((np.arctan2(beams[:, 1], beams[:, 0]), keys))

@@ -1,6 +1,6 @@
 """A map in space as seen from above: what stands within a range of heights above the ground is a wall, and ground that was seen is free.
 
-The ground is the lowest point of each column, and nowhere above a cone of 30 degrees over the ground around: a column in which a wall or
+The ground is the lowest point of each column, and nowhere above a cone of 31 degrees over the ground around: a column in which a wall or
 a crown alone was seen has none of its own. Below a column without points it is that of the nearest one.
 """
 
