@@ -37,7 +37,7 @@ class Estimate:
     nis: float | None = None
     """Normalised innovation squared of this step's LiDAR measurement, 3 degrees of freedom; None where there was none."""
     odometry: tuple[Pose2, Cov3 | None] | None = None
-    """``odom_T_body`` (3,) and its covariance (3, 3), where ``pose`` is ``map_T_body``: it never jumps."""
+    """``odom_T_body`` (3,) and its covariance (3, 3), where ``pose`` jumps: it is ``map_T_body``, or nothing holds it without a LiDAR."""
     map_T_odom: Pose2 | None = None
     """(3,) what loop closures and positions have corrected; None where ``pose`` is in the odometry frame."""
     in_space: Pose3 | None = None

@@ -12,6 +12,7 @@ from localization.core.filter import Innovation, clone, inflate, inflate_both, p
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, initial_state, wheel_transition
+from localization.core.policies.continuous_pose import ContinuousPose
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import NOTHING_MISSED, PriorOutlier
@@ -73,6 +74,7 @@ class EkfFusion(Estimator):
         """Means and covariance at the end of the last step."""
         self._config, self._gyro, self.model, self.corrections, self._sensor = config, robot.gyro_noise, model, corrections, sensor
         self._wheel_noise, self._slip, self._outlier, self._open_way = WheelNoiseScale(), SweepSlip(), PriorOutlier(), OpenWay()
+        self._continuous = ContinuousPose() if sensor is None else None  # scans hold the pose
         self._excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
         self.wheels = WheelPrediction(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
         self._turn: Innovation | None = None  # of the gyro, in the last step
@@ -101,7 +103,8 @@ class EkfFusion(Estimator):
         self.state = state
         self.counts_by_name["standing"] += step.is_standing
         twist, twist_cov = self._estimate_twist(step, is_measured=scan is not None)
-        return Estimate(step.end_ns, state["pose"], state.cov("pose"), twist, twist_cov, None if scan is None else scan.nis)
+        odometry = None if self._continuous is None else self._continuous.add(state)
+        return Estimate(step.end_ns, state["pose"], state.cov("pose"), twist, twist_cov, None if scan is None else scan.nis, odometry)
 
     def run_deferred(self) -> bool:
         """The last scan enters the submap, if it is a key scan. Deferred until its estimate is out."""

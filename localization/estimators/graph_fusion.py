@@ -111,9 +111,10 @@ class GraphFusion(FilteredOdometry):
         self._is_keyframe_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan) or self._is_found_again()
         self._place_positions(step)
         A = se2.adjoint(se2.inverse(delta))
-        pose, odometry = se2.compose(self._map_T_odom, estimate.pose), (estimate.pose, estimate.covariance)
+        pose, odometry = se2.compose(self._map_T_odom, estimate.pose), estimate.odometry or (estimate.pose, estimate.covariance)
         covariance = self._bound(A @ self._key_cov @ A.T + cov, self.odometry.state.cov("pose"))
-        return replace(estimate, pose=pose, covariance=covariance, odometry=odometry, map_T_odom=self._map_T_odom)
+        map_T_odom = se2.compose(pose, se2.inverse(odometry[0]))
+        return replace(estimate, pose=pose, covariance=covariance, odometry=odometry, map_T_odom=map_T_odom)
 
     def _bound(self, cov: Cov3, odometry_cov: Cov3) -> Cov3:
         """Covariance (3, 3) of a pose in the map, of which the graph has ``cov`` and the filter ``odometry_cov``.

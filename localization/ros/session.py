@@ -97,7 +97,10 @@ class StartPose:
         return replace(self, odom_cov=self.odom_cov + more, map_cov=self.map_cov + more)
 
     def apply(self, estimate: Estimate) -> Estimate:
-        """``estimate``, which is relative to the start, in the published frames; the covariances of start and motion are added."""
+        """``estimate``, which is relative to the start, in the published frames; the covariances of start and motion are added. Without
+        a map frame the odometry that never jumps is published (REP-105)."""
+        if estimate.odometry is not None and estimate.map_T_odom is None:
+            estimate = replace(estimate, pose=estimate.odometry[0], covariance=estimate.odometry[1], odometry=None)
         if not any(array.any() for array in (self.odom_T_start, self.odom_cov, self.map_T_start, self.map_cov)):
             return estimate
         if estimate.odometry is None or estimate.map_T_odom is None:

@@ -42,8 +42,9 @@ class _Record(NamedTuple):
 
     @property
     def odometry(self) -> Pose2:
-        """(3,) the estimate's pose where it never jumps."""
-        return self.estimate.pose if self.estimate.odometry is None else self.estimate.odometry[0]
+        """(3,) the estimate's pose by the sensors of the robot alone."""
+        estimate = self.estimate
+        return estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]
 
 
 class SensorChecks:
