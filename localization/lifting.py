@@ -44,12 +44,17 @@ class Pose3:
 
     def moved(self, delta: Pose2, cov: Cov3) -> Pose3:
         """The pose after a planar motion (3,) in the body's plane, whose right perturbation has ``cov`` (3, 3)."""
-        way = self.rotation @ [delta[0], delta[1], 0.0]
-        rotation, full = self.rotation @ _yaw(float(delta[2])), np.zeros((6, 6))
-        full[:2, :2], full[:2, 5], full[5, :2], full[5, 5] = cov[:2, :2], cov[:2, 2], cov[2, :2], cov[2, 2]
-        lever, world = np.eye(6), np.kron(np.eye(2), rotation)
-        lever[:3, 3:] = -np.array([[0.0, -way[2], way[1]], [way[2], 0.0, -way[0]], [-way[1], way[0], 0.0]])
-        return Pose3(self.position + way, rotation, lever @ self.covariance @ lever.T + world @ full @ world.T)
+        way, rotation = self.rotation @ [delta[0], delta[1], 0.0], self.rotation @ _yaw(float(delta[2]))
+        lever, world = _lever(way), np.kron(np.eye(2), rotation)
+        return Pose3(self.position + way, rotation, lever @ self.covariance @ lever.T + world @ _in_plane(cov) @ world.T)
+
+    def placed(self, start: Pose2, cov: Cov3) -> Pose3:
+        """The pose where the world's frame is at ``start`` (3,), whose right perturbation has ``cov`` (3, 3)."""
+        R = _yaw(float(start[2]))
+        way, world = R @ self.position, np.kron(np.eye(2), R)
+        lever = _lever(way)
+        covariance = world @ self.covariance @ world.T + lever @ world @ _in_plane(cov) @ world.T @ lever.T
+        return Pose3(np.array([start[0], start[1], 0.0]) + way, R @ self.rotation, covariance)
 
 
 class Lifting:
@@ -89,6 +94,20 @@ class Lifting:
         full[5, 5] = cov[2, 2]
         full[:2, 5] = full[5, :2] = self._rotation[:2, :2] @ cov[:2, 2]
         return full
+
+
+def _in_plane(cov: Cov3) -> FloatArray:
+    """(6, 6) of x, y, z, roll, pitch, yaw by the planar ``cov`` (3, 3)."""
+    full = np.zeros((6, 6))
+    full[np.ix_(_PLANAR, _PLANAR)] = cov
+    return full
+
+
+def _lever(way: FloatArray) -> FloatArray:
+    """(6, 6) how an error of the pose before ``way`` (3,) moves the one after it, in the world's axes."""
+    lever = np.eye(6)
+    lever[:3, 3:] = -se3.cross(way)
+    return lever
 
 
 def _yaw(angle: float) -> FloatArray:

@@ -142,7 +142,7 @@ class _Replay:
                     self._parameters.setdefault(name, []).append((estimate.stamp_ns * 1e-9, mean, sigma))
             attitude = self._pipeline.attitude
             if estimate.in_space is not None:
-                self._in_space.add(estimate.stamp_ns, estimate.in_space)
+                self._in_space.add(estimate.stamp_ns, estimate.in_map or estimate.in_space)
             elif attitude is not None:
                 self._attitudes.add(estimate.stamp_ns, attitude)
 

@@ -16,18 +16,16 @@ from localization.estimators import (
     ESTIMATORS_WITH_CORRECTIONS,
     ESTIMATORS_WITH_MAP,
     Estimate,
+    Estimator,
     EstimatorConfig,
-    MapFusion,
     PriorMap,
     SpaceChoice,
-    SpaceFusion,
     SpaceGraphSettings,
-    SpaceMapFusion,
     make_estimator,
+    make_localizing,
 )
 from localization.events import Event, ImuSample, PositionSample, Scan
 from localization.lidar.losses import LidarLosses
-from localization.maps.space_places import SpacePlaces
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig, Synchronizer
 from motion_models.base import MotionModel
@@ -76,29 +74,27 @@ class Pipeline:
         """Known mounts by frame, shared with the synchronizer and the estimator."""
         prior = trial.prior
         is_in_space = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is False
-        is_in_space |= prior is not None and isinstance(prior.places, SpacePlaces)
+        is_in_space |= prior is not None and prior.is_in_space
         has_corrections = trial.estimator in ESTIMATORS_WITH_CORRECTIONS and not (is_in_space and trial.estimator != "graph")
         model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         if is_in_space:
             self.synchronizer.measure_in_space()
-        name = trial.estimator if prior is None else "ekf"
         graph: SpaceGraphSettings | None = None
         if trial.estimator == "graph":
             corrections = make_corrections(model, trial.corrections)
             of_graph = config.estimator.graph, is_smoothing, config.estimator.lidar.range_noise_m
             graph = SpaceGraphSettings(corrections, robot.geometry.track_width_m, *of_graph)
         choice = SpaceChoice(robot.gyro_noise, self.mounts, config.estimator.lidar, config.estimator.space, graph)
-        if is_in_space:
-            self.estimator = choice.begin()
+        made = model, trial.corrections, robot, self.mounts
+        self.estimator: Estimator
+        if prior is not None:
+            self.estimator = make_localizing(prior, *made, config.estimator, is_smoothing)
         else:
-            self.estimator = make_estimator(name, model, trial.corrections, robot, self.mounts, has_lidar, config.estimator, is_smoothing)
-        if prior is not None and isinstance(prior.places, SpacePlaces):
-            assert isinstance(self.estimator, SpaceFusion)
-            self.estimator = SpaceMapFusion(self.estimator, prior.places, prior.initial, is_recording=is_smoothing)
+            self.estimator = (
+                choice.begin() if is_in_space else make_estimator(trial.estimator, *made, has_lidar, config.estimator, is_smoothing)
+            )
         self._is_in_planar_map = prior is not None and not is_in_space  # whether its ground tilts is to be known
-        if prior is not None and not is_in_space:
-            self.estimator = MapFusion(self.estimator, prior, is_recording=is_smoothing)
         has_choice = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar
         self.space_choice = choice if has_choice else None
         """The choice between plane and space; None where there is none."""

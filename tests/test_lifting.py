@@ -14,6 +14,7 @@ from localization.lifting import AttitudeTable, Lifting, Pose3, quaternion, writ
 from localization.logs.serialization import FusedWriter
 from localization.logs.writer import FusedEstimate, odometry_message, transform_message
 from localization.trajectory import Trajectory
+from motion_models import se2
 
 
 class Vertical:
@@ -104,6 +105,26 @@ def test_pose_in_space_moved_in_its_plane_has_the_covariance_of_samples():
     turns = (after * Rotation.from_matrix(made.rotation).inv()).as_rotvec()
     found = np.cov(np.column_stack([positions - made.position, turns]).T)
     np.testing.assert_allclose(found, made.covariance, atol=0.05 * np.abs(made.covariance).max())
+
+
+def test_pose_in_space_after_a_start_has_the_covariance_of_samples():
+    """The frame in which it is given is at an uncertain planar pose."""
+    rng, start, cov = np.random.default_rng(2), np.array([3.0, -2.0, 0.8]), np.diag([0.02, 0.01, 0.005]) ** 2
+    turned = Rotation.from_euler("zyx", [0.4, -0.2, 0.1]).as_matrix()
+    pose = Pose3(np.array([5.0, 1.0, 0.7]), turned, np.diag([0.01, 0.02, 0.01, 0.003, 0.004, 0.002]) ** 2)
+    placed, rows = pose.placed(start, cov), []
+    for e, s in zip(
+        rng.multivariate_normal(np.zeros(6), pose.covariance, 4000), rng.multivariate_normal(np.zeros(3), cov, 4000), strict=True
+    ):
+        moved = Pose3(pose.position + e[:3], Rotation.from_rotvec(e[3:]).as_matrix() @ turned, pose.covariance)
+        drawn = moved.placed(se2.retract(start, s), cov)
+        off = Rotation.from_matrix(drawn.rotation @ placed.rotation.T).as_rotvec()
+        rows.append(np.r_[drawn.position - placed.position, off])
+    np.testing.assert_allclose(np.cov(np.array(rows).T), placed.covariance, atol=0.06 * placed.covariance.max())
+    planar, above = placed.from_above()
+    np.testing.assert_allclose(planar, se2.compose(start, pose.from_above()[0]), atol=1e-12)
+    np.testing.assert_allclose(placed.position[2], 0.7)
+    assert above.shape == (3, 3)
 
 
 def test_fused_message_of_a_pose_in_space_has_height_tilt_and_covariance():

@@ -85,6 +85,8 @@ class OnlineCommand(OnlineSettings):
         log = open_log(path, robot, self.topic)
         has_lidar = log.sources.lidar is not None
         trial = self.make_trial(has_lidar)
+        if trial.prior is not None:
+            trial.prior.check_lidar(log.sources.has_clouds, bool(self.config.step.planar))
         made = made_by(trial, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
         pipeline = Pipeline(trial, robot, log.mounts, has_lidar, self.config)
         session = Session.start(files, SessionState(pipeline), f"{trial.model.name}_{trial.estimator}", made, shared_of(trial))

@@ -39,9 +39,8 @@ from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
 from localization.logs.reference_topics import merge_positions, read_positions
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
-from localization.maps import SavedMap, SpaceMap, load_map, save_map
-from localization.maps.place_search import PlaceMap
-from localization.maps.space_places import SpacePlaces
+from localization.maps import SavedMap, load_map, save_map
+from localization.maps.space_places import make_places
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
@@ -210,27 +209,22 @@ class Replay:
             raise EstimatorError("--initial-pose is three numbers x y yaw [m, m, deg] in a saved map. Name the map by --map.")
         if self.map is None:
             return None
-        saved, noise_m, has_clouds = load_map(self.map), self.config.estimator.lidar.range_noise_m, _has_clouds(log)
-        if not isinstance(saved.map, SpaceMap):
-            if self.config.step.planar is False:
-                raise MapError(f"map '{self.map}' holds planar scans: poses in it are in the plane. Leave out --config.step.no-planar.")
-            return PriorMap(PlaceMap(saved.map, noise_m), self._initial())
+        saved, is_planar = load_map(self.map), self.config.step.planar
+        prior = PriorMap(make_places(saved.map, self.config.estimator.lidar.range_noise_m), self._initial())
+        prior.check_lidar(log.sources.has_clouds, bool(is_planar))
+        if not prior.is_in_space and is_planar is False:
+            raise MapError(f"map '{self.map}' holds planar scans: poses in it are in the plane. Leave out --config.step.no-planar.")
         if self.extend_map is not None:
             saved.planar(self.map, "--extend-map")
         if self.positions is not None and "graph" not in names(self.estimator, "--estimator"):
             saved.planar(self.map, "--positions without the estimator graph")
-        if not has_clouds or self.config.step.planar:
-            why = "--config.step.planar keeps poses in the plane" if has_clouds else "the LiDAR of this log is planar"
-            raise MapError(
-                f"map '{self.map}' holds clouds in space, and {why}. Name a map of planar scans, or the topic by --topic.points."
-            )
-        return PriorMap(SpacePlaces(saved.map, noise_m), self._initial())
+        return prior
 
     def _refuse_tilt(self, log: Log, trials: Sequence[Trial], runs: Sequence[Run]) -> None:
         """Raises `MapError` where a 3D LiDAR was tilted by the ground in a map of planar scans."""
         for trial, run in zip(trials, runs, strict=True):
-            is_planar_map = trial.prior is not None and isinstance(trial.prior.places, PlaceMap)
-            if is_planar_map and run.in_space is not None and _has_clouds(log) and self.config.step.planar is None:
+            is_planar_map = trial.prior is not None and not trial.prior.is_in_space
+            if is_planar_map and run.in_space is not None and log.sources.has_clouds and self.config.step.planar is None:
                 raise MapError(
                     f"map '{self.map}' holds planar scans, and the IMU shows that the ground tilts: a 3D LiDAR is lost in it. "
                     "Save a map in space by --estimator graph --save-map, or stay in the plane by --config.step.planar."
@@ -322,11 +316,6 @@ class Replay:
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
-
-
-def _has_clouds(log: Log) -> bool:
-    """Whether the LiDAR of ``log`` is a 3D one."""
-    return log.sources.lidar is not None and log.sources.lidar.kind == "points"
 
 
 def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:

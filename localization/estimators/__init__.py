@@ -12,12 +12,14 @@ from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.estimator import Estimate, Estimator, LearnedParameter, Residuals
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
-from localization.estimators.map_fusion import MapFusion, PriorMap
+from localization.estimators.map_fusion import MapFusion
+from localization.estimators.saved_map_fusion import PriorMap, SavedMapFusion
 from localization.estimators.space_choice import SpaceChoice
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
 from localization.estimators.space_map_fusion import SpaceMapFusion
 from localization.lidar import LidarConfig, ScanMatchingSensor
+from localization.maps.space_places import SpacePlaces
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, make_corrections
 from motion_models.robot import Mount, Robot
@@ -36,6 +38,7 @@ __all__ = [
     "MapFusion",
     "PriorMap",
     "Residuals",
+    "SavedMapFusion",
     "SpaceChoice",
     "SpaceFusion",
     "SpaceGraphFusion",
@@ -43,6 +46,7 @@ __all__ = [
     "SpaceMapFusion",
     "check_estimator",
     "make_estimator",
+    "make_localizing",
 ]
 
 
@@ -106,3 +110,15 @@ def make_estimator(
     corrected, sensor = make_corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
     ekf = EkfFusion(model, corrected, robot, sensor, config.ekf)
     return ekf if name == "ekf" else GraphFusion(ekf, corrected, config.lidar, config.graph, is_smoothing)
+
+
+def make_localizing(
+    prior: PriorMap, model: MotionModel, form: Form, robot: Robot, mounts: Mapping[str, Mount], config: EstimatorConfig, is_recording: bool
+) -> MapFusion | SpaceMapFusion:
+    """The filter localized in ``prior``, in the plane or in space as that is; with ``is_recording``, its keyframes are kept."""
+    places, initial = prior.places, prior.initial
+    if isinstance(places, SpacePlaces):
+        in_space = SpaceFusion(robot.gyro_noise, mounts, config.lidar, config.space)
+        return SpaceMapFusion(in_space, places, initial, is_recording)
+    sensor = ScanMatchingSensor(mounts, config.lidar)
+    return MapFusion(EkfFusion(model, make_corrections(model, form), robot, sensor, config.ekf), places, initial, is_recording)

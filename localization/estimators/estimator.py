@@ -41,7 +41,9 @@ class Estimate:
     map_T_odom: Pose2 | None = None
     """(3,) what loop closures and positions have corrected; None where ``pose`` is in the odometry frame."""
     in_space: Pose3 | None = None
-    """``odom_T_body`` of an estimator of poses in space, of which ``pose`` is the one seen from above."""
+    """``odom_T_body`` of an estimator of poses in space, of which ``pose`` or ``odometry`` is the one seen from above."""
+    in_map: Pose3 | None = None
+    """``map_T_body`` in a saved map in space, of which ``pose`` is the one seen from above."""
 
 
 class LearnedParameter(NamedTuple):

@@ -18,7 +18,8 @@ from localization.bounded_settings import Positive, Settings, Signed
 from localization.core.state import SE2, Group
 from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
-from localization.estimators.fusion import EkfFusion, FilteredOdometry
+from localization.estimators.filtered_odometry import FilteredOdometry
+from localization.estimators.fusion import EkfFusion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, through_nodes
 from localization.estimators.position_queue import PositionQueue, align_map
 from localization.events import PositionSample, Step
@@ -67,7 +68,7 @@ class GraphConfig(Settings):
     """Clouds of a 3D LiDAR close loops of the smoothed trajectory where the robot has left the plane, by map-closures (extra `loops`)."""
 
 
-class GraphFusion(FilteredOdometry):
+class GraphFusion(FilteredOdometry[EkfFusion]):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, corrections: Corrections, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):

@@ -12,35 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from localization.estimators.estimator import Estimate, Estimator
-from localization.estimators.fusion import EkfFusion, FilteredOdometry
+from localization.errors import MapError
+from localization.estimators.estimator import Estimate
+from localization.estimators.fusion import EkfFusion
+from localization.estimators.saved_map_fusion import KEYFRAME_ANGLE_RAD, KEYFRAME_DISTANCE_M, PriorMap, SavedMapFusion
 from localization.events import PositionSample, Step
 from localization.lidar.registration import is_narrow
 from localization.logs.reference_topics import in_plane
 from localization.maps import KeyframeMap
 from localization.maps.changes import Changes, find_changes
-from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from localization.maps.recent_scans import RecentMotion
-from localization.maps.space_places import SpacePlaces
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
-_KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
-"""A keyframe follows when the robot has moved this far: scans of less are nearly the same evidence."""
-_LISTED_PLACES = 5
+_LISTED_CHANGES = 5
 _LEAST_CHANGED = 0.05
 """Share of the walls that are changed, from which on it is a note: halves of fr079 and MIT-CSAIL differ by 0.005 to 0.03, by doors."""
-
-
-@dataclass(frozen=True, eq=False)
-class PriorMap:
-    """A map that exists before the drive, and about where the drive begins in it."""
-
-    places: PlaceMap | SpacePlaces
-    initial: Pose2 | None = None
-    """(3,) ``map_T_body`` [m, m, rad]; None for anywhere. In space height, roll and pitch are those of the map's ground and gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,23 +41,20 @@ class _DriveKeyframe:
     """(3,) in the map; None while that was not known."""
 
 
-class MapFusion(FilteredOdometry):
+class MapFusion(SavedMapFusion[EkfFusion]):
     """`EkfFusion` with a `Localizer` behind it."""
 
-    def __init__(self, odometry: Estimator, prior: PriorMap, is_recording: bool = False) -> None:
-        """``odometry``: an `EkfFusion` with a LiDAR. With ``is_recording``, the keyframes of the drive are kept, and `finish` compares
-        them with the map."""
-        assert isinstance(odometry, EkfFusion)
-        assert isinstance(prior.places, PlaceMap)
-        self.odometry, self.localizer = odometry, Localizer(prior.places, prior.initial, is_background=True)
+    localizer: Localizer
+
+    def __init__(self, odometry: EkfFusion, places: PlaceMap, initial: Pose2 | None = None, is_recording: bool = False) -> None:
+        """``odometry``: a filter with a LiDAR. ``initial`` (3,): about where the drive begins in the map; None for anywhere. With
+        ``is_recording``, the keyframes of the drive are kept, and `finish` compares them with the map."""
+        super().__init__(odometry)
+        self.localizer = Localizer(places, initial, is_background=True)
         self._end_ns = 0
         self._is_keyframe_due, self._is_scan_awaited = False, True  # no scan since the robot was carried, or at all
         self._summed = RecentMotion(np.zeros(3), np.zeros((3, 3)))  # step by step, since the last keyframe
         self._map_T_odom, self._key_cov = self.localizer.pose, self.localizer.covariance
-        self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
-        self._outside_s = 0.0
-        self._first_s: float | None = None
-        self._n_losses, self._waiting_s = 0, 0.0
         self._positions: list[PositionSample] = []
         self._n_unused = 0
         self._drive: list[_DriveKeyframe] | None = [] if is_recording else None
@@ -80,12 +66,11 @@ class MapFusion(FilteredOdometry):
         self._end_ns = step.end_ns
         estimate = self.odometry.step(step)
         self._count(step.duration)
-        self._waiting_s += step.duration
         self._add_step()
         delta, cov = self._motion_since_keyframe()
         if delta is self._summed.delta:
             self._map_T_odom = se2.compose(se2.compose(self.localizer.pose, delta), se2.inverse(estimate.pose))
-        is_far = math.hypot(delta[0], delta[1]) >= _KEYFRAME_DISTANCE_M or abs(delta[2]) >= _KEYFRAME_ANGLE_RAD
+        is_far = math.hypot(delta[0], delta[1]) >= KEYFRAME_DISTANCE_M or abs(delta[2]) >= KEYFRAME_ANGLE_RAD
         has_scan = len(self.odometry.scan_points) > 0
         self._is_keyframe_due = ((is_far or self._is_scan_awaited) and has_scan) or not is_narrow(cov)  # carried: what was is no longer so
         self._take_positions(step.end_ns, delta)
@@ -98,9 +83,7 @@ class MapFusion(FilteredOdometry):
     def run_deferred(self) -> bool:
         """Do what was deferred until the estimate was published: update the submap, and localize the keyframe in the map."""
         self.odometry.run_deferred()
-        passed_s, self._waiting_s = self._waiting_s, 0.0
-        if self.localizer.advance(passed_s):
-            self._take_pose()
+        self._advance_search()
         if self._is_keyframe_due:
             self._is_keyframe_due, self._is_scan_awaited = False, not len(self.odometry.scan_points)
             was_localized = self.localizer.state == "localized"
@@ -148,19 +131,16 @@ class MapFusion(FilteredOdometry):
         return by_clones if np.trace(by_clones.cov) <= np.trace(self._summed.cov) else self._summed
 
     def set_pose(self, pose: Pose2, cov: Cov3) -> None:
-        """Search near the present ``pose`` (3,) in the map, with covariance ``cov`` (3, 3), as a person gives it. Odometry goes on."""
+        """See `SavedMapFusion.set_pose`."""
         delta, _ = self._motion_since_keyframe()
         self.localizer.set_pose(se2.compose(pose, se2.inverse(delta)), cov)
         self._take_pose()
 
-    def relocalize(self) -> None:
-        """Discard the pose in the map, and search the whole map. Odometry continues."""
-        self.localizer.search_everywhere()
-        self._take_pose()
-
-    def replace_map(self, places: PlaceMap) -> None:
-        """Localize in ``places`` instead of the present map, and search all of it. Odometry goes on."""
-        self.localizer = Localizer(places, is_background=True)
+    def replace_map(self, prior: PriorMap) -> None:
+        """See `SavedMapFusion.replace_map`."""
+        if not isinstance(prior.places, PlaceMap):
+            raise MapError("it holds clouds in space, and this estimator localizes planar scans. Start with it by --map.")
+        self.localizer = Localizer(prior.places, prior.initial, is_background=True)
         self._drive = None if self._drive is None else []
         self._take_pose()
 
@@ -169,16 +149,10 @@ class MapFusion(FilteredOdometry):
         self._map_T_odom = se2.compose(self.localizer.pose, se2.inverse(self.odometry.state["key"]))
         self._key_cov = self.localizer.covariance
 
-    def _count(self, duration_s: float) -> None:
-        if self.localizer.state == "localized" and self._first_s is None:
-            self._first_s = sum(self._seconds.values())
-        self._seconds[self.localizer.state] += duration_s
-        self._outside_s += duration_s if self._is_outside else 0.0
-
     @property
-    def _is_outside(self) -> bool:
-        """Whether the place is known, and is where the map has nothing."""
-        return self.localizer.state == "localized" and self.localizer.is_outside
+    def probability(self) -> float:
+        """See `SavedMapFusion.probability`."""
+        return self.localizer.probability_after(*self._motion_since_keyframe())
 
     def finish(self, filtered: Any = None) -> None:
         """The trajectory stays as it was published: nothing is smoothed."""
@@ -207,55 +181,16 @@ class MapFusion(FilteredOdometry):
         )
 
     def localization(self) -> Mapping[str, Any]:
-        """State, probability and places in the saved map so far, as JSON holds them."""
-        places = [] if self.localizer.state == "localized" else self.localizer.hypotheses[:_LISTED_PLACES]
-        return {
-            "state": self.localizer.state,
-            "probability": self.localizer.probability_after(*self._motion_since_keyframe()),
-            "pose": self.localizer.pose.tolist(),
-            **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
-            "is_outside": self._is_outside,
-            "outside_s": self._outside_s,
-            "first_localized_s": self._first_s,
-            "losses": self._n_losses,
-            "places": [{"pose": place.pose.tolist(), "probability": place.probability} for place in places],
-            **({} if self._changes is None else _as_json(self._changes)),
-        }
-
-    def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """Mean and sigma of what the filter estimated besides the pose, by name."""
-        return self.odometry.parameters()
-
-    def counts(self) -> Mapping[str, int]:
-        """Number of occurrences by name, as the filter counts them."""
-        return self.odometry.counts()
+        """`SavedMapFusion.localization`, and what has changed in the map."""
+        return {**super().localization(), **({} if self._changes is None else _as_json(self._changes))}
 
     def warnings(self) -> list[str]:
-        """Problems of the measurements so far: those of the filter, and for how long the place in the map was not known."""
-        found, total = list(self.odometry.warnings()), sum(self._seconds.values())
-        state, unknown = self.localizer.state, self._seconds["lost"]
-        if self._first_s is None and self.odometry.counts()["scans"]:
-            found.append(
-                "the robot was never localized in the map. It may be another building's, or much may have changed: check --map, or give "
-                "--initial-pose."
-            )
-        elif self._n_losses:
-            found.append(
-                f"the place in the map was lost {self._n_losses} times, for {unknown:.0f} of {total:.0f} s, and is {state} at the end: "
-                "poses of that time are by odometry alone. The robot was carried, or the map is out of date."
-            )
+        """Those of `SavedMapFusion`, positions that could not be used, and what has changed in the map."""
+        found = super().warnings()
         if self._n_unused:
             unused = f"{self._n_unused} positions could not be used: the map was built without such ones"
             found.append(f"{unused}. Build it with --positions, or leave them out.")
         return [*found, *([] if self._changes is None else _describe(self._changes))]
-
-    def occupancy(self) -> Grid:
-        """The saved map."""
-        return self.localizer.grid
-
-    def map_points(self) -> Points2:
-        """(M, 2) points of the saved map [m]."""
-        return self.localizer.map_points()
 
 
 def _as_json(changes: Changes) -> dict[str, Any]:
@@ -266,7 +201,7 @@ def _describe(changes: Changes) -> list[str]:
     """A sentence on the places where the map no longer fits, where they are more than scattered cells."""
     if changes.changed_share < _LEAST_CHANGED:
         return []
-    named = [f"{c.kind} at x {c.x:.1f} m, y {c.y:.1f} m ({c.size_m:.1f} m)" for c in changes.places[:_LISTED_PLACES]]
+    named = [f"{c.kind} at x {c.x:.1f} m, y {c.y:.1f} m ({c.size_m:.1f} m)" for c in changes.places[:_LISTED_CHANGES]]
     rest = len(changes.places) - len(named)
     more = f", and {rest} more" if rest else ""
     return [

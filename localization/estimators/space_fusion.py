@@ -229,26 +229,6 @@ class SpaceFusion(Estimator):
         return NO_POINTS if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
 
 
-class FilteredSpaceOdometry(Estimator):
-    """An estimator of poses in a map, whose odometry and learned states are those of a `SpaceFusion`."""
-
-    odometry: SpaceFusion
-
-    @property
-    def clock_offset_s(self) -> float:
-        """See `SpaceFusion.clock_offset_s`."""
-        return self.odometry.clock_offset_s
-
-    @property
-    def lost(self) -> LostScans:
-        """See `SpaceFusion.lost`."""
-        return self.odometry.lost
-
-    def parameters(self) -> Mapping[str, tuple[float, float]]:
-        """See `SpaceFusion.parameters`."""
-        return self.odometry.parameters()
-
-
 def _align(state: State, gravity: Gravity) -> State:
     """The pose turned about a level axis, so that ``gravity`` is vertical; its heading, that of the body's x axis, stays.
 

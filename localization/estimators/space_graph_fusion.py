@@ -15,10 +15,11 @@ from localization.core.space import SE3
 from localization.core.state import clip_eigenvalues
 from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
+from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
 from localization.estimators.pose_graph import through_nodes
 from localization.estimators.position_queue import PositionQueue, align_map
-from localization.estimators.space_fusion import FilteredSpaceOdometry, SpaceFusion
+from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from localization.events import PositionSample, Step
 from localization.lidar.cloud_loops import find_loops, make_map_closures
@@ -55,7 +56,7 @@ class SpaceGraphSettings:
             make_map_closures(1.0)  # a missing extra is an error before the drive
 
 
-class SpaceGraphFusion(FilteredSpaceOdometry):
+class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
     """`SpaceFusion`, whose keyframes a `SpaceGraph` smooths at the end; its live poses are the filter's.
 
     The filter's submap grows with the drive and is never left, so that a place that is visited again is matched by the filter itself. Where

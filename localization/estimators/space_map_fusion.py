@@ -6,39 +6,49 @@ As in the plane (`map_fusion`), the filter never depends on the map: ``odom_T_bo
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from localization.errors import EstimatorError
+from localization.errors import EstimatorError, MapError
 from localization.estimators.estimator import Estimate
-from localization.estimators.space_fusion import FilteredSpaceOdometry, SpaceFusion
+from localization.estimators.saved_map_fusion import KEYFRAME_ANGLE_RAD, KEYFRAME_DISTANCE_M, PriorMap, SavedMapFusion
+from localization.estimators.space_fusion import SpaceFusion
 from localization.events import Step
-from localization.lifting import Pose3, SpaceTable, Trajectory3
+from localization.lifting import Pose3
+from localization.maps import SpaceMap
 from localization.maps.space_localizer import SpaceLocalizer, SpaceMotion
+from localization.maps.space_map import in_units
 from localization.maps.space_places import SpacePlaces
 from localization.trajectory import Trajectory
 from motion_models import se2, se3
-from motion_models.se2 import FloatArray, Points2, Pose2
-
-_KEYFRAME_DISTANCE_M, _KEYFRAME_ANGLE_RAD = 0.5, 0.3
-"""A keyframe follows when the robot has moved this far, as in the plane."""
+from motion_models.se2 import Cov3, FloatArray, Pose2
+from motion_models.se3 import Transform3
 
 
-class SpaceMapFusion(FilteredSpaceOdometry):
-    """`SpaceFusion` with a `SpaceLocalizer` behind it; estimates are those seen from above, `smoothed_in_space` has all of the pose."""
+@dataclass(frozen=True, eq=False)
+class _DriveKeyframe:
+    stamp_ns: int
+    cloud: FloatArray
+    lidar: FloatArray
+    pose: Transform3
+    """(4, 4) in the map."""
+    cov: FloatArray
+    """(6, 6)"""
 
-    def __init__(self, odometry: SpaceFusion, places: SpacePlaces, initial: Pose2 | None, is_recording: bool = False) -> None:
-        """``initial`` (3,): about where the drive begins in the map. With ``is_recording``, poses in space are kept until `finish`."""
-        self.odometry, self.localizer = odometry, SpaceLocalizer(places, initial)
-        self._has_key = False
+
+class SpaceMapFusion(SavedMapFusion[SpaceFusion]):
+    """`SpaceFusion` with a `SpaceLocalizer` behind it; estimates are those seen from above, `Estimate.in_map` has all of the pose."""
+
+    localizer: SpaceLocalizer
+
+    def __init__(self, odometry: SpaceFusion, places: SpacePlaces, initial: Pose2 | None = None, is_recording: bool = False) -> None:
+        """``initial`` (3,): about where the drive begins in the map. With ``is_recording``, the keyframes of the drive are kept."""
+        super().__init__(odometry)
+        self.localizer = SpaceLocalizer(places, initial, is_background=True)
+        self._has_key, self._end_ns = False, 0
         self._cloud: FloatArray | None = None  # of a keyframe that is due
-        self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
-        self._outside_s, self._n_losses = 0.0, 0
-        self._first_s: float | None = None
-        self._table = SpaceTable() if is_recording else None
+        self._drive: list[_DriveKeyframe] | None = [] if is_recording else None
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map, as seen from above. Raises `EstimatorError` for planar scans."""
@@ -48,29 +58,36 @@ class SpaceMapFusion(FilteredSpaceOdometry):
                 "the map holds clouds in space, and the LiDAR's scans are planar: they cannot be localized in it. Name a map of planar "
                 "scans by --map, or the cloud's topic by --topic.points."
             )
+        self._end_ns = step.end_ns
         estimate = self.odometry.step(step)
         self._count(step.duration)
         motion = self._motion_since_keyframe()
         way, turn = math.hypot(*motion.delta[:3, 3]), math.hypot(*se3.rotation_vector(motion.delta[:3, :3]))
-        is_far = way >= _KEYFRAME_DISTANCE_M or turn >= _KEYFRAME_ANGLE_RAD or not self._has_key
+        is_far = way >= KEYFRAME_DISTANCE_M or turn >= KEYFRAME_ANGLE_RAD or not self._has_key
         self._cloud = self.odometry.cloud if is_far and self.odometry.has_vertical else None
         in_map = self._in_map(motion)
-        if self._table is not None and self.odometry.has_vertical:
-            self._table.add(step.end_ns, in_map)
         pose, covariance = in_map.from_above()
         map_T_odom = se2.compose(pose, se2.inverse(estimate.pose))
-        return replace(estimate, pose=pose, covariance=covariance, odometry=(estimate.pose, estimate.covariance), map_T_odom=map_T_odom)
+        odometry = estimate.pose, estimate.covariance
+        return replace(estimate, pose=pose, covariance=covariance, odometry=odometry, map_T_odom=map_T_odom, in_map=in_map)
 
     def run_deferred(self) -> bool:
         """Do what was deferred until the estimate was published: update the submap, and localize the keyframe in the map."""
         cloud, self._cloud = self._cloud, None
+        self._advance_search()
         if cloud is not None:
             was_localized = self.localizer.state == "localized"
             self.localizer.add(cloud, self._motion_since_keyframe(), self.odometry.state["pose"][:3, :3])
             self._n_losses += was_localized and self.localizer.state == "lost"
             self.odometry.start_key()
             self._has_key = True
+            self._record(cloud)
         return self.odometry.run_deferred()
+
+    def _record(self, cloud: FloatArray) -> None:
+        if self._drive is not None and self.localizer.state == "localized":
+            lidar, pose = self.odometry.lidar_position, self.localizer.pose
+            self._drive.append(_DriveKeyframe(self._end_ns, cloud, lidar, pose, self.localizer.covariance))
 
     def _motion_since_keyframe(self) -> SpaceMotion:
         return SpaceMotion(*self.odometry.state.between("key", "pose")) if self._has_key else SpaceMotion(np.eye(4), np.zeros((6, 6)))
@@ -81,62 +98,48 @@ class SpaceMapFusion(FilteredSpaceOdometry):
         world = np.kron(np.eye(2), pose[:3, :3])
         return Pose3(pose[:3, 3], pose[:3, :3], world @ (A @ self.localizer.covariance @ A.T + motion.cov) @ world.T)
 
-    def _count(self, duration_s: float) -> None:
-        if self.localizer.state == "localized" and self._first_s is None:
-            self._first_s = sum(self._seconds.values())
-        self._seconds[self.localizer.state] += duration_s
-        self._outside_s += duration_s if self.localizer.is_outside else 0.0
+    def set_pose(self, pose: Pose2, cov: Cov3) -> None:
+        """See `SavedMapFusion.set_pose`."""
+        delta, R = self._motion_since_keyframe().delta, self.odometry.state["pose"][:3, :3]
+        level = se3.rotation(np.array([0.0, 0.0, -math.atan2(R[1, 0], R[0, 0])])) @ R
+        key = self.localizer.places.on_ground(pose, level) @ se3.inverse(delta)
+        self.localizer.set_pose(np.array(self._from_above(key)), cov)
+
+    def replace_map(self, prior: PriorMap) -> None:
+        """See `SavedMapFusion.replace_map`."""
+        if not isinstance(prior.places, SpacePlaces):
+            raise MapError("it holds planar scans, and this estimator localizes clouds in space. Start with it by --map.")
+        self.localizer = SpaceLocalizer(prior.places, prior.initial, is_background=True)
+        self._drive = None if self._drive is None else []
+
+    @property
+    def probability(self) -> float:
+        """See `SavedMapFusion.probability`."""
+        return self.localizer.probability_after(self._motion_since_keyframe())
+
+    @staticmethod
+    def _from_above(pose: FloatArray) -> list[float]:
+        return [float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])]
 
     def finish(self, filtered: Trajectory | None = None) -> None:
         """The trajectory stays as it was published: nothing is smoothed."""
         self.run_deferred()
+        self.localizer.finish_search()
 
-    @property
-    def smoothed_in_space(self) -> Trajectory3 | None:
-        """Poses ``map_T_body`` as they were published; None before gravity was measured, or where they were not kept."""
-        return None if self._table is None or not len(self._table) else self._table.trajectory()
-
-    def localization(self) -> Mapping[str, Any]:
-        """State, probability and places in the saved map so far, as JSON holds them."""
-        localizer = self.localizer
-        places = [] if localizer.state == "localized" else localizer.hypotheses
-        return {
-            "state": localizer.state,
-            "probability": localizer.probability,
-            "pose": _from_above(localizer.pose),
-            **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
-            "is_outside": localizer.is_outside,
-            "outside_s": self._outside_s,
-            "first_localized_s": self._first_s,
-            "losses": self._n_losses,
-            "places": [{"pose": _from_above(place.pose), "probability": place.probability} for place in places],
-        }
-
-    def counts(self) -> Mapping[str, int]:
-        """Number of occurrences by name, as the filter counts them."""
-        return self.odometry.counts()
-
-    def warnings(self) -> list[str]:
-        """Problems of the measurements so far: those of the filter, and for how long the place in the map was not known."""
-        found = list(self.odometry.warnings())
-        if self._first_s is None and self.odometry.counts()["scans"]:
-            found.append(
-                "the robot was never localized in the map. It may be of another place, or much may have changed: check --map and "
-                "--initial-pose."
-            )
-        elif self._n_losses:
-            times = f"{self._n_losses} times, for {self._seconds['lost']:.0f} s"
-            found.append(
-                f"the place in the map was lost {times}, and is {self.localizer.state} at the end: poses of that time are by odometry. "
-                "The robot was carried, or the map is out of date."
-            )
-        return found
-
-    def map_points(self) -> Points2:
-        """(M, 2) points of the saved map, seen from above [m]."""
-        return self.localizer.places.points[:, :2]
-
-
-def _from_above(pose: FloatArray) -> list[float]:
-    """x, y, yaw of a pose (4, 4) [m, m, rad]."""
-    return [float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0])]
+    def keyframe_map(self) -> SpaceMap | None:
+        """The drive's keyframes where they were localized in the map; None without such, or where they were not kept."""
+        if not self._drive:
+            return None
+        points, counts = in_units([key.cloud for key in self._drive])
+        return SpaceMap(
+            stamps_ns=np.array([key.stamp_ns for key in self._drive], dtype=np.int64),
+            poses=np.array([key.pose for key in self._drive]),
+            covariances=np.array([0.5 * (key.cov + key.cov.T) for key in self._drive]),
+            points=points,
+            counts=counts,
+            sensors=np.array([key.lidar for key in self._drive]),
+            edges=np.empty((0, 2), np.int64),
+            edge_deltas=np.empty((0, 4, 4)),
+            edge_information=np.empty((0, 6, 6)),
+            edge_is_loop=np.empty(0, dtype=bool),
+        )

@@ -97,6 +97,11 @@ class Sources:
         """Topics of the wheels."""
         return (*(() if self.wheels is None else (self.wheels,)), *self.more_wheels)
 
+    @property
+    def has_clouds(self) -> bool:
+        """Whether the LiDAR is a 3D one."""
+        return self.lidar is not None and self.lidar.kind == "points"
+
     def used(self) -> list[TopicSource]:
         """Each topic once."""
         others = [*self.all_wheels, *(s for s in (self.center_of_gravity, self.imu, self.lidar) if s is not None)]

@@ -7,7 +7,7 @@ one that is not finished by then waits for it.
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -15,29 +15,26 @@ from localization.maps.place_search import Place, PlaceMap
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
+Found = TypeVar("Found")
 
-class BackgroundSearch:
-    """`PlaceMap.search` of merged scans. `advance` by each step, `move` by each keyframe, and take the `result` when it is due."""
 
-    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None, is_by_fix: bool = False) -> None:
-        """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
-        ``is_by_fix``: it is about a measured position."""
-        self._places, self._points, self._near = places, points, near
-        self.n_points, self.is_by_fix = len(points), is_by_fix
-        self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
-        """(3,) motion since the scans, with its covariance (3, 3)."""
-        self._left_s = places.search_s
+class BackgroundSearch(Generic[Found]):
+    """`search` of a map. `advance` by each step, and take the `result` when it is due."""
+
+    def __init__(self, places: Any, *arguments: Any, due_s: float) -> None:
+        """``arguments`` of ``places.search``, whose result is due after ``due_s`` [s]."""
+        self._places, self._arguments, self._left_s = places, arguments, due_s
         self._start()
 
     def _start(self) -> None:
-        self._found: list[Place] = []
+        self._found: list[Found] = []
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._search, name="place search", daemon=True)
         self._thread.start()
 
     def _search(self) -> None:
         try:
-            self._found = self._places.search(self._points, *(self._near or ()))
+            self._found = self._places.search(*self._arguments)
         except Exception as error:  # raised again where the result is taken
             self._error = error
 
@@ -46,12 +43,7 @@ class BackgroundSearch:
         self._left_s -= duration_s
         return self._left_s <= 0.0
 
-    def move(self, delta: Pose2, cov: Cov3) -> None:
-        """The robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) meanwhile."""
-        A = se2.adjoint(se2.inverse(delta))
-        self.moved, self.cov = se2.compose(self.moved, delta), A @ self.cov @ A.T + cov
-
-    def result(self) -> list[Place]:
+    def result(self) -> list[Found]:
         """The places that were found, at the moment of the scans. Waits where the search is not finished."""
         self._thread.join()
         if self._error is not None:
@@ -65,3 +57,20 @@ class BackgroundSearch:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._start()
+
+
+class PlanarSearch(BackgroundSearch[Place]):
+    """`PlaceMap.search` of merged scans; `move` by each keyframe meanwhile."""
+
+    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None, is_by_fix: bool = False) -> None:
+        """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
+        ``is_by_fix``: it is about a measured position."""
+        self.n_points, self.is_by_fix = len(points), is_by_fix
+        self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
+        """(3,) motion since the scans, with its covariance (3, 3)."""
+        super().__init__(places, points, *(near or ()), due_s=places.search_s)
+
+    def move(self, delta: Pose2, cov: Cov3) -> None:
+        """The robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) meanwhile."""
+        A = se2.adjoint(se2.inverse(delta))
+        self.moved, self.cov = se2.compose(self.moved, delta), A @ self.cov @ A.T + cov

@@ -16,7 +16,7 @@ import numpy as np
 from localization.lidar.correlative_search import prior_outlier_cov
 from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanobis
 from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
-from localization.maps.background_search import BackgroundSearch
+from localization.maps.background_search import PlanarSearch
 from localization.maps.grid import Grid
 from localization.maps.place_probability import (
     MAX_SEARCH_ODDS,
@@ -117,7 +117,7 @@ class Localizer:
         self._searched_m, self._is_whole_searched, self._since_search = 0.0, False, np.zeros((3, 3))
         self._failures, self._wait = 0, 0
         self._fix: PositionFix | None = None
-        self._running: BackgroundSearch | None = None
+        self._running: PlanarSearch | None = None
         if initial is not None:
             self.set_pose(initial, initial_cov)
 
@@ -292,7 +292,7 @@ class Localizer:
             self._cov = self._cov if self._initial_left else np.zeros((3, 3))
         points, self._searched_m = self._recent.joined(_JOINED_M), self._recent.way_m
         if self._is_background:
-            self._running = BackgroundSearch(self.places, points, near, is_by_fix)
+            self._running = PlanarSearch(self.places, points, near, is_by_fix)
         else:
             self._conclude(self.places.search(points, *(near or ())), len(points), is_by_fix, np.zeros(3), np.zeros((3, 3)))
 

@@ -15,11 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.maps.background_search import BackgroundSearch
+from localization.maps.grid import Grid
 from localization.maps.localizer import INITIAL_COV, LIKELY, State, within
 from localization.maps.place_probability import sigmoid
 from localization.maps.space_places import SpacePlace, SpacePlaces
 from motion_models import se3
-from motion_models.se2 import Cov3, FloatArray, Pose2
+from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 from motion_models.se3 import Transform3
 
 _BEND = np.diag([5e-3, 5e-3, 5e-3, 5e-4, 5e-4, 5e-4]) ** 2
@@ -46,6 +48,8 @@ _NEAR_M, _NEAR_RAD = 1.0, 0.4
 """Sigma of a pose by odometry since it was known, up to which it is searched about that: 3 sigma are searched in seconds."""
 _NEAR_KEYFRAMES = 10
 """Keyframes after which a given or reckoned pose that no cloud confirms is dropped."""
+_NEAR_SEARCH_S, _SEARCH_S = 0.3, 1.5
+"""Times after which the result of a search beside the estimates is due, about a pose and in the whole map [s]."""
 _PATIENCE, _MAX_WAIT = 6, 3
 """After each so many searches in vain, one more keyframe is left out between them, at most the second number, as in the plane."""
 
@@ -57,6 +61,9 @@ class SpaceMotion(NamedTuple):
     """(4, 4)"""
     cov: FloatArray
     """(6, 6) of its right perturbation."""
+
+
+_NO_MOTION = SpaceMotion(np.eye(4), np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,28 +82,59 @@ class SpaceHypothesis:
 class SpaceLocalizer:
     """`add` keyframe after keyframe; `state`, `probability`, `pose` and `covariance` are those at the last one."""
 
-    def __init__(self, places: SpacePlaces, initial: Pose2 | None = None, initial_cov: Cov3 = INITIAL_COV) -> None:
-        """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3)."""
-        self.places = places
+    def __init__(
+        self, places: SpacePlaces, initial: Pose2 | None = None, initial_cov: Cov3 = INITIAL_COV, is_background: bool = False
+    ) -> None:
+        """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3). ``is_background``: searches run
+        beside the estimates (`BackgroundSearch`), and `advance` counts the time until they are due."""
+        self.places, self._is_background = places, is_background
         self.state: State = "searching"
-        self._log_odds = -_MAX_LOG_ODDS
         self.hypotheses: list[SpaceHypothesis] = []
         """Places that the last search found, the most probable first."""
-        self._since = SpaceMotion(np.eye(4), np.zeros((6, 6)))  # that search
+        self._cov: FloatArray = np.zeros((6, 6))
+        self._running: BackgroundSearch[SpacePlace] | None = None
         self.is_outside = False
         """Whether most of the last cloud is where the map has nothing: the tracked pose is by odometry meanwhile."""
-        self._near_left = 0 if initial is None else _NEAR_KEYFRAMES
-        self._failures = self._wait = 0
-        planar, cov = (places.centre, places.extent_cov) if initial is None else (initial, initial_cov)
-        self.pose, self._cov = places.on_ground(planar, np.eye(3)), _LEVEL_COV.copy()
+        if initial is None:
+            self.search_everywhere()
+        else:
+            self.set_pose(initial, initial_cov)
+
+    def set_pose(self, pose: Pose2, cov: Cov3 = INITIAL_COV) -> None:
+        """Search near ``pose`` (3,) with covariance ``cov`` (3, 3), as a person gives it."""
+        self.search_everywhere()
+        self._near_left, self.pose = _NEAR_KEYFRAMES, self.places.on_ground(pose, np.eye(3))
         self._cov[np.ix_(_PLANAR, _PLANAR)] = cov
+
+    def search_everywhere(self) -> None:
+        """Forget the place, and search the whole map from now on."""
+        self.state = "searching"
+        self.hypotheses, self._log_odds, self.is_outside = [], -_MAX_LOG_ODDS, False
+        self.pose, self._running = self.places.on_ground(self.places.centre, np.eye(3)), None
+        self._since = self._before = _NO_MOTION  # since the clouds of the last search, and those of the search before until then
+        self._failures = self._wait = 0
+        self._forget()
 
     @property
     def probability(self) -> float:
         """That the robot is within 0.5 m and 0.2 rad of `pose`; while it is searched, that it is at the first of `hypotheses`."""
+        return self.probability_after(_NO_MOTION)
+
+    def probability_after(self, motion: SpaceMotion) -> float:
+        """`probability` when the robot has moved by ``motion`` since the last keyframe."""
         if self.state != "localized":
             return min(sigmoid(self._log_odds), LIKELY)
-        return sigmoid(self._log_odds) * within(self._cov[np.ix_(_PLANAR, _PLANAR)])
+        A = se3.adjoint(se3.inverse(motion.delta))
+        return sigmoid(self._log_odds) * within((A @ self._cov @ A.T + motion.cov)[np.ix_(_PLANAR, _PLANAR)])
+
+    @property
+    def grid(self) -> Grid | None:
+        """The map's walls and free ground, as seen from above; None where nothing stands upright."""
+        return None if self.places.from_above is None else self.places.from_above.grid
+
+    def map_points(self) -> Points2:
+        """(M, 2) points of the map, seen from above [m]."""
+        return self.places.points[:, :2]
 
     @property
     def covariance(self) -> FloatArray:
@@ -113,12 +151,27 @@ class SpaceLocalizer:
         self._since = SpaceMotion(self._since.delta @ motion.delta, A @ self._since.cov @ A.T + motion.cov)
         self.hypotheses = [replace(found, pose=found.pose @ motion.delta) for found in self.hypotheses]
         if self.state == "localized" and _is_within(self._cov, _TRACKED_M, _TRACKED_RAD):
+            self._running = None
             self._track(cloud)
             return
         if self.state == "localized":  # by odometry for long: the place is searched about the pose, or everywhere
             self.state, self.hypotheses, self._log_odds = "searching", [], -_MAX_LOG_ODDS
             self._near_left = _NEAR_KEYFRAMES
-        self._search(cloud, rotation)
+        if self._running is None:
+            self._search(cloud, rotation)
+
+    def advance(self, duration_s: float) -> bool:
+        """``duration_s`` more have passed in the log; returns whether the result of a search was due, and has been taken."""
+        if self._running is None or not self._running.advance(duration_s):
+            return False
+        self.finish_search()
+        return True
+
+    def finish_search(self) -> None:
+        """Take the result of the search that runs, if one does."""
+        search, self._running = self._running, None
+        if search is not None:
+            self._conclude(search.result())
 
     def _track(self, cloud: FloatArray) -> None:
         """Register near the pose. Where that contradicts, again and again, the robot is lost."""
@@ -158,31 +211,37 @@ class SpaceLocalizer:
         self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
         yaw = math.atan2(rotation[1, 0], rotation[0, 0])
         level = se3.rotation(np.array([0.0, 0.0, -yaw])) @ rotation
+        near: tuple[FloatArray, ...] = ()
         if self._near_left and _is_within(self._cov, _NEAR_M, _NEAR_RAD):
-            near = np.array([*self.pose[:2, 3], math.atan2(self.pose[1, 0], self.pose[0, 0])])
-            places = self.places.search(cloud, near, 3.0 * np.sqrt(np.diagonal(self._cov)[_PLANAR]), level)
-        else:
-            places = self.places.search_everywhere(cloud, level)
-        self._conclude(places)
-        if self.state != "localized" and self._near_left:
+            at = np.array([*self.pose[:2, 3], math.atan2(self.pose[1, 0], self.pose[0, 0])])
+            near = at, 3.0 * np.sqrt(np.diagonal(self._cov)[_PLANAR])
+        if self._near_left:
             self._near_left -= 1
             if not self._near_left:
                 self._forget()
+        self._before, self._since = self._since, _NO_MOTION
+        if self._is_background:
+            due_s = _NEAR_SEARCH_S if near else _SEARCH_S
+            self._running = BackgroundSearch(self.places, cloud, level, *near, due_s=due_s)
+        else:
+            self._conclude(self.places.search(cloud, level, *near))
 
     def _conclude(self, places: Sequence[SpacePlace]) -> None:
-        """Take the best of ``places``, if it is probable and the searches before agree."""
-        before, since = self.hypotheses, self._since
-        self.hypotheses, self._since = _weigh(places), SpaceMotion(np.eye(4), np.zeros((6, 6)))
+        """Take the best of ``places``, which are those of the last search's cloud, if it is probable and the searches before agree."""
+        earlier, delta = self.hypotheses, self._since.delta
+        A = se3.adjoint(se3.inverse(delta))
+        self.hypotheses = [replace(found, pose=found.pose @ delta) for found in _weigh(places)]
         self._log_odds = -_MAX_LOG_ODDS
         if not self.hypotheses:
             return
         best = self.hypotheses[0]
         self._log_odds = math.log(best.probability / (1.0 - best.probability))
-        way = max((found.way_m for found in before if _agree(found.pose, best.pose, since.cov + _SAME_COV)), default=-math.inf)
-        way = max(way + math.hypot(*since.delta[:3, 3]), 0.0)
+        cov = A @ self._before.cov @ A.T + _SAME_COV
+        way = max((found.way_m for found in earlier if _agree(found.pose, best.pose, cov)), default=-math.inf)
+        way = max(way + math.hypot(*self._before.delta[:3, 3]), 0.0)
         self.hypotheses[0] = replace(best, way_m=way)
         if best.probability >= LIKELY and way >= _INDEPENDENT_M:
-            self.state, self.pose, self._cov = "localized", best.pose, best.cov + _BEND
+            self.state, self.pose, self._cov = "localized", best.pose, A @ (best.cov + _BEND) @ A.T + self._since.cov
             self._near_left = self._failures = self._wait = 0
 
 

@@ -16,6 +16,7 @@ from localization.lidar.cloud_map import SYSTEMATIC_COV, CloudMap, CloudMatch, t
 from localization.lidar.kiss_icp import choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
 from localization.maps.height_slice import HEIGHTS_M, HeightSlice, find_ground
+from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.place_search import PlaceMap
 from localization.maps.space_map import SpaceMap
 from motion_models import se3
@@ -74,7 +75,7 @@ class SpacePlaces:
         for pose, cloud in zip(mapped.poses, clouds, strict=True):
             for surfaces in (self._surfaces, self._coarse):
                 surfaces.insert(pose, cloud)
-        self.mapped, self._range_noise_m = mapped, range_noise_m
+        self.mapped, self.range_noise_m = mapped, range_noise_m
         self.fingerprint = hashlib.sha256(mapped.poses.tobytes() + mapped.points.tobytes()).hexdigest()[:12]
         points = mapped.points_in_map()
         self._ground = find_ground(points)
@@ -103,27 +104,29 @@ class SpacePlaces:
         """The place of ``cloud`` (N, 3) of the body frame near ``pose`` (4, 4), uncertain by ``cov`` (6, 6)."""
         return _compare(self._surfaces.match(cloud, pose, cov), len(cloud))
 
-    def search(self, cloud: FloatArray, near: Pose2, half: FloatArray, level: FloatArray) -> list[SpacePlace]:
-        """Places where ``cloud`` (N, 3) of the body frame fits best within ``half`` (3,) [m, m, rad] of ``near`` (3,), the best first;
-        ``level`` as of `on_ground`."""
+    def search(self, cloud: FloatArray, level: FloatArray, near: Pose2 | None = None, half: FloatArray | None = None) -> list[SpacePlace]:
+        """Places where ``cloud`` (N, 3) of the body frame fits best, the best first: with ``near`` (3,), within ``half`` (3,) [m, m, rad]
+        of it, else in the whole map, from where what stands upright fits as seen from above. ``level`` as of `on_ground`."""
+        if near is None or half is None:
+            return self._search_everywhere(cloud, level)
         axes = [np.linspace(-h, h, max(math.ceil(2.0 * h / d), 1) + 1) for h, d in zip(half, (_START_M, _START_M, _START_RAD), strict=True)]
         starts = [near + np.array(offset) for offset in itertools.product(*axes) if np.hypot(*(offset[:2] / half[:2])) <= 1.0]
         return self.refine(cloud, starts, level)
 
-    def search_everywhere(self, cloud: FloatArray, level: FloatArray) -> list[SpacePlace]:
-        """`search` in the whole map, from where what stands upright fits as seen from above; none where nothing does."""
+    def _search_everywhere(self, cloud: FloatArray, level: FloatArray) -> list[SpacePlace]:
+        """None where nothing stands upright."""
         upright = cloud @ level.T
         above = find_ground(upright).above(upright)
         walls = upright[(above >= HEIGHTS_M[0]) & (above <= HEIGHTS_M[1]), :2]
-        if self._from_above is None or len(walls) < MIN_POINTS:
+        if self.from_above is None or len(walls) < MIN_POINTS:
             return []
-        return self.refine(cloud, [place.pose for place in self._from_above.search(walls)], level)
+        return self.refine(cloud, [place.pose for place in self.from_above.search(walls)], level)
 
     @cached_property
-    def _from_above(self) -> PlaceMap | None:
+    def from_above(self) -> PlaceMap | None:
         """The slice of what stands upright; None where nothing does."""
         try:
-            return PlaceMap(HeightSlice(self.mapped).keyframes, self._range_noise_m)
+            return PlaceMap(HeightSlice(self.mapped).keyframes, self.range_noise_m)
         except MapError:
             return None
 
@@ -143,6 +146,15 @@ class SpacePlaces:
     def upright_columns(self, cloud: FloatArray, pose: Transform3) -> tuple[int, int]:
         """Columns in which something stands upright both in the map and in ``cloud`` (N, 3) at ``pose`` (4, 4), and in one alone."""
         return compare_columns(self.points, se3.transform(pose, cloud), 2.0 * self.cell)
+
+
+Places = PlaceMap | SpacePlaces
+"""A map as scans or clouds are localized in it."""
+
+
+def make_places(mapped: KeyframeMap | SpaceMap, range_noise_m: float) -> Places:
+    """``mapped`` as scans or clouds are localized in it, with a sigma of a range [m]. Raises `MapError` without points."""
+    return SpacePlaces(mapped, range_noise_m) if isinstance(mapped, SpaceMap) else PlaceMap(mapped, range_noise_m)
 
 
 def _compare(match: CloudMatch, n_points: int) -> SpacePlace:

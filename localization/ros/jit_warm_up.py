@@ -58,7 +58,10 @@ class WarmUp:
     def _thread(self, *, is_planar: bool) -> threading.Thread:
         """The thread for these scans, which begins when it is first asked for."""
         run, trial = self._run, self._trial
-        key = (trial.estimator, trial.model.name, trial.corrections, repr(run.config), repr(run.robot.arms), str(is_planar))
+        is_in_space = trial.prior is not None and trial.prior.is_in_space
+        is_planar &= not is_in_space  # planar scans are refused there
+        kinds = str(is_planar), str(is_in_space)
+        key = (trial.estimator, trial.model.name, trial.corrections, repr(run.config), repr(run.robot.arms), *kinds)
         if key not in _threads:
             pipeline = Pipeline(trial, run.robot, {"base_link": Mount(), **run.robot.mounts}, True, run.config)
             _threads[key] = threading.Thread(target=_process, args=(run, trial, pipeline, is_planar), name="warm-up", daemon=True)

@@ -19,10 +19,9 @@ import numpy as np
 from localization.calibration.lidar_check import LidarCheck, corrected
 from localization.calibration.wheel_wiring import LiveSensors
 from localization.errors import CheckpointError
-from localization.estimators import Estimate, GraphFusion, MapFusion, PriorMap
+from localization.estimators import Estimate, GraphFusion, PriorMap, SavedMapFusion
 from localization.events import Event, Scan
 from localization.logs.decode import MessageStats
-from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import fingerprints, read_head
 from localization.ros.diagnostics import ERROR, WARN, Doctor, Health, Status
@@ -121,7 +120,10 @@ class Node:
 
         patience_s = math.inf if is_resumed or not config.predict else _COMPILING_S
         discovered = discovery.discover(config.wait_s, needed, report, is_over, is_compiled, patience_s)
-        trial = run.make_trial(discovered.parts.sources.lidar is not None)
+        sources = discovered.parts.sources
+        trial = run.make_trial(sources.lidar is not None)
+        if trial.prior is not None:
+            trial.prior.check_lidar(sources.has_clouds, bool(run.config.step.planar))
         for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report)
@@ -273,14 +275,15 @@ class Node:
         if self._predictor is not None:
             self._predictor.stop()
 
-    def replace_map(self, places: PlaceMap) -> None:
-        """Localize in another saved map from now on: by what the estimator has learned, and without a jump of odometry."""
+    def replace_map(self, prior: PriorMap) -> None:
+        """Localize in another saved map from now on: by what the estimator has learned, and without a jump of odometry. Raises
+        `MapError` for one in space instead of one in the plane, and the reverse."""
         estimator = self.session.pipeline.estimator
-        assert isinstance(estimator, MapFusion)
-        estimator.replace_map(places)
-        self._trial = replace(self._trial, prior=PriorMap(places))
+        assert isinstance(estimator, SavedMapFusion)
+        estimator.replace_map(prior)
+        self._trial = replace(self._trial, prior=prior)
         self._shared.update(shared_of(self._trial))
-        self._made.update(fingerprints(map=places.fingerprint))
+        self._made.update(fingerprints(map=prior.places.fingerprint))
 
     @property
     def payloads(self) -> Payloads:

@@ -16,12 +16,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from localization.errors import MapError, OutputError
-from localization.estimators import MapFusion
+from localization.estimators import PriorMap, SavedMapFusion
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.serialization import decoder
 from localization.logs.writer import odom_axes
-from localization.maps import KeyframeMap, SavedMap, load_map, save_map
-from localization.maps.place_search import PlaceMap
+from localization.maps import KeyframeMap, SavedMap, SpaceMap, load_map, save_map
+from localization.maps.space_places import Places, make_places
 from localization.output import versions
 from localization.ros.payloads import Load, Payloads
 from localization.ros.session import StartPose
@@ -76,8 +76,8 @@ class CommandedNode(Protocol):
     def restart(self, start: StartPose) -> None:
         """Begin anew at ``start``."""
 
-    def replace_map(self, places: PlaceMap) -> None:
-        """Localize in another saved map from now on."""
+    def replace_map(self, prior: PriorMap) -> None:
+        """Localize in another saved map from now on. Raises `MapError` for one in space instead of one in the plane, and the reverse."""
 
     def insert_present_cg(self) -> None:
         """Give the pipeline the centre of gravity with the present payloads."""
@@ -91,7 +91,7 @@ class OperatorCommands:
         self._commands = {names.resolve(topic): topic for topic in _TOPIC_TYPES}
         self._decoders = {topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in _TOPIC_TYPES.items()}
         self.topics = list(self._commands)
-        self._loaded: queue.SimpleQueue[tuple[str, PlaceMap | MapError]] = queue.SimpleQueue()
+        self._loaded: queue.SimpleQueue[tuple[str, Places | MapError]] = queue.SimpleQueue()
         for full, topic in self._commands.items():
             transport.subscribe(full, _TOPIC_TYPES[topic], is_latched=False, is_command=True)
         transport.offer_service(names.resolve(RESET), "std_srvs/srv/Empty", self.reset)
@@ -152,7 +152,7 @@ class OperatorCommands:
         """
         frames, (odom, odom_cov) = self._node.frames, self._present_odometry()
         has_map, estimator = self._node.session.pipeline.is_localizing, self._node.session.pipeline.estimator
-        if frame == frames.map_frame and isinstance(estimator, MapFusion):
+        if frame == frames.map_frame and isinstance(estimator, SavedMapFusion):
             estimator.set_pose(pose, cov)
             return ServiceReply(True, f"the place in the map is searched near x {pose[0]:.3f} m, y {pose[1]:.3f} m.")
         if frame == frames.map_frame and has_map:
@@ -174,7 +174,7 @@ class OperatorCommands:
     def relocalize(self, _: Any = True) -> ServiceReply:
         """Forget the place in the saved map, and search all of it; odometry goes on."""
         estimator = self._node.session.pipeline.estimator
-        if not isinstance(estimator, MapFusion):
+        if not isinstance(estimator, SavedMapFusion):
             self._report(f"relocalize: {(refused := 'there is no saved map to search. Name one by --map.')}")
             return ServiceReply(False, refused)
         estimator.relocalize()
@@ -213,11 +213,11 @@ class OperatorCommands:
         The file is read and checked at once. Until its search images are drawn, in a thread, and where it is refused, all stays as it is.
         """
         pipeline, path = self._node.session.pipeline, _map_path(name)
-        if not isinstance(pipeline.estimator, MapFusion):
+        if not isinstance(pipeline.estimator, SavedMapFusion):
             self._report(f"load_map: {(refused := 'this estimator uses no saved map. Start with one by --map.')}")
             return ServiceReply(False, refused)
         try:
-            mapped = load_map(path).planar(path, "a live node")
+            mapped = load_map(path).map
         except (MapError, OSError) as error:
             self._report(f"load_map: {error} The present map stays.")
             return ServiceReply(False, str(error), _INVALID_MAP if path.exists() else _NO_SUCH_MAP)
@@ -225,21 +225,24 @@ class OperatorCommands:
         threading.Thread(target=self._draw, args=(str(path), mapped, noise_m), name="load map", daemon=True).start()
         return ServiceReply(True, f"'{path}' is being loaded")
 
-    def _draw(self, path: str, mapped: KeyframeMap, range_noise_m: float) -> None:
+    def _draw(self, path: str, mapped: KeyframeMap | SpaceMap, range_noise_m: float) -> None:
         try:
-            self._loaded.put((path, PlaceMap(mapped, range_noise_m)))
+            self._loaded.put((path, make_places(mapped, range_noise_m)))
         except MapError as error:
             self._loaded.put((path, error))
 
     def take_loaded_map(self) -> None:
         """Go over to the map that `load_map` has made ready, if there is one: called between messages."""
         while not self._loaded.empty():
-            path, places = self._loaded.get()
-            if isinstance(places, MapError):
-                self._report(f"load_map: '{path}': {places} The present map stays.")
-                continue
-            self._node.replace_map(places)
-            self._report(f"load_map: the whole map of '{path}' is searched.")
+            path, found = self._loaded.get()
+            try:
+                if isinstance(found, MapError):
+                    raise found
+                self._node.replace_map(PriorMap(found))
+            except MapError as error:
+                self._report(f"load_map: '{path}': {error} The present map stays.")
+            else:
+                self._report(f"load_map: the whole map of '{path}' is searched.")
 
     def pause(self, is_paused: bool) -> ServiceReply:
         """Use no messages and publish no estimates, or continue. Motion meanwhile is a gap in the wheels' data."""

@@ -12,8 +12,9 @@ import numpy as np
 from localization.estimators import Estimate
 from localization.estimators.estimator import CHANGE_SHARE, GyroCalibration, fuse_turn, mean_twist, twist_at_end
 from localization.events import CgSample, Event, Turn, WheelSample
+from localization.lifting import Pose3
 from localization.logs.serialization import FusedWriter, encode, make
-from localization.logs.writer import FusedEstimate, odom_axes, six_by_six
+from localization.logs.writer import FusedEstimate
 from localization.maps.grid import Grid
 from localization.ros.diagnostics import Status
 from localization.ros.discovery import TF, TF_TYPE
@@ -118,8 +119,7 @@ class EstimatePublisher:
             self.recent_transforms.append(self._odometry.transform(fused))
             self._transport.publish(self._topics[TF], self.recent_transforms[-1])
             if estimate.map_T_odom is not None:
-                correction = FusedEstimate(stamp_ns, estimate.map_T_odom, np.zeros(3))
-                self._transport.publish(self._topics[TF], self._map_correction.transform(correction))
+                self._transport.publish(self._topics[TF], self._map_correction.transform(_correction(estimate, stamp_ns)))
         if self._has_predictions:
             self._transport.publish(self._topics[PREDICTED_ODOMETRY], odometry or self._odometry.odometry(fused))
 
@@ -130,9 +130,9 @@ class EstimatePublisher:
             self._transport.publish(self._topics[TF], writer.transform(FusedEstimate(stamp_ns, parent_T_map, np.zeros(3))))
 
     def _publish_pose(self, estimate: Estimate, stamp_ns: int) -> None:
-        """geometry_msgs/PoseWithCovarianceStamped in `map`."""
-        cov = None if estimate.covariance is None else odom_axes(estimate.covariance, float(estimate.pose[2]))
-        pose = make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(estimate.pose), covariance=six_by_six(cov))
+        """geometry_msgs/PoseWithCovarianceStamped in `map`; in space where the saved map is."""
+        fused = FusedEstimate(stamp_ns, estimate.pose, np.zeros(3), estimate.covariance, in_space=estimate.in_map)
+        pose = make("geometry_msgs/msg/PoseWithCovariance", pose=_placed(*fused.place()), covariance=fused.pose_covariance())
         self._publish(POSE, make(_TYPES[POSE], header=self._header(stamp_ns, self._frames.map_frame), pose=pose))
 
     def publish_path(self, stamp_ns: int) -> None:
@@ -292,6 +292,16 @@ def _fused(estimate: Estimate, stamp_ns: int) -> FusedEstimate:
     return FusedEstimate(stamp_ns, pose, estimate.twist, covariance, estimate.twist_covariance, in_space=estimate.in_space)
 
 
+def _correction(estimate: Estimate, stamp_ns: int) -> FusedEstimate:
+    """``map_T_odom``; in space where the saved map is."""
+    assert estimate.map_T_odom is not None
+    in_map, in_odom, in_space = estimate.in_map, estimate.in_space, None
+    if in_map is not None and in_odom is not None:
+        R = in_map.rotation @ in_odom.rotation.T
+        in_space = Pose3(in_map.position - R @ in_odom.position, R, np.zeros((6, 6)))
+    return FusedEstimate(stamp_ns, estimate.map_T_odom, np.zeros(3), in_space=in_space)
+
+
 class Path:
     """Poses along the way: the spacing doubles whenever there are too many."""
 
@@ -325,11 +335,13 @@ def occupancy_grid(points: FloatArray) -> tuple[FloatArray, float, Any]:
 
 def _pose(pose: FloatArray) -> object:
     x, y, yaw = map(float, pose)
-    position = make("geometry_msgs/msg/Point", x=x, y=y, z=0.0)
     half = 0.5 * math.remainder(yaw, math.tau)
-    return make(
-        "geometry_msgs/msg/Pose", position=position, orientation=make(_QUATERNION, x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
-    )
+    return _placed(np.array([x, y, 0.0]), np.array([0.0, 0.0, math.sin(half), math.cos(half)]))
+
+
+def _placed(position: FloatArray, quaternion: FloatArray) -> object:
+    at, turn = dict(zip("xyz", position.tolist(), strict=True)), dict(zip("xyzw", quaternion.tolist(), strict=True))
+    return make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", **at), orientation=make(_QUATERNION, **turn))
 
 
 _QUATERNION = "geometry_msgs/msg/Quaternion"
@@ -348,5 +360,5 @@ def _propagated(last: Estimate, motion: Motion, twist: FloatArray, twist_cov: Fl
 
     pose, cov = moved(last.pose, last.covariance)
     odometry = None if last.odometry is None else moved(*last.odometry)
-    in_space = None if last.in_space is None else last.in_space.moved(motion.delta, motion.cov)
-    return Estimate(stamp_ns, pose, cov, twist, twist_cov, None, odometry, last.map_T_odom, in_space)
+    in_space, in_map = (None if at is None else at.moved(motion.delta, motion.cov) for at in (last.in_space, last.in_map))
+    return Estimate(stamp_ns, pose, cov, twist, twist_cov, None, odometry, last.map_T_odom, in_space, in_map)

@@ -18,6 +18,7 @@ from localization.errors import CheckpointError, OutputError
 from localization.estimate_table import trajectory
 from localization.estimators import Estimate
 from localization.events import Event
+from localization.lifting import Pose3
 from localization.logs.writer import MAP_FRAME, PARENT_FRAME, write_fused
 from localization.output import output_errors, refuse_existing
 from localization.pipeline import Pipeline, ReplayConfig, Trial
@@ -105,11 +106,18 @@ class StartPose:
             return estimate
         if estimate.odometry is None or estimate.map_T_odom is None:
             pose, cov = _moved(self.odom_T_start, self.odom_cov, estimate.pose, estimate.covariance)
-            return replace(estimate, pose=pose, covariance=cov)
+            return replace(estimate, pose=pose, covariance=cov, in_space=_placed(self.odom_T_start, self.odom_cov, estimate.in_space))
         odometry = _moved(self.odom_T_start, self.odom_cov, *estimate.odometry)
         pose, cov = _moved(self.map_T_start, self.map_cov, estimate.pose, estimate.covariance)
         map_T_odom = se2.compose(se2.compose(self.map_T_start, estimate.map_T_odom), se2.inverse(self.odom_T_start))
-        return replace(estimate, pose=pose, covariance=cov, odometry=odometry, map_T_odom=map_T_odom)
+        in_space = _placed(self.odom_T_start, self.odom_cov, estimate.in_space)
+        in_map = _placed(self.map_T_start, self.map_cov, estimate.in_map)
+        moved = replace(estimate, pose=pose, covariance=cov, odometry=odometry, map_T_odom=map_T_odom)
+        return replace(moved, in_space=in_space, in_map=in_map)
+
+
+def _placed(world_T_start: FloatArray, start_cov: FloatArray, pose: Pose3 | None) -> Pose3 | None:
+    return None if pose is None else pose.placed(world_T_start, start_cov)
 
 
 def _moved(

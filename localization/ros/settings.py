@@ -25,7 +25,7 @@ from localization.errors import SettingError
 from localization.estimators import LOCALIZER, PriorMap, check_estimator
 from localization.logs.topic_roles import TopicOverrides
 from localization.maps import load_map
-from localization.maps.place_search import PlaceMap
+from localization.maps.space_places import make_places
 from localization.pipeline import ReplayConfig, Trial
 from localization.ros.session import Files
 from motion_models.online_calibration import check_forms
@@ -222,8 +222,7 @@ class OnlineSettings:
         return Trial(make_model(self.model, load_robot(self.robot)), name, form, None if self.map is None else self._prior(self.map))
 
     def _prior(self, path: Path) -> PriorMap:
-        mapped = load_map(path).planar(path, "a live node")
-        return PriorMap(PlaceMap(mapped, self.config.estimator.lidar.range_noise_m))
+        return PriorMap(make_places(load_map(path).map, self.config.estimator.lidar.range_noise_m))
 
     def live_run(self) -> LiveRun:
         """Raises `OutputError`, `RobotError`, `SettingError`."""

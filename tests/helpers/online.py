@@ -32,6 +32,7 @@ from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import EncoderConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
+from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
@@ -148,12 +149,13 @@ def run_node(
     topics: TopicOverrides | None = None,
     view: View | None = None,
     prior: PriorMap | None = None,
+    robot: Robot = ROBOT,
 ) -> tuple[Node, list[str]]:
     """A node over all that ``transport`` holds, and what it reported. It publishes no predictions unless ``config`` has it so."""
     reports: list[str] = []
     run = LiveRun(
-        ROBOT,
-        lambda has_lidar: Trial(make_model("skid_steer", ROBOT), estimator, prior=prior),
+        robot,
+        lambda has_lidar: Trial(make_model("skid_steer", robot), estimator, prior=prior),
         files or Files(),
         topics or TopicOverrides(),
         node=config or NodeConfig(wait_s=0.0, predict=False),

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from localization.maps.background_search import BackgroundSearch
+from localization.maps.background_search import PlanarSearch
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from localization.ros.state_serialization import deserialize, serialize
@@ -59,7 +59,7 @@ def test_localizer_with_searches_beside_it_is_localized_at_the_same_place(office
 
 def test_background_search_written_and_read_searches_again(office: PlaceMap) -> None:
     points = floor_plan.scan(OFFICE, WAY[0])
-    search = BackgroundSearch(office, points, None)
+    search = PlanarSearch(office, points, None)
     search.move(np.array([0.5, 0.0, 0.1]), COV)
     search.advance(0.1)
     again = deserialize(*serialize(search, {"map": office}), {"map": office})
@@ -70,6 +70,6 @@ def test_background_search_written_and_read_searches_again(office: PlaceMap) -> 
 
 
 def test_background_search_that_fails_raises_where_the_result_is_taken(office: PlaceMap) -> None:
-    search = BackgroundSearch(office, np.zeros((3, 5)), None)
+    search = PlanarSearch(office, np.zeros((3, 5)), None)
     with pytest.raises((IndexError, ValueError, TypeError)):
         search.result()

@@ -96,15 +96,12 @@ def localize(made: HillDrive, mapped: SpaceMap, events: list[Event], rng: np.ran
         for estimate in pipeline.process(event):
             states.append(localizer.state)
             stamps.append(estimate.stamp_ns)
-    poses = pipeline.estimator.smoothed_in_space
-    is_localized = dict(zip(stamps[1:], states, strict=True))
-    for stamp, pose in zip(poses.stamps_ns, poses.poses(), strict=True):
-        if is_localized[int(stamp)] != "localized":
-            continue
-        found, world = np.eye(4), np.kron(np.eye(2), pose.rotation)
-        found[:3, :3], found[:3, 3] = pose.rotation, pose.position
-        errors.append(se3.local(found, map_T_world @ true_poses(made, np.array([stamp]))[0]))
-        nees.append(errors[-1] @ np.linalg.solve(world.T @ pose.covariance @ world, errors[-1]))
+            if localizer.state != "localized":
+                continue
+            pose, found = estimate.in_map, np.eye(4)
+            found[:3, :3], found[:3, 3], world = pose.rotation, pose.position, np.kron(np.eye(2), pose.rotation)
+            errors.append(se3.local(found, map_T_world @ true_poses(made, np.array([estimate.stamp_ns]))[0]))
+            nees.append(errors[-1] @ np.linalg.solve(world.T @ pose.covariance @ world, errors[-1]))
     keyframes = [Keyframe(s, c, m, r, map_T_world @ true_poses(made, np.array([s]))[0]) for s, c, m, r in given]
     first = states.index("localized") if "localized" in states else len(states) - 1
     share = np.mean([state == "localized" for state in states[first:]])
