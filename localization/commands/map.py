@@ -105,13 +105,12 @@ class MapMerge:
 
     def run(self, console: Console) -> None:
         """Run the command. Raises `SkidlocError` for input that cannot be used."""
-        from localization.estimators.map_merge import merge
+        from localization.estimators import merge_maps
         from localization.lidar import LidarConfig
 
         check_outputs(self.out)
         first, second = load_map(self.first), load_map(self.second)
-        both = first.planar(self.first, "map merge"), second.planar(self.second, "map merge")
-        found = merge(*both, LidarConfig().range_noise_m)
+        found = merge_maps(first.map, second.map, LidarConfig().range_noise_m)
         save_map(self.out, SavedMap(found.map, {"merged_from": [dict(first.provenance), dict(second.provenance)]}))
         print_line(console, f"{found.closed} of {len(second.map.poses)} keyframes of '{self.second}' were found in '{self.first}'")
         for name, values in (("their scans are off the merged map by", found.errors), ("the second map was bent by", found.bent)):

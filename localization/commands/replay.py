@@ -21,8 +21,7 @@ from rich.table import Table
 from localization.calibration.lidar_check import open_log_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError, MapError
-from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator
-from localization.estimators.map_merge import merge
+from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import (
     ReferenceTrack,
@@ -214,8 +213,6 @@ class Replay:
         prior.check_lidar(log.sources.has_clouds, bool(is_planar))
         if not prior.is_in_space and is_planar is False:
             raise MapError(f"map '{self.map}' holds planar scans: poses in it are in the plane. Leave out --config.step.no-planar.")
-        if self.extend_map is not None:
-            saved.planar(self.map, "--extend-map")
         if self.positions is not None and "graph" not in names(self.estimator, "--estimator"):
             saved.planar(self.map, "--positions without the estimator graph")
         return prior
@@ -245,8 +242,7 @@ class Replay:
         drive = saved_map(
             of_graph if any(run.keyframes is not None for run in of_graph) else runs, head, mounts, dataclasses.asdict(self.config)
         )
-        both = old.planar(self.map, "--extend-map"), drive.planar(path, "--extend-map")
-        found = merge(*both, self.config.estimator.lidar.range_noise_m, only_new=True, initial=self._initial())
+        found = merge_maps(old.map, drive.map, self.config.estimator.lidar.range_noise_m, only_new=True, initial=self._initial())
         save_map(path, SavedMap(found.map, {"extended_from": [dict(old.provenance), dict(drive.provenance)]}))
         return f"map: {found.added} of {len(drive.map.poses)} keyframes are new in '{path}', {found.closed} were found in '{self.map}'"
 

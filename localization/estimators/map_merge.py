@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from localization.errors import MapError
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph
 from localization.lidar.loop_detection import FLOOR_COV
 from localization.lidar.scan_matcher import OPEN_INFORMATION
-from localization.maps import KeyframeMap
+from localization.maps import KeyframeMap, SpaceMap
 from localization.maps.changes import adds_to, find_changes
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
@@ -24,18 +25,21 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 _START_COV = np.diag([10.0, 10.0, 1.0]) ** 2
 """Covariance of the second map's place in the first beside its ties: a room's size and any heading, which they narrow to centimetres [m^2,
 m^2, rad^2]."""
-_MAX_OFF_M = 0.3
+MAX_OFF_M = 0.3
 """Distance of an aligned scan from where the localizer has it, up to which it ties [m]: from there on 14 to 31 % of alignments end
 elsewhere (`localization.lidar.registration`)."""
-_LEAST_SCORE, _LEAST_CLOSURES = 0.5, 3
+_LEAST_SCORE, LEAST_CLOSURES = 0.5, 3
 """Score of a scan in the other map, from which on it ties its keyframe to that; and how many such keyframes a merge takes."""
 
 
+Map = TypeVar("Map", KeyframeMap, SpaceMap)
+
+
 @dataclass(frozen=True, eq=False)
-class Merged:
+class Merged(Generic[Map]):
     """Both maps as one, in the frame of the first."""
 
-    map: KeyframeMap
+    map: Map
     closed: int
     """Keyframes of the second map that are tied to the first."""
     errors: FloatArray
@@ -46,17 +50,24 @@ class Merged:
     """Keyframes of the second map that the merged one has."""
 
 
-def merge(first: KeyframeMap, second: KeyframeMap, range_noise_m: float, only_new: bool = False, initial: Pose2 | None = None) -> Merged:
+def refuse_few(n_closures: int, n_keyframes: int) -> None:
+    """Raises `MapError` where too few of the second map's keyframes were found in the first."""
+    if n_closures < LEAST_CLOSURES:
+        raise MapError(
+            f"the second map could not be joined to the first: {n_closures} of its {n_keyframes} keyframes were found there, and it takes "
+            f"{LEAST_CLOSURES}. They are maps of two places, share none, or much has changed."
+        )
+
+
+def merge(
+    first: KeyframeMap, second: KeyframeMap, range_noise_m: float, only_new: bool = False, initial: Pose2 | None = None
+) -> Merged[KeyframeMap]:
     """``second`` in the frame of ``first``. ``range_noise_m``: sigma of a range [m]. With ``only_new``, of the second its keyframes alone
     that add to the first, with all ties among these. ``initial`` (3,): about where the second begins in the first. Raises `MapError` if
     they share no place."""
     places = PlaceMap(first, range_noise_m)
     closures = _closures(places, second, initial)
-    if len(closures) < _LEAST_CLOSURES:
-        raise MapError(
-            f"the second map could not be joined to the first: {len(closures)} of its {len(second.poses)} keyframes were found there, and "
-            f"it takes {_LEAST_CLOSURES}. They are maps of two buildings, share no rooms, or much has changed."
-        )
+    refuse_few(len(closures), len(second.poses))
     poses, covs = _solve(second, closures)
     keys = list(closures)
     measured = np.array([closures[k][0] for k in keys])
@@ -86,7 +97,7 @@ def _closure(places: PlaceMap, points: Points2, localizer: Localizer) -> tuple[P
     if not len(points):
         return None
     place = places.align(points, localizer.pose)
-    if place.score < _LEAST_SCORE or math.hypot(*(place.pose[:2] - localizer.pose[:2])) > _MAX_OFF_M:
+    if place.score < _LEAST_SCORE or math.hypot(*(place.pose[:2] - localizer.pose[:2])) > MAX_OFF_M:
         return None
     return place.pose, np.asarray(np.linalg.inv(place.fit.information + OPEN_INFORMATION)) + FLOOR_COV
 

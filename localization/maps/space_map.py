@@ -57,6 +57,25 @@ class SpaceMap:
         """(K, 3) where the LiDAR was at each keyframe, in the map's frame [m]."""
         return np.asarray((self.poses[:, :3, :3] @ self.sensors[:, :, None])[:, :, 0] + self.poses[:, :3, 3])
 
+    def select(self, kept: IntArray) -> SpaceMap:
+        """The keyframes ``kept`` (N,) in their order, with the motions between these alone."""
+        number = {int(k): i for i, k in enumerate(kept)}
+        parts = np.split(self.points, np.cumsum(self.counts)[:-1])
+        is_kept = np.array([a in number and b in number for a, b in self.edges.tolist()], dtype=bool)
+        edges = [[number[a], number[b]] for a, b in self.edges[is_kept].tolist()]
+        return SpaceMap(
+            stamps_ns=self.stamps_ns[kept],
+            poses=self.poses[kept],
+            covariances=self.covariances[kept],
+            points=np.vstack([np.empty((0, 3), np.int16), *(parts[k] for k in kept)]),
+            counts=self.counts[kept],
+            sensors=self.sensors[kept],
+            edges=np.array(edges, dtype=np.int64).reshape(-1, 2),
+            edge_deltas=self.edge_deltas[is_kept],
+            edge_information=self.edge_information[is_kept],
+            edge_is_loop=self.edge_is_loop[is_kept],
+        )
+
     def cov_at(self, pose: Transform3) -> FloatArray:
         """(6, 6) the map's own covariance at ``pose`` (4, 4), a right perturbation of it: that of the nearest keyframe."""
         k = int(np.argmin(np.linalg.norm(self.poses[:, :3, 3] - pose[:3, 3], axis=1)))

@@ -37,7 +37,9 @@ def test_drive_over_hills_is_saved_and_localized_in_its_own_map(log: Path, tmp_p
     assert isinstance(saved.map, SpaceMap)
     assert len(saved.map.poses) > 3
     assert saved.provenance["robot"] == "husky_a200"
-    assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", path, "--initial-pose", 0.3, -0.4, 10) == 0
+    more = "--initial-pose", 0.3, -0.4, 10, "--extend-map", tmp_path / "more.skidmap"
+    assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", path, *more) == 0
+    assert len(load_map(tmp_path / "more.skidmap").map.poses) >= len(saved.map.poses)
     results = json.loads((tmp_path / "out" / "metrics.json").read_text())["results"]
     (found,) = [result["localization"] for result in results if result["estimator"] == "map"]
     assert found["state"] == "localized"
