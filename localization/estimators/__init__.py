@@ -114,7 +114,7 @@ def make_estimator(
         return LidarOdometry(mounts, config.lidar)
     corrected, sensor = make_corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None
     ekf = EkfFusion(model, corrected, robot, sensor, config.ekf)
-    return ekf if name == "ekf" else GraphFusion(ekf, corrected, config.lidar, config.graph, is_smoothing)
+    return ekf if name == "ekf" else GraphFusion(ekf, config.lidar, config.graph, is_smoothing)
 
 
 def make_localizing(

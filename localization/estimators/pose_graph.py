@@ -10,18 +10,15 @@ Incremental by ISAM2 (Kaess et al. 2012) on the way; Levenberg-Marquardt and mar
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from localization.core.measurements.position import predict_position
 from localization.core.measurements.relative_pose import motion_residual
-from localization.core.state import Group
 from localization.errors import EstimatorError
 from motion_models import se2
 from motion_models.preintegration import PreintegratedMotion
@@ -289,35 +286,6 @@ def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values)
         if is_done:
             break
     return values
-
-
-def through_nodes(
-    group: Group, odometry: FloatArray, covs_since: FloatArray, nodes: NDArray[np.intp], poses: FloatArray, covs: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Elements (N, ...) of ``group`` and covariances (N, dim, dim) of ``odometry`` (N, ...), whose ``nodes`` (K,) are at ``poses`` (K, ...)
-    with ``covs`` (K, dim, dim).
-
-    What the motion between two nodes has changed by grows evenly along it, and not where the robot stands. Elements between nodes have the
-    noise of the motion since the last one as well, ``covs_since`` (N, dim, dim), the less of it the nearer the next one is: the covariance
-    of a random walk between two known ends. After the last node the odometry goes on.
-    """
-
-    def each(function: Callable[..., FloatArray], *rows: FloatArray) -> FloatArray:
-        return np.array([function(*row) for row in zip(*rows, strict=True)])
-
-    a = np.clip(np.searchsorted(nodes, np.arange(len(odometry)), side="right") - 1, 0, len(nodes) - 1)
-    b = np.minimum(a + 1, len(nodes) - 1)
-    travelled = np.append(0.0, np.cumsum(np.linalg.norm(each(group.local, odometry[:-1], odometry[1:]), axis=1) + 1e-9))
-    length = np.where(b > a, travelled[nodes[b]] - travelled[nodes[a]], math.inf)
-    part = np.clip((travelled - travelled[nodes[a]]) / length, 0.0, 1.0)
-    back = each(group.compose, each(group.inverse, odometry), odometry[nodes[a]])
-    until = each(group.compose, each(group.inverse, odometry), odometry[nodes[b]])
-    forward, backward = each(group.compose, poses[a], each(group.inverse, back)), each(group.compose, poses[b], each(group.inverse, until))
-    A, B, w = each(group.adjoint, back), each(group.adjoint, until), part[:, None, None]
-    mixed = (1.0 - w) * (A @ covs[a] @ A.swapaxes(-1, -2)) + w * (B @ covs[b] @ B.swapaxes(-1, -2))
-    noise = (1.0 - w) * covs_since
-    noise[nodes] = 0.0
-    return each(group.retract, forward, part[:, None] * each(group.local, forward, backward)), mixed + noise
 
 
 @contextlib.contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -17,8 +16,8 @@ from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
-from localization.estimators.pose_graph import through_nodes
 from localization.estimators.position_queue import PositionQueue, align_map
+from localization.estimators.recorded_path import RecordedPath
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from localization.events import PositionSample, Step
@@ -67,15 +66,14 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         """``odometry``: the filter whose keyframes are smoothed; ``map_T_odom`` (3,): as a graph in the plane has left it."""
         corrections, track_m = settings.corrections, settings.track_m
         self.odometry, self._corrections = odometry, corrections
-        self._config, self._is_smoothing = settings.config, settings.is_smoothing
+        self._config = settings.config
+        self._path = RecordedPath(SE3) if settings.is_smoothing else None
         self._map_T_odom = map_T_odom
         lever = np.array([settings.config.antenna_x_m, settings.config.antenna_y_m, 0.0])
         self.graph = SpaceGraph(block_diag(corrections.cov, _NO_SIGMA**2), odometry.accelerometer_sigma, lever=lever)
         self._queue = PositionQueue()
         self._excitation = Excitation(track_m, corrections.min_track_over_radius)
         self._wheels = MotionPreintegration(len(corrections.names))
-        self._stamps_ns, self._poses, self._covs_since = array("q"), array("d"), array("d")
-        self._nodes: list[int] = []
         self._range_noise_m = settings.range_noise_m
         self._clouds: list[FloatArray | None] = []  # of keyframes, in the body frame, if poses are to be smoothed
         self._sensors: list[FloatArray] = []
@@ -97,10 +95,8 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         if self.graph.poses:
             self._wheels.add(step.predicted, self._corrections, self._excitation.is_turning, np.zeros(len(self._corrections.names)))
             delta, cov = state.between("key", "pose")
-        if self._is_smoothing and (not self._stamps_ns or step.end_ns > self._stamps_ns[-1]):
-            self._stamps_ns.append(step.end_ns)
-            self._poses.extend(state["pose"].ravel())
-            self._covs_since.extend(cov.ravel())
+        if self._path is not None:
+            self._path.add(step.end_ns, state["pose"], cov)
         c, (way, turn) = self._config, (math.hypot(*delta[:3, 3]), math.hypot(*se3.rotation_vector(delta[:3, :3])))
         if not self.graph.poses or way > c.keyframe_distance_m or turn > c.keyframe_angle_rad:
             self._add_keyframe(delta, cov)
@@ -132,8 +128,8 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
             self.graph.wheels.append(wheels)
             self.graph.betweens.append(Between(n - 1, *between))
         self.graph.poses.append(state["pose"])
-        if self._is_smoothing:
-            self._nodes.append(len(self._stamps_ns) - 1)
+        if self._path is not None:
+            self._path.add_node()
             cloud = self.odometry.cloud
             self._clouds.append(None if cloud is None else cloud.astype(np.float32))
             self._sensors.append(self.odometry.lidar_position)
@@ -142,7 +138,7 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
 
     def add_position(self, sample: PositionSample) -> None:
         """A position by GPS, for the smoothed poses; it is placed once the odometry has come to its stamp."""
-        if self._is_smoothing and self.graph.poses:
+        if self._path is not None and self.graph.poses:
             self._queue.add(sample)
 
     def run_deferred(self) -> bool:
@@ -152,7 +148,8 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory projected to the plane, at the stamps of ``filtered``; None unless smoothing, or with one keyframe."""
         self.run_deferred()
-        if not self._is_smoothing or filtered is None or len(self._nodes) < 2:
+        path = self._path
+        if path is None or filtered is None or len(path.nodes) < 2:
             return None
         self._align()
         try:
@@ -164,10 +161,9 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         except EstimatorError as error:
             self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
-        stamps = np.array(self._stamps_ns, dtype=np.int64)
-        self._map = self._make_map(stamps[self._nodes], se3.lift(self._map_T_odom) @ keyframes.poses, keyframes.covs)
-        odometry, since = np.array(self._poses).reshape(-1, 4, 4), np.array(self._covs_since).reshape(-1, 6, 6)
-        smoothed, spread = through_nodes(SE3, odometry, since, np.array(self._nodes), keyframes.poses, keyframes.covs)
+        stamps = path.stamps_ns
+        self._map = self._make_map(stamps[path.nodes], se3.lift(self._map_T_odom) @ keyframes.poses, keyframes.covs)
+        smoothed, spread = path.through(keyframes.poses, keyframes.covs)
         smoothed = se3.lift(self._map_T_odom) @ smoothed
         table, planar = SpaceTable(), filtered.poses.copy()
         planar_covs = None if filtered.covariances is None else filtered.covariances.copy()

@@ -33,7 +33,7 @@ class Drive(NamedTuple):
 def drive(seed: int, with_graph: bool = False) -> Drive:
     """Wheels and gyro of a robot that drives off at once and stops at the end."""
     ekf = make_filter(PoseSensor(), "diff_drive", has_lidar=False)
-    estimator = GraphFusion(ekf, ekf.corrections, LidarConfig(), GraphConfig(), False) if with_graph else ekf
+    estimator = GraphFusion(ekf, LidarConfig(), GraphConfig(), False) if with_graph else ekf
     world = make_world(ekf, seed, has_lidar=False, wheels=lambda t: weave(t) if t < 0.1 * MOVING else (0.0, 0.0))
     found, truth = [], []
     for k in range(MOVING + RESTING):

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from localization.core.state import SE2
 from localization.errors import EstimatorError
 from localization.estimators import pose_graph
-from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement, through_nodes
+from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.evaluation.consistency import nees
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
@@ -263,18 +262,3 @@ def test_pose_graph_deserialized_equals_original_bitwise() -> None:
     assert np.array_equal(graph.poses(), resumed.poses())
     assert np.array_equal(graph.marginal(30), resumed.marginal(30))
     assert all(np.array_equal(a, b) for a, b in zip(graph.smooth(), resumed.smooth(), strict=True))
-
-
-def test_through_nodes_moves_poses_by_travelled_share():
-    odometry = np.column_stack([[0.0, 1.0, 1.0, 2.0], np.zeros(4), np.zeros(4)])  # it rests in between
-    poses, covs = np.array([[0.0, 0.0, 0.0], [2.2, 0.0, 0.0]]), np.array([0.01 * np.eye(3), 0.03 * np.eye(3)])
-    found, mixed = through_nodes(SE2, odometry, np.zeros((4, 3, 3)), np.array([0, 3]), poses, covs)
-    np.testing.assert_allclose(found[:, 0], [0.0, 1.1, 1.1, 2.2], atol=1e-6)
-    np.testing.assert_allclose(mixed[[0, 3]], covs, atol=1e-8)
-
-
-def test_through_nodes_adds_the_noise_of_the_motion_less_its_share():
-    odometry = np.column_stack([[0.0, 0.5, 1.0, 1.5, 2.0], np.zeros(5), np.zeros(5)])
-    noise, nothing = np.diag([1e-4, 2e-4, 3e-5]), np.zeros((2, 3, 3))
-    _, found = through_nodes(SE2, odometry, np.tile(noise, (5, 1, 1)), np.array([0, 4]), odometry[[0, 4]], nothing)
-    np.testing.assert_allclose(found, np.array([0.0, 0.75, 0.5, 0.25, 0.0])[:, None, None] * noise, atol=1e-12)

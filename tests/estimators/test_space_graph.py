@@ -9,7 +9,7 @@ import pytest
 
 from localization.core.measurements.position import predict_position_in_space
 from localization.core.space import SE3
-from localization.estimators.pose_graph import through_nodes
+from localization.estimators.recorded_path import through_nodes
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from localization.lidar.cloud_loops import CloudLoop
 from motion_models import se2, se3

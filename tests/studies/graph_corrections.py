@@ -103,7 +103,7 @@ def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int
     model = add_correction_parameters(make_model(model_name, robot), form)
     corrected = make_corrections(model, form)
     ekf = EkfFusion(model, corrected, robot, sensor, FilterConfig())
-    estimator = ekf if kind == "ekf" else GraphFusion(ekf, corrected, LidarConfig(), GraphConfig(), is_smoothing=False)
+    estimator = ekf if kind == "ekf" else GraphFusion(ekf, LidarConfig(), GraphConfig(), is_smoothing=False)
     stepper, truth = Synchronizer(model, robot, drive.mounts, True), Trajectory(drive.truth.stamps_ns, drive.truth.poses)
     pose, start = np.zeros(3), None
     stamps, poses, params = [], [], []
