@@ -98,7 +98,7 @@ class Pipeline:
         has_choice = trial.estimator in ESTIMATORS_IN_SPACE and config.step.planar is None and has_lidar
         self.space_choice = choice if has_choice else None
         """The choice between plane and space; None where there is none."""
-        self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step, robot.clock.sigma_s)
+        self.checks = SensorChecks(self.mounts, config.estimator.lidar, config.step, robot)
         self.wheel_twist: FloatArray | None = None
         """(3,) twist at the end of the last step by the wheels alone; None where wheel data were missing in it."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -109,8 +109,15 @@ class Joints:
     """Radians per unit of the positions: 0.0174533 for degrees, 2 pi over the counts of a turn for ticks, 1 over the radius for metres."""
     rate_unit_rad_s: float = 1.0
     """Radians per second per unit of the velocities: 0.10472 for revolutions per minute, 0.0174533 for degrees per second."""
+    is_front_known: bool = True
+    """False: which end of the robot is its front is not known, and the poses' covariance has twice the way from the start."""
     angle_range: float = 0.0
     """Range after which the positions wrap, in their own unit: 65536 for counters of 16 bits. 0: a full turn of the wheel."""
+
+    def renamed(self, names: Mapping[str, str]) -> Joints:
+        """The same wheels by other ``names``, each by the present one."""
+        left, right, backwards = (tuple(names[joint] for joint in side) for side in (self.left, self.right, self.reversed))
+        return replace(self, left=left, right=right, reversed=backwards)
 
 
 @dataclass(frozen=True)

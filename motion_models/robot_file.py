@@ -277,6 +277,10 @@ def _build(kind: type[Section], table: Any, name: str, source: str) -> Section:
             if not isinstance(value, str):
                 raise RobotError(f"{source}: {name}.{key} must be text, found {value!r}.")
             values[key] = value
+        elif declared == "bool":
+            if not isinstance(value, bool):
+                raise RobotError(f"{source}: {name}.{key} must be true or false, found {value!r}.")
+            values[key] = value
         else:
             if not isinstance(value, list) or not value or not all(isinstance(v, str) for v in value):
                 raise RobotError(f"{source}: {name}.{key} must be a list of names, found {value!r}.")
@@ -421,12 +425,14 @@ def _row(key: str, kind: str, default: str, text: str) -> str:
 
 
 def _kind_of(declared: str) -> str:
-    return {"float": "number", "str": "text"}.get(declared, "list of texts")
+    return {"float": "number", "str": "text", "bool": "true or false"}.get(declared, "list of texts")
 
 
 def _default_of(field: dataclasses.Field[Any]) -> str:
     if field.default is dataclasses.MISSING:
         return "needed"
+    if isinstance(field.default, bool):
+        return str(field.default).lower()
     if isinstance(field.default, tuple):
         return ", ".join(f'"{value}"' for value in field.default) or "none"
     return f'"{field.default}"' if isinstance(field.default, str) else f"{field.default:g}"

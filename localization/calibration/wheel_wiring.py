@@ -47,6 +47,9 @@ _MAX_UNSHIFTED = 0.85
 """Correlation without an offset below which one is searched: whole drives of healthy logs have 0.95 and more."""
 _MIN_TURN_PART = 1e-3
 """Least root mean square of the sides' difference, of the largest of all wirings'."""
+_MIN_AHEAD_M, _MIN_TURNED_RAD, _SAME_END = 0.1, 1.5, 0.25
+"""LiDAR ahead of the middle or behind it [m], turns in all, and share of the sideways motion of the other end, that decide at which end it
+is: robots turn about a point up to 5 cm from the middle of their wheels."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -256,7 +259,46 @@ def _corrected(sensors: Log | LiveSensors, signals: WheelSignals, base: Wiring, 
         return WiringReport(sensors.robot, correlations=measured)
     if len({wiring.signature for wiring in found}) > 1:
         return _ambiguous(sensors, [wiring.text for wiring in found], measured)
+    speeds = [name for name in measured if name.startswith("speed")]
+    if {*found[0].reversed} == {*range(len(signals.joints))} and speeds == ["speed by the LiDAR"]:
+        return _front_of(sensors, signals, found[0], measured)
     return _certain(sensors, signals, found[0], measured)
+
+
+def _front_of(sensors: Log | LiveSensors, signals: WheelSignals, backwards: Wiring, measured: Mapping[str, float]) -> WiringReport:
+    """All wheels count ``backwards``; or left and right are swapped and the LiDAR is mounted backwards: then it is at the other end of the
+    robot, by its sideways motion in turns. Where that shows neither, the front is not known."""
+    share = _share_of_other_end(sensors, signals)
+    if share is not None and share > 1.0 - _SAME_END:
+        swapped = (
+            "left and right wheels are swapped, and the LiDAR is mounted backwards: in turns it moves as at the other end of the robot"
+        )
+        other = backwards._replace(left=backwards.right, right=backwards.left, reversed=(), lidar=(-1.0, 1.0), text=swapped)
+        return _certain(sensors, signals, other, measured)
+    if share is not None and share < _SAME_END:
+        return _certain(sensors, signals, backwards, measured)
+    text = (
+        f"{backwards.text}, or left and right are swapped and the LiDAR is mounted backwards, which these sensors do not tell apart: until"
+        " you check which end of the robot is its front, and remove is_front_known, the covariance of positions has twice the way from the"
+        " start"
+    )
+    found = _certain(sensors, signals, backwards._replace(text=text), measured)
+    robot = replace(found.robot, joints=replace(found.robot.joints, is_front_known=False))
+    return replace(found, robot=robot, keys={**found.keys, "joints.is_front_known": "false"})
+
+
+def _share_of_other_end(sensors: Log | LiveSensors, signals: WheelSignals) -> float | None:
+    """Sideways motion by the scans in turns, of what a LiDAR at the other end of the robot has there: 0 where it is at the end that its
+    mount has, 1 at the other. None for a LiDAR near the middle, or without turns."""
+    motion, scan = lidar_motion(sensors, signals), next(iter(sensors.scans()), None)
+    ahead = 0.0 if scan is None else sensors.mounts.get(scan.frame_id, Mount()).x
+    if motion is None or abs(ahead) < _MIN_AHEAD_M:
+        return None
+    known = np.isfinite(motion.turn) & np.isfinite(motion.side)
+    turn, side = motion.turn[known], motion.side[known]
+    if float(np.abs(turn).sum()) * STEP_S < _MIN_TURNED_RAD:
+        return None
+    return float(turn @ side) / float(turn @ turn) / (-2.0 * ahead)
 
 
 def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
@@ -459,11 +501,12 @@ def _ambiguous(log: Log | LiveSensors, ways: Sequence[str], measured: Mapping[st
 
 def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
     """Report with the robot corrected. A LiDAR's mount is left to its own check, which measures its angle."""
-    if wiring.lidar != (1.0, 1.0) and not wiring.reversed:
+    is_swapped = {*wiring.left} != {*range(signals.left)}
+    if wiring.lidar != (1.0, 1.0) and not wiring.reversed and not is_swapped:
         return WiringReport(log.robot, correlations=measured)
     robot, keys = log.robot, {}
     names = signals.joints
-    if {*wiring.left} != {*range(signals.left)}:
+    if is_swapped:
         left, right = (tuple(names[i] for i in side) for side in (wiring.left, wiring.right))
         robot = replace(robot, joints=replace(robot.joints, left=left, right=right))
         keys.update({"joints.left": _list(left), "joints.right": _list(right)})
@@ -478,11 +521,8 @@ def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, meas
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     after = correlations(signals, signals.joint_rates, wiring)
     entries = "; ".join(f"{key} = {value}" for key, value in keys.items())
-    what = wiring.text
-    if len(wiring.reversed) == len(names) and "speed by the LiDAR" in measured:
-        what += " (or left and right are swapped and the LiDAR is mounted backwards: check which end of the robot is its front)"
     text = (
-        f"{wheels}: {what}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
+        f"{wheels}: {wiring.text}: correlation of the wheels with the {_numbers(measured)} as the robot file has them, {_numbers(after)}"
         f" so. {CORRECTED} {entries}."
     )
     return WiringReport(robot, (text,), keys, correlations=measured)

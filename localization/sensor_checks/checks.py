@@ -14,7 +14,7 @@ from localization.sensor_checks.clocks import ClockCheck
 from localization.sensor_checks.contradictions import Contradictions
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GyroRate, rate_off
-from localization.sensor_checks.inflation import CovarianceInflation
+from localization.sensor_checks.inflation import CovarianceInflation, lever_of_unknown_front
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MAX_NIS, MovingObjects
@@ -26,7 +26,7 @@ from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
-from motion_models.robot import Mount
+from motion_models.robot import Mount, Robot
 from motion_models.se2 import Pose2
 
 _TOGETHER_S = 0.5
@@ -54,16 +54,16 @@ class SensorChecks:
     changes them, or the wheels stand, each step is examined as it comes.
     """
 
-    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, clock_sigma_s: float = 0.0) -> None:
-        """``clock_sigma_s``: by how much the clock of the poses may be off [s]."""
-        self._inflation = CovarianceInflation()
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, robot: Robot | None = None) -> None:
+        """``robot``: whose clocks and front may not be known for sure; None where they are."""
+        self._inflation = CovarianceInflation(lever_of_unknown_front(robot, mounts))
         self._faults = faults = FaultLog(self._inflation)
         self._window = window = Window(mounts, config)
         self._moving, self._sweep_times = MovingObjects(faults, window), SweepTimes(faults)
         self._own_body, self._contradictions, self._gyro_rate = OwnBody(faults), Contradictions(faults), GyroRate(faults)
         self._standstill = Standstill(faults, window, step_config)
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
-        self._clocks = ClockCheck(faults, clock_sigma_s)
+        self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
         self._records: list[_Record] = []
         self._recorded = Reckoning()  # up to the last step, recorded or not

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -12,16 +13,26 @@ from localization.events import Step
 from localization.sensor_checks.reckoning import ESTIMATE, GYRO, WHEELS, Reckoning
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import Cov3, FloatArray, Pose2
 
 DeadReckoning = Literal["wheels", "wheels and gyro"]
 """Motion by the wheels alone, and that with the turns by the gyro."""
 
 
+def lever_of_unknown_front(robot: Robot | None, mounts: Mapping[str, Mount]) -> float | None:
+    """How far sensors at ``mounts`` are from the middle of a ``robot`` whose front may be its rear [m]; None where its front is known."""
+    if robot is None or robot.joints.is_front_known:
+        return None
+    return max((abs(mount.x) for mount in mounts.values()), default=0.0)
+
+
 class CovarianceInflation:
     """Differences that were added, carried along with the body as the covariance of an estimate is."""
 
-    def __init__(self) -> None:
+    def __init__(self, turned_about_m: float | None = None) -> None:
+        """``turned_about_m``: `lever_of_unknown_front`."""
+        self._turned_about_m = turned_about_m
         self.reckoning = Reckoning()
         """By the sensors, and by the estimate."""
         self._agreed = self.reckoning.poses  # where the sensors last agreed
@@ -67,7 +78,7 @@ class CovarianceInflation:
     @property
     def is_acting(self) -> bool:
         """Whether estimates get another covariance."""
-        return self.is_inflating or self.possible is not None or self.late_s > 0.0
+        return self.is_inflating or self.possible is not None or self.late_s > 0.0 or self._turned_about_m is not None
 
     @property
     def is_inflating(self) -> bool:
@@ -98,6 +109,8 @@ class CovarianceInflation:
             self._pending = np.zeros((3, 3))
         if self.late_s and estimate.twist is not None:
             estimate = _widen(estimate, np.outer(estimate.twist, estimate.twist) * self.late_s**2)
+        if self._turned_about_m is not None:
+            estimate = _widen(estimate, _turned_about(self._pose, self._turned_about_m))
         if estimate.covariance is not None and self.possible is not None:
             estimate = _widen(estimate, np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
@@ -112,6 +125,9 @@ class CovarianceInflation:
         which the poses' clock may be off."""
         if self.late_s and smoothed.covariances is not None:
             smoothed = _widen_by_way(smoothed, self.late_s)
+        if self._turned_about_m is not None and smoothed.covariances is not None:
+            turned = np.array([_turned_about(se2.between(smoothed.poses[0], pose), self._turned_about_m) for pose in smoothed.poses])
+            smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + turned)
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
@@ -127,6 +143,15 @@ class CovarianceInflation:
         for difference in (self.ongoing_pair, self.ongoing_scene):
             total = total if difference is None else total + np.outer(difference, difference)
         return total
+
+
+def _turned_about(pose: Pose2, ahead_m: float) -> Cov3:
+    """Covariance (3, 3) of a ``pose`` since the start of a robot that may drive backwards: then it is as far away on the other side, and a
+    sensor ``ahead_m`` of its middle [m] is behind it."""
+    x, y, _ = se2.inverse(pose)
+    difference = np.array([2.0 * x, 2.0 * y, 0.0])
+    lever = (2.0 * ahead_m) ** 2
+    return np.asarray(np.outer(difference, difference) + np.diag([lever, lever, 0.0]))
 
 
 def _widen(estimate: Estimate, spread: Cov3) -> Estimate:

@@ -14,6 +14,8 @@ from localization.calibration.wheel_wiring import WiringReport, check_wiring, op
 from localization.cli import main
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot_file import load_robot, robot_toml
+from tests.helpers import entrance_drives
+from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.helpers.extended import cases
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, Change, drive
 
@@ -151,3 +153,34 @@ def test_wiring_without_gyro_has_no_sentence_about_it(tmp_path: Path) -> None:
     assert "record a LiDAR or the driver's odometry" in with_gyro
     without = check_wiring(open_log(tmp_path / "log.mcap", ROBOT, TopicOverrides(imu="")))
     assert without.findings == ()
+
+
+ROVER = Vehicle(0.06, 0.3, 0.24, 0.5, 0.3, 0.9, wheels_hz=15.0, imu_hz=30.0, scan_hz=7.0, beams=120, room=(9.0, 8.0), seed=52)
+
+
+def front_report(tmp_path: Path, ahead_m: float, is_turned: bool) -> WiringReport:
+    """Of wheels that all count backwards; or whose sides are swapped, with a LiDAR that ``is_turned``. The gyro contradicts both."""
+    how = Publishing(lambda a, r: (-a, -r), lidar_ahead_m=ahead_m)
+    if is_turned:
+        how = Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]]), lidar_ahead_m=ahead_m, lidar_yaw=math.pi)
+    log = entrance_drives.write(tmp_path / "log.mcap", ROVER, entrance_drives.drive(ROVER), how)
+    return check_wiring(open_log(log, ROVER.robot()))
+
+
+FRONTS = {"swapped": (0.15, True), "backwards": (0.15, False), "swapped, LiDAR behind": (-0.12, True)}
+
+
+@pytest.mark.parametrize("name", cases(FRONTS, usual=["swapped"]))
+def test_front_is_at_the_end_where_the_lidar_moves_sideways(tmp_path: Path, name: str) -> None:
+    ahead_m, is_turned = FRONTS[name]
+    joints = front_report(tmp_path, ahead_m, is_turned).robot.joints
+    everything = (*ROVER.left, *ROVER.right)
+    assert (joints.left, joints.reversed) == ((ROVER.right, ()) if is_turned else (ROVER.left, everything))
+    assert joints.is_front_known
+
+
+def test_front_of_a_robot_with_its_lidar_in_the_middle_is_not_known(tmp_path: Path) -> None:
+    report = front_report(tmp_path, 0.03, is_turned=True)
+    assert not report.robot.joints.is_front_known
+    assert "which end of the robot is its front" in report.findings[0]
+    assert report.keys["joints.is_front_known"] == "false"

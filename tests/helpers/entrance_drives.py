@@ -115,6 +115,8 @@ class Publishing:
     """The driver's track over the true effective track times k: 1 for a driver that knows nothing of skidding; k for one that does."""
     lidar_yaw: float = 0.0
     """True yaw less that of /tf_static [rad]."""
+    lidar_ahead_m: float = 0.15
+    """Of the middle of the wheels, as /tf_static has it."""
     lidar_flip: bool = False
     """Mounted upside down, which /tf_static does not have."""
     names: Mapping[str, str] = field(default_factory=dict)
@@ -242,7 +244,7 @@ def _scans(vehicle: Vehicle, motion: Motion, how: Publishing) -> Iterator[Row]:
     angles = -math.pi + math.tau * np.arange(vehicle.beams) / vehicle.beams
     for t in _times(motion, vehicle.scan_hz):
         x, y, yaw = motion.poses[motion.at(t)]
-        x, y = x + 0.15 * math.cos(yaw), y + 0.15 * math.sin(yaw)
+        x, y = x + how.lidar_ahead_m * math.cos(yaw), y + how.lidar_ahead_m * math.sin(yaw)
         beams = yaw + how.lidar_yaw + (-angles if how.lidar_flip else angles)
         ranges = cast(x, y, beams, vehicle.room) + 0.008 * rng.normal(size=len(beams))
         yield (
@@ -275,5 +277,5 @@ def _reference(motion: Motion, how: Publishing) -> Iterator[Row]:
 
 def _mounts(how: Publishing) -> Any:
     imu, laser = how.frames
-    edges = [("base_link", imu, (0.0, 0.0, 0.1), bags.quaternion()), ("base_link", laser, (0.15, 0.0, 0.3), bags.quaternion())]
+    edges = [("base_link", imu, (0.0, 0.0, 0.1), bags.quaternion()), ("base_link", laser, (how.lidar_ahead_m, 0.0, 0.3), bags.quaternion())]
     return bags.tf(START, edges)

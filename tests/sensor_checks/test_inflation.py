@@ -54,3 +54,20 @@ def test_smoothed_trajectory_of_an_uncertain_clock_has_the_way_in_that_time() ->
     assert found is not None
     np.testing.assert_allclose(np.sqrt(found[[0, 10, 30], 0, 0]), [0.0, 0.5, 0.5], atol=1e-6)
     assert not found[:, 1:].any()
+
+
+def test_covariance_of_an_unknown_front_reaches_the_other_side_of_the_start() -> None:
+    """Two metres ahead and one to the left, in a right turn; turned about, the robot is two behind and one to the right."""
+    pose, stamps = np.array([2.0, 1.0, -0.5]), np.arange(2)
+    inflation = CovarianceInflation(turned_about_m=0.05)
+    inflation.reckoning.poses = np.tile(pose, (5, 1))
+    found = inflation.inflate(Estimate(0, pose, 1e-6 * np.eye(3), None, None)).covariance
+    poses = Trajectory(stamps, np.array([np.zeros(3), pose]), np.tile(1e-6 * np.eye(3), (2, 1, 1)))
+    smoothed = inflation.inflate_trajectory(poses).covariances
+    assert found is not None
+    assert smoothed is not None
+    error = se2.between(pose, [-2.0, -1.0, -0.5])
+    for covariance in (found, smoothed[1]):
+        assert float(error @ np.linalg.solve(covariance, error)) == pytest.approx(1.0, abs=0.01)
+        assert covariance[2, 2] == pytest.approx(1e-6)
+    assert smoothed[0, 0, 0] == pytest.approx(0.01, rel=0.01)
