@@ -30,7 +30,7 @@ from localization.calibration.wheel_fit import (
 from localization.calibration.wheel_units import CORRECTED
 from localization.calibration.wheel_wiring import check_wiring
 from localization.logs import open_log
-from localization.logs.topic_names import is_measured_outside, is_other_estimate
+from localization.logs.topic_names import is_measured_outside, is_other_estimate, match_joints
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.drive_controllers import ControllerValues
 from motion_models.center_of_gravity.urdf import first_names, link_poses, parse_urdf
@@ -41,6 +41,9 @@ from motion_models.se2 import FloatArray
 from motion_models.text_files import read_text
 
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
+_OPEN_SIDES = "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."
+_SURE_CORRELATION = 0.9
+"""Of the wheels' turns with those of gyro or LiDAR, as in `wheel_wiring`."""
 _LEAST_DRIVEN_K = 0.8
 """k = track / effective track of two driven wheels and a caster is 1 within 2 %; of four wheels 0.43 to 0.77."""
 
@@ -49,9 +52,11 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     """Guess everything that a robot file needs. Raises `RobotError` for a URDF that cannot be used."""
     draft = Draft()
     text = None if given.urdf is None else _read_urdf(given.urdf)
-    urdf = None if text is None else wheel_geometry(text, str(given.urdf), given.base_link)
-    controllers = (*(() if urdf is None else urdf.controllers), *(() if given.controller is None else read_controllers(given.controller)))
     _choose_topics(draft, survey, given.topics)
+    names = _JointNames(draft, survey, given)
+    urdf = None if text is None else names.of_urdf(wheel_geometry(text, str(given.urdf), given.base_link))
+    own = () if given.controller is None else tuple(map(names.of_controller, read_controllers(given.controller)))
+    controllers = (*(() if urdf is None else urdf.controllers), *own)
     motion = _motion(path, draft, survey, _wheel_names(draft, survey, given, urdf, controllers))
     measured = None if motion is None else wheel_sides(motion)
     _choose_joints(draft, survey, given, _candidates(draft, survey, given, urdf, controllers), measured)
@@ -78,7 +83,44 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
         kinds = [kind for kind in controller_kinds(given.controller) if urdf is None or kind not in urdf.kinds]
         draft.missing += [f"{kind}, by {given.controller.name}: {KIND_NOTES[kind]}" for kind in kinds]
     _choose_mounts(draft, survey, {} if text is None else _urdf_mounts(text, given))
+    if _OPEN_SIDES in draft.missing:
+        _decide_sides(draft, given, path)
     return draft
+
+
+class _JointNames:
+    """Names that the log has for the joints of other sources, where these have a prefix more or less, as several robots' have."""
+
+    def __init__(self, draft: Draft, survey: Survey, given: Given) -> None:
+        self._reasons, self._log, self._chosen = draft.reasons, survey.name, {*given.left, *given.right}
+        self._names = survey.joint_names.get(draft.topics.get("joint_states", ""), ())
+
+    def of_urdf(self, urdf: WheelGeometry) -> WheelGeometry:
+        """``urdf`` with the log's names. Raises `RobotError` where its wheels may be those of several robots or axles."""
+        joints = tuple(urdf.positions)
+        ways = self._ways(joints)
+        if len(ways) > 1:
+            found = " or ".join(way[joints[0]] for way in ways)
+            raise RobotError(
+                f"{joints[0]} of the URDF may be {found} of {self._log}: joints of several robots or axles. Name the robot's topic with "
+                "--topic.joint-states, or its wheels with --left and --right."
+            )
+        if ways:
+            ours, theirs = joints[0], ways[0][joints[0]]
+            self._reasons.append(f"joints: {theirs} of the log is the URDF's {ours}, and so on for {len(joints)} wheels.")
+            urdf = urdf.renamed(ways[0])
+        return dataclasses.replace(urdf, controllers=tuple(map(self.of_controller, urdf.controllers)))
+
+    def of_controller(self, controller: ControllerValues) -> ControllerValues:
+        """``controller`` with the log's names, where these are certain."""
+        ways = self._ways((*controller.left, *controller.right))
+        if len(ways) != 1:
+            return controller
+        left, right = (tuple(ways[0][joint] for joint in side) for side in (controller.left, controller.right))
+        return dataclasses.replace(controller, left=left, right=right)
+
+    def _ways(self, joints: tuple[str, ...]) -> list[dict[str, str]]:
+        return [way for way in match_joints(joints, self._names) if self._chosen <= {*way.values()}]
 
 
 def _motion_topic(draft: Draft, survey: Survey) -> str | None:
@@ -265,11 +307,25 @@ def _choose_joints(draft: Draft, survey: Survey, given: Given, candidates: list[
     wrong = [c for c in of_log if not _fits(c, chosen if measured is None else measured)]
     draft.contradictions += [Contradiction("left wheels", c.reason, ", ".join(c.left), by_log) for c in wrong]
     if wrong and measured is None and chosen.reason != "given":
-        draft.missing.append(
-            "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."
-        )
+        draft.missing.append(_OPEN_SIDES)
     if measured is not None and measured.reversed:
         _name_reversed(draft, measured)
+
+
+def _decide_sides(draft: Draft, given: Given, path: Path) -> None:
+    """Sides that names, positions and controllers leave open by turns: gyro and LiDAR need lengths, but no odometry of the driver."""
+    has_lengths = {"wheel_radius_m", "track_width_m", "wheelbase_m"} <= draft.values.keys()
+    if draft.joints is None or not has_lengths or not {"imu", "scan", "points"} & draft.topics.keys():
+        return
+    found = check_wiring(open_log(path, finish_robot(draft, given, "new")))
+    turns = {name: r for name, r in found.correlations.items() if name.startswith("turn")}
+    if found.is_ambiguous or not turns or not (found.findings or min(turns.values()) > _SURE_CORRELATION):
+        return
+    draft.missing.remove(_OPEN_SIDES)
+    left = ", ".join(found.robot.joints.left)
+    draft.contradictions[:] = [
+        dataclasses.replace(c, by_log=f"left {left}, by turns") if c.quantity == "left wheels" else c for c in draft.contradictions
+    ]
 
 
 def _name_reversed(draft: Draft, measured: WheelSides) -> None:

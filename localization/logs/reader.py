@@ -62,8 +62,7 @@ class Log:
     """A log of a robot; made by `open_log`. Its iterators read the file anew each time and hold about a second of it."""
 
     def __init__(self, path: Path, source: Source, robot: Robot, topics: TopicOverrides) -> None:
-        self.path, self.robot = path, robot
-        self.source = source
+        self.path, self.source = path, source
         """The file itself, with its raw messages."""
         self.channels = merge_channels(source.channels)
         """Topics and types in the log."""
@@ -81,6 +80,8 @@ class Log:
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
         roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge, self._mean_point)
+        self.robot = roles.robot
+        """The robot, its wheel joints by the log's names."""
         self.sources = roles.sources
         """Topic of each role."""
         self.wheels_error = roles.wheels_error

@@ -1,9 +1,9 @@
-"""Origin of topics by their names: other estimates than the wheels', and namespaces of robots."""
+"""Origin of topics by their names: other estimates than the wheels', and namespaces of robots, of joints as well."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 _OTHER_ESTIMATE = re.compile(
     r"truth|reference|mocap|vicon|optitrack|vrpn|qualisys|motive"  # measured from outside
@@ -13,6 +13,7 @@ _OTHER_ESTIMATE = re.compile(
 )
 _FILTER = re.compile(r"filter|fused|ekf|ukf|kalman", re.IGNORECASE)
 _BY_WHEELS = re.compile(r"wheel|encoder|diff_?drive|base_controller|velocity_controller|motor|chassis", re.IGNORECASE)
+_ENDING = re.compile(r"[_-](joint|link)$", re.IGNORECASE)
 _MEASURED_OUTSIDE = re.compile(r"ground_?truth|reference|mocap|vicon|optitrack|vrpn|qualisys", re.IGNORECASE)
 
 
@@ -48,3 +49,25 @@ def find_in_namespace(wanted: str, topics: Iterable[str]) -> str | None:
     """The only one of ``topics`` that is ``wanted`` in a namespace: /j100_0000/platform/odom for /platform/odom; None for several."""
     found = [topic for topic in topics if topic != wanted and topic.endswith("/" + wanted.lstrip("/"))]
     return found[0] if wanted and len(found) == 1 else None
+
+
+def match_joints(ours: Sequence[str], theirs: Iterable[str]) -> list[dict[str, str]]:
+    """Ways in which all joints ``ours`` are ``theirs``, whose names have one prefix more or less, or end in _joint or _link: their names by
+    ours. None where a name is in both.
+
+    >>> match_joints(["left_wheel", "right_wheel"], ["r1/left_wheel_joint", "r1/right_wheel_joint", "r1/arm_joint"])
+    [{'left_wheel': 'r1/left_wheel_joint', 'right_wheel': 'r1/right_wheel_joint'}]
+    """
+    by_stem, stems = {_stem(name): name for name in theirs}, [_stem(name) for name in ours]
+    if not ours or {*ours} & {*by_stem.values()}:
+        return []
+    first = stems[0]
+    more = sorted(name.removesuffix(first) for name in by_stem if name.endswith(first))
+    less = sorted(first.removesuffix(name) for name in by_stem if first.endswith(name) and name != first)
+    ways = [[prefix + stem for stem in stems] for prefix in more]
+    ways += [[stem.removeprefix(prefix) for stem in stems] for prefix in less if all(stem.startswith(prefix) for stem in stems)]
+    return [dict(zip(ours, (by_stem[name] for name in way), strict=True)) for way in ways if {*way} <= by_stem.keys()]
+
+
+def _stem(joint: str) -> str:
+    return _ENDING.sub("", joint)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from localization.errors import TopicError
 from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
-from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate, is_without_gyro
+from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate, is_without_gyro, match_joints
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.cg_model import CgModel
 from motion_models.center_of_gravity.files import arms_model
@@ -236,6 +236,8 @@ class TopicRoles:
     """Why the wheels cannot be used, where the log has joint states."""
     arms: CgModel | None
     """CG model for the joint states of `Sources.arms`."""
+    robot: Robot
+    """The robot, its wheel joints by the log's names where these have another prefix."""
     warnings: list[str]
 
 
@@ -269,13 +271,14 @@ class _RoleChooser:
         self._joints: Sides = ((), ())
         self._more_wheels: tuple[TopicSource, ...] = ()
         self._error: TopicError | None = None
+        self._joint_note = ""
         self._warnings: list[str] = []
 
     def choose(self) -> TopicRoles:
         wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._center_of_gravity()
         arms, model = self._arms() if center_of_gravity is None else ((), None)
         sources = Sources(wheels, lidar, imu, center_of_gravity, arms, self._more_wheels)
-        return TopicRoles(sources, self._joints, self._error, model, [*self._chooser.warnings, *self._warnings])
+        return TopicRoles(sources, self._joints, self._error, model, self._robot, [*self._chooser.warnings, *self._warnings])
 
     def _arms(self) -> tuple[tuple[TopicSource, ...], CgModel | None]:
         """Joint states of the arms. An empty option for the centre of gravity leaves it at the robot file's value."""
@@ -339,15 +342,9 @@ class _RoleChooser:
             candidates = [named.topic]
         else:
             candidates = self._chooser.of_type(TYPES["joint_states"]) if self._overrides.joint_states is None else []
-        known: set[str] = set()
-        fitting = []
-        self._names: dict[str, set[str]] = {}
-        for topic in candidates:
-            names, joints = self._wheel_joints(topic)
-            self._names[topic] = names
-            known |= names
-            if joints is not None:
-                fitting.append((topic, joints))
+        fitting, known = self._fitting(candidates)
+        if not fitting and self._rename_joints(candidates, known):
+            fitting, known = self._fitting(candidates)
         if len(fitting) == 1:
             topic, self._joints = fitting[0]
             wanted = (*self._robot.joints.left, *self._robot.joints.right)
@@ -361,6 +358,33 @@ class _RoleChooser:
         elif (parts := self._wheels_in_parts(candidates)) is not None:
             return parts
         return self._odometry(named, known, bool(candidates) and not fitting)
+
+    def _fitting(self, topics: list[str]) -> tuple[list[tuple[str, Sides]], set[str]]:
+        """Topics whose messages have wheels of both sides, with their joints, and all joints of ``topics``."""
+        self._names: dict[str, set[str]] = {}
+        fitting = []
+        for topic in topics:
+            self._names[topic], joints = self._wheel_joints(topic)
+            if joints is not None:
+                fitting.append((topic, joints))
+        return fitting, set().union(*self._names.values())
+
+    def _rename_joints(self, topics: list[str], names: set[str]) -> bool:
+        """Give the robot's wheel joints the ``names`` that ``topics`` have for them, where these have another prefix."""
+        joints = self._robot.joints
+        ways = match_joints((*joints.left, *joints.right), sorted(names))
+        if len(ways) == 1:
+            (way,) = ways
+            self._robot = replace(self._robot, joints=joints.renamed(way))
+            ours, theirs = next(iter(way.items()))
+            self._warnings.append(
+                f"{', '.join(topics)}: its joints have other names than the robot file's, {theirs} for {ours}, and so on for all wheels;"
+                " they are taken as the same. Write the log's names to [joints], unless another robot's wheels are called so."
+            )
+        elif ways:
+            ours = joints.left[0]
+            self._joint_note = f" {ours} may be {' or '.join(way[ours] for way in ways)}: those of several robots or axles."
+        return len(ways) == 1
 
     def _wheels_in_parts(self, candidates: list[str]) -> TopicSource | None:
         """Joint states of single wheels or sides, in messages or topics of their own; None where a side has none."""
@@ -386,6 +410,7 @@ class _RoleChooser:
         missing_joints = (
             f"no joint states of {self._log} have the wheel joints: robot '{self._robot.name}' names"
             f" {', '.join((*self._robot.joints.left, *self._robot.joints.right))}; joints in it: {', '.join(sorted(known)) or 'none'}"
+            f"{self._joint_note}"
         )
         if joint_states is not None and joint_states.chosen_by == "option":
             raise TopicError(f"{missing_joints}. Name them in the robot file's [joints].")

@@ -120,6 +120,7 @@ class Node:
 
         patience_s = math.inf if is_resumed or not config.predict else _COMPILING_S
         discovered = discovery.discover(config.wait_s, needed, report, is_over, is_compiled, patience_s)
+        run = replace(run, robot=discovered.parts.robot)
         sources = discovered.parts.sources
         trial = run.make_trial(sources.lidar is not None)
         if trial.prior is not None:

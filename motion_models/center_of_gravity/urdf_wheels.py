@@ -114,6 +114,17 @@ class WheelGeometry:
     has_names: bool = True
     """Whether the wheels are called so; else they were found by their controller or their axes."""
 
+    def renamed(self, names: Mapping[str, str]) -> WheelGeometry:
+        """The same wheels by other ``names``, each by the present one."""
+        return dataclasses.replace(
+            self,
+            left=tuple(names[joint] for joint in self.left),
+            right=tuple(names[joint] for joint in self.right),
+            positions={names[joint]: place for joint, place in self.positions.items()},
+            axes={names[joint]: axis for joint, axis in self.axes.items()},
+            off_axis=tuple(names[joint] for joint in self.off_axis),
+        )
+
     @property
     def has_one_axle(self) -> bool:
         """Whether the wheels that are driven stand on one axle."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from localization.cli import main
 from motion_models.robot import Robot, Topics
 from motion_models.robot_file import load_robot
+from tests.helpers.entrance_drives import Publishing, Vehicle, drive, write
+from tests.studies.entrances import urdf_of
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 BASE_LOG = CASES / "base-log" / "log.mcap"
@@ -154,3 +157,40 @@ def test_init_with_a_urdf_of_other_joint_names_names_both(tmp_path: Path, capsys
     (tmp_path / "r.urdf").write_text(text.replace("_wheel", "_tyre_wheel"))
     init(tmp_path, BASE_LOG, "--urdf", str(tmp_path / "r.urdf"))
     assert "CONTRADICTION: joints = front_left_tyre_wheel" in " ".join((tmp_path / "r.toml").read_text().split())
+
+
+def prefixed_urdf(tmp_path: Path, name: str, prefix: str) -> str:
+    """The URDF of a case, whose wheels' joints have a ``prefix``."""
+    text = (CASES / name / "robot.urdf").read_text()
+    path = tmp_path / "prefixed.urdf"
+    path.write_text(re.sub(r'(<joint name=")(\w*wheel)', rf"\g<1>{prefix}\g<2>", text))
+    assert prefix in path.read_text()
+    return str(path)
+
+
+def test_init_with_a_prefix_in_the_urdf_takes_its_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The sides of the URDF contradict the names: they count as they do without the prefix."""
+    name = "H01-urdf-names-against-sides"
+    robot = init(tmp_path, CASES / name / "log.mcap", "--urdf", prefixed_urdf(tmp_path, name, "j100_0000/"))
+    assert {*robot.joints.left} == {"front_left_wheel", "rear_left_wheel"}
+    printed = capsys.readouterr().out
+    assert "of the log is the URDF's j100_0000/" in printed
+    assert "by the sides of the URDF's wheels" in printed
+
+
+def test_init_of_a_urdf_with_an_axle_in_place_of_two_asks_for_the_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = Vehicle(left=("left_wheel",), right=("right_wheel",))
+    (tmp_path / "robot.urdf").write_text(urdf_of(vehicle, ("left_wheel", "right_wheel")))
+    options = ["--urdf", str(tmp_path / "robot.urdf"), "--out", str(tmp_path / "r.toml")]
+    assert main(["init", str(BASE_LOG), *options]) == 2
+    assert "left_wheel of the URDF may be front_left_wheel or rear_left_wheel" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_init_decides_sides_by_the_gyro_where_no_odometry_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    vehicle = Vehicle(seed=301)
+    log = write(tmp_path / "log.mcap", vehicle, drive(vehicle), Publishing())
+    (tmp_path / "robot.urdf").write_text(urdf_of(vehicle, (*vehicle.right, *vehicle.left)))
+    assert init(tmp_path, log, "--urdf", str(tmp_path / "robot.urdf")).joints.left == vehicle.left
+    printed = capsys.readouterr().out
+    assert "the log does not decide" not in printed
+    assert "by turns" in printed

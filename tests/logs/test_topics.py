@@ -329,3 +329,38 @@ def test_mount_that_moves_is_named(tmp_path: Path) -> None:
     log = _with_tf(tmp_path, [0.3, 0.4])
     assert "laser" not in log.mounts
     assert any("'laser' moves against 'base_link'" in note for note in log.warnings())
+
+
+WHEELS = (*Joints().left, *Joints().right)
+
+
+def prefixed_log(tmp_path: Path, *prefixes: str, joints: Joints = Joints(reversed=("rear_left_wheel",))) -> Log:  # noqa: B008
+    """Wheels of robots with these ``prefixes`` in one topic."""
+    names = tuple(prefix + name for prefix in prefixes for name in WHEELS)
+    records: list[Record] = []
+    for i in range(10):
+        stamp = START + i * S // 10
+        values = [0.1 * i] * len(names)
+        records.append(("/joint_states", bags.joint_state(stamp, names, values, values), stamp))
+    path = bags.write_mcap(tmp_path / "run.mcap", records)
+    return open_log(path, dataclasses.replace(ROBOT, joints=joints))
+
+
+@pytest.mark.parametrize("prefix", ["robot1/", "j100_0000_"])
+def test_wheel_joints_with_a_prefix_in_the_log_are_found(tmp_path: Path, prefix: str) -> None:
+    log = prefixed_log(tmp_path, prefix)
+    assert log.joints == (tuple(prefix + n for n in WHEELS[:2]), tuple(prefix + n for n in WHEELS[2:]))
+    assert log.robot.joints.reversed == (f"{prefix}rear_left_wheel",)
+    assert f"{prefix}front_left_wheel for front_left_wheel" in " ".join(log.warnings())
+    assert any(isinstance(event, WheelSample) for event in log.events())
+
+
+def test_wheel_joints_with_a_prefix_in_the_robot_file_are_found(tmp_path: Path) -> None:
+    joints = Joints(tuple(f"husky/{n}_joint" for n in WHEELS[:2]), tuple(f"husky/{n}_joint" for n in WHEELS[2:]))
+    assert prefixed_log(tmp_path, "", joints=joints).joints == (WHEELS[:2], WHEELS[2:])
+
+
+def test_wheel_joints_of_two_robots_are_refused_with_both_names(tmp_path: Path) -> None:
+    log = prefixed_log(tmp_path, "robot1/", "robot2/")
+    with pytest.raises(TopicError, match="front_left_wheel may be robot1/front_left_wheel or robot2/front_left_wheel"):
+        list(log.events())
