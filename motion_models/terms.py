@@ -74,7 +74,7 @@ _SYNONYMS = {
 }
 """Other names of the variables, for errors that name the nearest one."""
 _FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
-_RISE = re.compile(r"rise\(t,(\d+(?:\.\d+)?(?:e\d+)?)\)")
+_RISE = re.compile(r"rise\(t,(\d+(?:\.\d+)?(?:e\+?\d+)?)\)")
 
 
 class Factor(NamedTuple):

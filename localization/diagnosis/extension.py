@@ -8,6 +8,7 @@ file that a user gets has the coefficients of all windows.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,11 +69,13 @@ class Extension:
     """Check of its file on the half of the drive that it was not fitted to; None without terms, and where nothing was measured there."""
     effects: tuple[FoundEffect, ...] = ()
     """Effects bound to time, place or sensors, which are not written."""
+    is_lasting: bool = True
+    """Whether the terms hold early and late in the drive."""
 
     @property
     def is_better(self) -> bool:
-        """Whether the file is better on the half held out, beyond its scatter."""
-        return self.check is not None and self.check.is_better
+        """Whether the terms last, and their file is better on the half held out, beyond its scatter."""
+        return self.is_lasting and self.check is not None and self.check.is_better
 
     def describe_effects(self) -> str:
         """The bound effects as sentences; empty without any."""
@@ -89,6 +92,8 @@ class Extension:
         if any("t" in t.term.expression.variables for t in self.terms):
             known += "; t counts from the start of each drive, so that it holds for drives that start as this one did"
         text = f"{', and '.join(parts)} beyond {self.model} ({known}); "
+        if not self.is_lasting:
+            return f"{text}it holds in one half of the drive, early or late, and not in the other, so that it is not written"
         if self.check is None or not self.is_better:
             return f"{text}on the other half of the drive it improves nothing beyond the noise, so it is not written"
         fallen = [
@@ -172,22 +177,41 @@ def extend(
     predictor, causes = found.predictor, search.state.causes
     kept = {causes[i].id for i in search.kept}
     replaced = tuple(dict.fromkeys(f.cause for f in found.diagnosis.findings if f.cause in {c.id for c in causes} - kept))
-    extension = Extension(model.name, search.terms, replaced, _check(predictor, search, reader), search.effects)
+    whole, sizes = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))
+    is_lasting = not search.terms or _is_lasting(predictor, search, whole, sizes)
+    extension = Extension(model.name, search.terms, replaced, _check(predictor, search, reader), search.effects, is_lasting)
     if not extension.is_better:
         return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
-    whole = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))[0]
     left = _without(drive, predictor, search.removed) if search.effects else drive
     again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config, predictor.baseline)
     return ExtendedResult(_with_extension(again, extension, found), extension, whole.robot)
 
 
 def _check(predictor: DrivePredictor, search: Search, reader: Reader | None) -> HandoverCheck | None:
-    """The file with terms of one half of the drive, on the other half; None without terms."""
+    """The file with terms of the half of the drive that measures them better, on the other half; None without terms.
+
+    In a drive of a minute one half may not have the motions that separate two terms, as v |wz| and |v| wz without arcs backwards.
+    """
     if not search.terms:
         return None
-    used, held = halves(len(predictor.drive.maneuvers))
+
+    def relative_sigma(used: NDArray[np.bool_]) -> float:
+        """Of the term that these windows measure worst, over its size on the whole drive."""
+        measured = sizes_on(predictor, search, used[predictor.batch.owner])[1]
+        return max(t.sigma / abs(whole.term.value) for t, whole in zip(measured, search.terms, strict=True))
+
+    first, second = halves(len(predictor.drive.maneuvers))
+    used, held = min((first, second), (second, first), key=lambda pair: relative_sigma(pair[0]))
     by_half, sizes = _robot_by(predictor, search, used[predictor.batch.owner])
     return check_written(predictor, search.state.noise, CandidateRobot(by_half, sizes, held), reader)
+
+
+def _is_lasting(predictor: DrivePredictor, search: Search, whole: CorrectedRobot, sizes: Mapping[Cause, float]) -> bool:
+    """Whether both the first and the second half of the drive show at least half of what the terms by all of its windows change there: what
+    acts in a part of it alone is no law of the motion, and yet terms may describe it by the motions of that part."""
+    is_late = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
+    checks = [check_written(predictor, search.state.noise, CandidateRobot(whole, sizes, part), None) for part in (~is_late, is_late)]
+    return not any(check is not None and check.is_refuted for check in checks)
 
 
 def _with_effects(

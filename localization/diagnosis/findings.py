@@ -266,6 +266,12 @@ class HandoverCheck:
         is_gain = self.gain.low > 0.0 or share - _CLEAR_SIGMAS * sigma > 0.5
         return is_gain and not any(one.is_worse for one in self.replays.values())
 
+    @property
+    def is_refuted(self) -> bool:
+        """Whether the windows clearly show less than half of what the file changes: with it errors grow."""
+        share, sigma = self.shown
+        return share + _CLEAR_SIGMAS * sigma < 0.5
+
     def describe(self) -> str:
         """Errors of the half held out before and after, as a sentence without a stop."""
         rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in self.before)

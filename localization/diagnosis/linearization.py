@@ -319,6 +319,14 @@ def nuisance_part(state: Linearization, left: FloatArray) -> FloatArray:
     return np.asarray(np.nan_to_num(state.nuisances) @ (FLAT * sizes))
 
 
+def noise_beside(predictor: DrivePredictor, state: Linearization, columns: FloatArray) -> Noise:
+    """Noise of the drive where ``columns`` (M, 6, k) may have any size beside all causes."""
+    unit = columns / np.maximum(np.sqrt(np.mean(np.nan_to_num(columns) ** 2, axis=(0, 1))), 1e-12)
+    known = np.isfinite(state.linear)[..., None]
+    nuisances = np.concatenate([state.nuisances, np.where(known, unit, np.nan)], axis=-1)
+    return estimate_drive_noise(predictor, state.linear, state.signatures, nuisances, state.causes)
+
+
 LEVELS = 2
 """Nuisances that are no error of the model: the first ones."""
 

@@ -27,12 +27,12 @@ from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Hypothesis, with_sizes
 from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
-from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize
-from localization.diagnosis.noise import FLAT, Noise, estimate_drive_noise
+from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
+from localization.diagnosis.noise import FLAT, Noise
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
 from motion_models.se2 import FloatArray
-from motion_models.terms import COMPONENTS, Expression, Term, parse_expression
+from motion_models.terms import COMPONENTS, VARIABLES, Expression, Term, parse_expression
 
 _POWERS = ("", "{0}", "abs({0})", "{0}^2", "{0}*abs({0})", "sign({0})", "{0}^3")
 """Shapes of one variable: even and odd, to the third power, as slip grows."""
@@ -42,17 +42,20 @@ cause would be larger than robots have it."""
 _OF_CAUSES_PRICE = 7.0
 """Price of a term with the shape of a cause, in twice the log-odds: 33 robots have the cause for one that turns so without."""
 _MORE = {
-    "vx": ("dv", "abs(dv)", "sign(v)*abs(dv)", "v*abs(dv)", "v*t", "abs(v)*t", "dv*abs(v)"),
-    "vy": ("dwz", "v*dwz", "wz*dv", "wz*t", "v*wz*t", "v*dv"),
-    "wz": ("dwz", "abs(dwz)*sign(wz)", "wz*abs(dv)", "wz*dv", "v*dwz", "wz*t", "v*t", "dv", "abs(wz)*t"),
+    "vx": ("dv", "abs(dv)", "sign(v)*abs(dv)", "v*abs(dv)", "dv*abs(v)", "dwz"),
+    "vy": ("dwz", "v*dwz", "wz*dv", "v*dv", "dv"),
+    "wz": ("dwz", "abs(dwz)*sign(wz)", "wz*abs(dv)", "wz*dv", "v*dwz", "dv"),
 }
-"""Accelerations and time."""
-_WARMING = {"vx": "v", "wz": "wz"}
-"""Motion whose share changes while tyres and gears warm up, by component."""
-_TIME_CONSTANTS = (0.125, 0.25, 0.5)
-"""Time constants of what warms up, over the drive's length: slower is a drift with t, and faster is over before it is measured."""
+"""Accelerations."""
+_MAX_DEGREE = 3
+"""Most powers of speed and yaw rate in a term: products of more fit a drive as well, and are many times too large on a faster one."""
+_WARMING = {"vx": ("v", "wz", "abs(v)"), "vy": ("v", "wz", "v*wz"), "wz": ("v", "wz", "abs(wz)")}
+"""Motions whose share changes while tyres and gears warm up, by component."""
+_TIME_CONSTANTS = (0.125, 0.25, 0.5, 1.0)
+"""Time constants of what warms up, over the drive's length: with the last it is nearly a drift with t, which has no bound on longer drives,
+and what is faster is over before it is measured."""
 _SHORTEST_S = 16.0
-"""Drive in which a drift can be distinguished from what warms up: eight windows [s]."""
+"""Drive in which what warms up can be measured: eight windows [s]."""
 _OF_CG = {
     "vx": ("v*cg_x", "wz*cg_y", "v*cg_y", "abs(wz)*cg_x"),
     "vy": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x"),
@@ -137,15 +140,29 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
     texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
     has_cg = bool(np.std(predictor.batch.cg, axis=0).max() > _CG_MOVES_M)
     whole = float(predictor.batch.t.max(initial=0.0))
-    rises = [f"rise(t,{share * whole:.2g})" for share in _TIME_CONSTANTS if whole > _SHORTEST_S]
+    rises = [f"rise(t,{float(f'{share * whole:.2g}'):g})" for share in _TIME_CONSTANTS if whole > _SHORTEST_S]
     found: dict[tuple[str, Expression], None] = {}
     for component in COMPONENTS:
-        warming = [f"{_WARMING[component]}*{rise}" for rise in rises] if component in _WARMING else []
+        warming = [f"{motion}*{rise}" for motion in _WARMING[component] for rise in rises]
         for text in (*texts, *_MORE[component], *warming, *(_OF_CG[component] if has_cg else ())):
-            found.setdefault((component, parse_expression(text)))
+            expression = parse_expression(text)
+            if _degree(expression) <= _MAX_DEGREE:
+                found.setdefault((component, expression))
     base = 2.0 * math.log(len(found) + others) + math.log(max(count, 2))
     more = {(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
     return tuple(CandidateTerm(c, e, base + _complexity(Term(c, e, 0.0)) + more.get((c, e), 0.0)) for c, e in found)
+
+
+def _fading_pairs(candidates: Sequence[CandidateTerm]) -> list[tuple[int, int]]:
+    """Indices of terms that make what fades, c exp(-t/T) = c - c rise(t,T), of a motion c: neither is an improvement by itself."""
+    index = {(c.component, str(c.expression)): i for i, c in enumerate(candidates)}
+    texts = ((component, motion, text) for component, text in index for motion in _WARMING[component] if text.startswith(f"{motion}*rise("))
+    return [(index[component, motion], index[component, text]) for component, motion, text in texts]
+
+
+def _degree(expression: Expression) -> int:
+    """Powers of motions in it; signs and rises have none."""
+    return sum(f.power for f in expression.factors if f.form not in ("sign", "rise") and VARIABLES[f.variable].is_motion)
 
 
 def _complexity(term: Term) -> float:
@@ -281,15 +298,19 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     limits = np.full((len(prices), 2), (-math.inf, math.inf))
     limits[:f] = _size_limits(state)
     noise, chosen, previous = state.noise, named, None
+    fading = [tuple(f + i for i in pair) for pair in _fading_pairs(candidates)]
+    if found.diagnosis.verdict == "unexplained":  # noise that contains what is unexplained hides it
+        strongest = f + int(np.argmax((design.problem(noise).gains_beside(named) - prices)[f:]))
+        noise = noise_beside(predictor, state, design.columns[..., [strongest]])
     for _ in range(_ROUNDS):
         problem = design.problem(noise)
-        starts = sorted({chosen, named, ()})
+        starts = sorted({chosen, named, (), *fading})
         _, chosen = min(_best_set(problem, prices, limits, start, len(named) + _MOST) for start in starts)
         terms = tuple(sorted(i for i in chosen if i >= f))
         if terms == previous:
             break
         previous = terms
-        noise = _noise_without(predictor, state, design.columns[..., list(terms)])
+        noise = noise_beside(predictor, state, design.columns[..., list(terms)])
     chosen, stability = _supported(design, noise, chosen, f, rng)
     return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)
 
@@ -405,14 +426,6 @@ def refine(
         new = zip(terms, values[len(causes) :], sigmas, strict=True)
         terms = tuple(dataclasses.replace(t, value=float(value), sigma=float(sigma)) for t, value, sigma in new)
     return sizes, terms
-
-
-def _noise_without(predictor: DrivePredictor, state: Linearization, columns: FloatArray) -> Noise:
-    """Noise of the drive once the terms of ``columns`` (M, 6, k) may have any size."""
-    unit = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=(0, 1))), 1e-12)
-    known = np.isfinite(state.linear)[..., None]
-    nuisances = np.concatenate([state.nuisances, np.where(known, unit, np.nan)], axis=-1)
-    return estimate_drive_noise(predictor, state.linear, state.signatures, nuisances, state.causes)
 
 
 def _alike(problem: _Regression, i: int, others: tuple[int, ...], names: list[str], f: int) -> tuple[str, ...]:

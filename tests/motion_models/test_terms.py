@@ -40,6 +40,7 @@ def husky(entry: str, model: str = "diff_drive") -> Robot:
         ("vx", "left", "left", "m", False),
         ("wz", "t*wz", "wz*t", "1/s", True),
         ("vx", "rise(t, 20.0)*v", "v*rise(t,20)", "1", True),
+        ("vx", "v*rise(t,1.2e+02)", "v*rise(t,120)", "1", True),
     ],
 )
 def test_expression_is_written_in_one_way_with_its_unit(component: str, text: str, written: str, unit: str, is_symmetric: bool) -> None:

@@ -1,0 +1,105 @@
+"""Candidates of terms, and terms that are found where noise, causes or a part of the drive would hide them or stand for them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from localization.diagnosis.causes.cause import Hypothesis
+from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive import Drive
+from localization.diagnosis.extension import ExtendedResult, extend
+from localization.diagnosis.linearization import make_predictor
+from localization.diagnosis.missing_terms import candidate_terms, term_columns
+from motion_models.registry import make_model
+from motion_models.robot_file import load_robot
+from motion_models.terms import Term, parse_expression
+from tests.helpers.diagnosis_effects import Effect, hide
+from tests.helpers.diagnosis_windows import drive_of_windows, windows
+
+ROBOT = load_robot("pioneer_3dx")
+MODEL = make_model("diff_drive", ROBOT)
+
+
+def drive_with(count: int, seed: int, *terms: Term) -> Drive:
+    """So many windows of a robot that has ``terms`` which its file does not have."""
+    real = dataclasses.replace(ROBOT, terms={"diff_drive": terms}) if terms else ROBOT
+    return drive_of_windows(ROBOT, windows([real] * count, "diff_drive", seed))
+
+
+def term(component: str, text: str, value: float) -> Term:
+    return Term(component, parse_expression(text), value)
+
+
+def extended(drive: Drive) -> ExtendedResult:
+    return extend(examine(drive, MODEL), drive, MODEL)
+
+
+def names(result: ExtendedResult) -> list[str]:
+    return [] if result.extension is None else sorted(t.term.name for t in result.extension.terms)
+
+
+@pytest.mark.parametrize(("count", "longest"), [(40, "rise(t,80)"), (150, "rise(t,300)")])
+def test_candidate_terms_warm_up_as_long_as_the_drive(count: int, longest: str) -> None:
+    """A time constant of hundreds of seconds is written so that it is read again."""
+    texts = {str(c.expression) for c in candidate_terms(make_predictor(drive_with(count, 0), MODEL), 4 * count)}
+    assert f"v*{longest}" in texts
+    assert "v*t" not in texts
+
+
+def test_candidate_terms_have_at_most_three_powers_of_motions() -> None:
+    """Ten times the motion moves the robot by at most a thousand times as much."""
+    predictor = make_predictor(drive_with(16, 0), MODEL)
+    candidates = candidate_terms(predictor, 64)
+    twist = predictor.nominal_twist
+    assert {"v*abs(v)*wz", "v*wz*abs(wz)"} <= {str(c.expression) for c in candidates}
+    values = {"cg_x": np.zeros(len(twist)), "cg_y": np.zeros(len(twist)), "t": np.ones(len(twist))}
+    motions = {"v": twist[:, 0], "wz": twist[:, 2], "dv": twist[:, 0], "dwz": twist[:, 2]}
+    for candidate in candidates:
+        small, large = (candidate.expression.evaluate(values | {n: s * m for n, m in motions.items()})[0] for s in (1.0, 10.0))
+        assert np.all(np.abs(large) <= 1000.0 * (1.0 + 1e-9) * np.abs(small)), str(candidate.expression)
+
+
+def test_term_columns_of_a_rise_equal_those_of_its_limit() -> None:
+    """With a time constant of a millisecond nothing is left to rise."""
+    predictor = make_predictor(drive_with(16, 0), MODEL)
+    plain, risen = (term("vx", text, 1.0) for text in ("v", "v*rise(t,0.1)"))
+    candidate = candidate_terms(predictor, 64)[0]
+    columns = term_columns(
+        predictor, Hypothesis(), [dataclasses.replace(candidate, component="vx", expression=t.expression) for t in (plain, risen)]
+    )
+    late = predictor.window_times_s[0] > 2.0
+    assert columns[late, :, 1] == pytest.approx(columns[late, :, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_extend_finds_what_fades(seed: int) -> None:
+    """exp(-t/12) is 1 - rise(t,12): neither term is an improvement by itself."""
+    effect: Effect = lambda m: (0.4 * m.v * np.exp(-m.t / 12.0), 0.0, 0.0)  # noqa: E731
+    result = extended(hide(drive_with(40, seed), effect))
+    assert [name.split("(")[0] for name in names(result)] == ["vx[v*rise", "vx[v]"]
+    assert result.robot is not None
+
+
+def test_extend_writes_no_term_that_holds_in_a_part_of_the_drive() -> None:
+    """A law that begins at three quarters of the drive: terms describe it by the motions of that part."""
+    effect: Effect = lambda m: (np.where(m.t > 60.0, 0.3 * m.v * np.abs(m.v), 0.0), 0.0, 0.0)  # noqa: E731
+    result = extended(hide(drive_with(40, 1), effect))
+    assert result.extension is not None
+    assert "holds in one half of the drive" in result.extension.describe()
+    assert result.robot is None
+
+
+def test_extend_corrects_by_the_half_that_has_the_motions() -> None:
+    """Every other block of four windows has hardly any way ahead: there |v| wz and v wz are nearly one term."""
+    hidden = (term("vy", "abs(v)*wz", 0.2), term("vy", "v*wz", -0.2))
+    both, back = (list(drive_with(count, 3, *hidden).maneuvers) for count in (20, 200))
+    back = [m for m in back if m.wheels.mean() < -0.3 and m.wheels.mean(axis=1).max() < 0.4][:20]
+    mixed = [m for i in range(5) for m in (*back[4 * i : 4 * i + 4], *both[4 * i : 4 * i + 4])]
+    result = extended(drive_of_windows(ROBOT, [dataclasses.replace(m, start_s=2.0 * i) for i, m in enumerate(mixed)]))
+    assert names(result) == ["vy[abs(v)*wz]", "vy[v*wz]"]
+    assert result.extension is not None
+    assert result.extension.check is not None
+    assert result.extension.check.shown[0] == pytest.approx(1.0, abs=0.05)
