@@ -19,7 +19,7 @@ from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MAX_NIS, MovingObjects
 from localization.sensor_checks.own_body import OwnBody
-from localization.sensor_checks.reckoning import ESTIMATE, Reckoning
+from localization.sensor_checks.reckoning import ESTIMATE, ReckonedStep
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
@@ -27,7 +27,6 @@ from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
 from motion_models.robot import Mount, Robot
-from motion_models.se2 import Pose2
 
 _TOGETHER_S = 0.5
 """Steps of this time are examined together while no check acts [s]. Faults are found by windows of 2.5 s and more."""
@@ -39,12 +38,7 @@ class _Record(NamedTuple):
     step: Step
     estimate: Estimate
     residuals: Residuals | None
-
-    @property
-    def odometry(self) -> Pose2:
-        """(3,) the estimate's pose by the sensors of the robot alone."""
-        estimate = self.estimate
-        return estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]
+    reckoned: ReckonedStep
 
 
 class SensorChecks:
@@ -65,8 +59,8 @@ class SensorChecks:
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
         self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
+        self._reckoning = self._inflation.reckoning
         self._records: list[_Record] = []
-        self._recorded = Reckoning()  # up to the last step, recorded or not
         self._is_acting = True
 
     def insert_imu(self, sample: ImuSample) -> None:
@@ -84,10 +78,13 @@ class SensorChecks:
             return step  # the estimator refuses it
         step = self._own_body.remove(step)
         if not self._is_acting and not step.is_standing and (step.turn is None or not rate_off(step)):
+            self._reckoning.predict(step)
             return step
         self._examine_records(estimator)
         self._is_acting = True
-        step = self._examine_step(step, is_to_come=True)
+        step = self._compare_sensors(step, is_to_come=True)
+        self._reckoning.predict(step)
+        step = self._moving.apply(step, is_to_come=True)
         if self._sweep_times.has_drawn_map:
             self._sweep_times.has_drawn_map = False
             step = replace(step, restarts_map=True)  # without the scans that were distorted
@@ -99,12 +96,15 @@ class SensorChecks:
     def inflate(self, step: Step, estimate: Estimate, estimator: Estimator) -> Estimate:
         """``estimate`` of ``estimator`` after ``step`` with the covariance of what faulty sensors have done to it; unchanged without one
         (LiDAR alone)."""
-        record = _Record(step, estimate, estimator.residuals)
+        residuals = estimator.residuals
+        pose = estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]  # by sensors alone
+        self._reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
+        record = _Record(step, estimate, residuals, self._reckoning.step)
         if self._is_acting:
             self._add(record, estimator)
         else:
-            self._record(record)
-            if not self._moving.is_off(self._recorded.poses) and (estimate.nis is None or estimate.nis < MAX_NIS):
+            self._records.append(record)
+            if not self._moving.is_off() and (estimate.nis is None or estimate.nis < MAX_NIS):
                 return estimate
             self._examine_records(estimator)
         estimate, self._is_acting = self._inflate(record, estimator), self._has_to_act()
@@ -125,22 +125,19 @@ class SensorChecks:
         is_step_changed = self._gyro_rate.is_acting or self._contradictions.is_acting or self._moving.is_acting
         return is_led_away or is_step_changed or self._inflation.is_acting
 
-    def _record(self, record: _Record) -> None:
-        if not self._records:
-            self._recorded.poses = self._inflation.reckoning.poses
-        self._records.append(record)
-        self._recorded.predict(record.step)
-        self._recorded.correct(record.step, record.odometry, None)
-
     def _examine_records(self, estimator: Estimator) -> None:
         records, self._records = self._records, []
         for record in records:
-            self._examine_step(record.step, is_to_come=False)
+            self._reckoning.poses = record.reckoned.before
+            self._compare_sensors(record.step, is_to_come=False)
+            self._reckoning.poses = record.reckoned.predicted
+            self._moving.apply(record.step, is_to_come=False)
+            self._reckoning.poses = record.reckoned.after
             self._add(record, estimator)
         self._own_body.report()  # of steps up to here, whose sensors are compared
 
-    def _examine_step(self, step: Step, *, is_to_come: bool) -> Step:
-        """``step`` as it should be for the estimator, for which it ``is_to_come``, or was."""
+    def _compare_sensors(self, step: Step, *, is_to_come: bool) -> Step:
+        """``step`` without sensors that contradict the others, for the estimator, for which it ``is_to_come``, or was."""
         self._faults.start_step(step)
         if step.scan is not None and not step.scan.is_planar:
             self._tilt.add(step.scan)
@@ -152,17 +149,14 @@ class SensorChecks:
         step = self._gyro_rate.apply(step)
         step = replace(step, turn=None) if "gyro" in excluded else step
         step = step.without_scan() if "LiDAR" in excluded else step
-        step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
-        self._inflation.reckoning.predict(step)
-        return self._moving.apply(step, is_to_come=is_to_come)
+        return self._standstill.apply(step, is_contradicted="wheels" in excluded)
 
     def _add(self, record: _Record, estimator: Estimator) -> None:
         """Compare innovations and learned parameters with their covariances.
 
         Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
         """
-        step, estimate, residuals = record
-        self._inflation.reckoning.correct(step, record.odometry, None if residuals is None else residuals.file_delta)
+        step, estimate, residuals, _ = record
         self._moving.keep_view()
         if estimate.nis is not None:
             self._standstill.restart()
@@ -181,7 +175,7 @@ class SensorChecks:
             return estimate
         self._clocks.add(estimator)
         inflated = self._inflation.inflate(estimate)
-        pose = self._inflation.reckoning.poses[ESTIMATE]
+        pose = self._reckoning.poses[ESTIMATE]
         if scan is not None and self._places.update(lambda: self._window.profile(scan), pose):
             self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on
         return inflated

@@ -16,9 +16,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+import numpy as np
 from scipy.special import stdtrit
 
-from localization.sensor_checks.window import MIN_BINS, Bins
+from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Bins
 from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray
 
@@ -33,13 +34,15 @@ SLIDE_RAD = math.radians(12.0)
 """Direction of a way, up to which it is equal: a robot on a side slope or in curves slides by a few degrees [rad]."""
 _CONFIDENCE = 0.999
 """Confidence of a direction's one-sided bound: windows overlap, so that one of a thousand is one of some minutes."""
+_QUANTILES = [math.inf, *stdtrit(np.arange(1, WINDOW_BINS - 1), _CONFIDENCE).tolist()]
+"""Of Student's distribution at `_CONFIDENCE`, by its degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
     """What several sensors measure in each bin, and by what they differ without a fault."""
 
-    columns: Mapping[Sensor, tuple[int, ...]]
+    columns: Mapping[Sensor, slice]
     """Of `Bins.rows`: one of a turn, two of a way."""
     offset_column: int
     """Of `Bins.rows`: what the offset is proportional to."""
@@ -59,10 +62,11 @@ class Quantity:
     """Directions that are no farther apart are equal [rad]."""
 
 
-TURN = Quantity({"wheels": (3,), "gyro": (4,), "LiDAR": (7,)}, 0, 0.025, 5e-3, 5e-4, 0.0, math.inf, MIN_BINS, OPPOSITE_RAD)
+_TURNS: Mapping[Sensor, slice] = {"wheels": slice(3, 4), "gyro": slice(4, 5), "LiDAR": slice(7, 8)}
+TURN = Quantity(_TURNS, 0, 0.025, 5e-3, 5e-4, 0.0, math.inf, MIN_BINS, OPPOSITE_RAD)
 """The bias: five prior sigmas of the shipped robots. The noise: 0.3 deg of a scan's turn; the least one half of a cheap gyro's 0.002
 rad/s/sqrt(Hz) in a quarter of a second."""
-WAY = Quantity({"wheels": (1, 2), "LiDAR": (5, 6)}, 3, 0.5, 5e-3, 5e-3, 0.05, 2.0, 6, SLIDE_RAD)
+WAY = Quantity({"wheels": slice(1, 3), "LiDAR": slice(5, 7)}, 3, 0.5, 5e-3, 5e-3, 0.05, 2.0, 6, SLIDE_RAD)
 """The slide: half the length of a robot a radian. The noise: a quarter of a range's."""
 
 
@@ -78,6 +82,10 @@ class Gain(NamedTuple):
     """Directions and scales (within `_MAX_RATIO`) are equal, whatever the error."""
 
 
+UNKNOWN = Gain(0.0, 0.0, math.inf, is_equal=False)
+"""Of a sensor that has measured nothing."""
+
+
 class Comparison(NamedTuple):
     """Two sensors, and what both measure."""
 
@@ -91,7 +99,7 @@ class Comparison(NamedTuple):
         a, b = bins.rows[:, quantity.columns[self.first]], bins.rows[:, quantity.columns[self.second]]
         limits = quantity.offset_sigma, quantity.noise, quantity.min_noise, quantity.min_size, quantity.max_ratio
         n, alpha, sigma = _fit(a, b, bins.rows[:, quantity.offset_column], *limits)
-        bound = float(stdtrit(n - 2, _CONFIDENCE)) * sigma / abs(alpha) if n >= quantity.min_bins and alpha else math.inf
+        bound = _QUANTILES[n - 2] * sigma / abs(alpha) if n >= quantity.min_bins and alpha else math.inf
         scale, angle, most = abs(alpha), math.atan2(alpha.imag, alpha.real), quantity.max_angle
         is_equal = abs(angle) <= most and bound <= min(most, math.pi - most) and 1.0 <= _MAX_RATIO * scale <= _MAX_RATIO**2
         return Gain(scale, angle, bound, is_equal)

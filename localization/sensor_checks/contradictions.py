@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, WAY, Comparison, Gain, Quantity, Sensor
+from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, UNKNOWN, WAY, Comparison, Gain, Quantity, Sensor
 from localization.sensor_checks.faults import MEMORY_S, Evidence, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.window import WINDOW_BINS, Bins, Window
@@ -117,13 +117,13 @@ class Contradictions:
 
     def compare(self, window: Window) -> bool:
         """Declare faults that last; whether turns of two sensors are equal, ways are where there are scans, and nothing contradicts."""
-        gains = {comparison: comparison.gain(window.bins) for comparison in _COMPARISONS}
+        gains = {each: each.gain(window.bins) if window.has_gyro or "gyro" not in each else UNKNOWN for each in _COMPARISONS}
         equal: dict[Quantity, set[Sensor]] = {TURN: set(), WAY: set()}  # sensors that agree with another one
         for comparison, gain in gains.items():
             if gain.is_equal:
                 equal[comparison.quantity] |= {comparison.first, comparison.second}
         agree = bool(equal[TURN]) and (bool(equal[WAY]) or not window.has_scans)
-        self._is_any_shown = is_repeating(window.bins)
+        self._is_any_shown = window.has_gyro and is_repeating(window.bins)
         self._stuck.add(self._is_any_shown, window.end_s, window.begin_s)
         for symptom, evidence in zip(SYMPTOMS, self._evidence, strict=True):
             is_shown = symptom.is_shown(gains)
@@ -167,6 +167,9 @@ def _numbers(symptom: Symptom, gains: Mapping[Comparison, Gain]) -> dict[str, fl
 
 def is_repeating(bins: Bins) -> bool:
     """Whether the gyro repeats one value, while the wheels turn by something else."""
+    first, last = (bins.gyro[[0, -1]] / bins.durations_s[[0, -1]]).tolist()
+    if not abs(last - first) <= _REPEATED_RAD_S:
+        return False  # at once, of nearly all windows
     wheels, gyro = bins.rows[:, [3, 4]].T / bins.durations_s
     if not np.ptp(gyro) <= _REPEATED_RAD_S:
         return False

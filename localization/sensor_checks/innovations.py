@@ -9,7 +9,6 @@ from __future__ import annotations
 import bisect
 import math
 import operator
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
@@ -98,7 +97,7 @@ class InnovationWindows:
 
     def __init__(self, pair: Pair) -> None:
         self.pair = pair
-        self.bins: deque[Bin] = deque()
+        self.bins: list[Bin] = []
         self._innovation = self._variance = self._seconds = 0.0
         self._regressors = _NONE
 
@@ -116,12 +115,12 @@ class InnovationWindows:
         self.bins.append(Bin(now_s, self._innovation, self._variance, self._seconds, self._regressors, poses))
         self._regressors = _NONE
         while self.bins[1].end_s < now_s - WINDOWS_S[-1]:
-            self.bins.popleft()
+            del self.bins[0]
         return True
 
     def worst(self) -> InnovationWindow | None:
         """The window ending now whose sum of innovations is farthest from zero, in sigmas; None before the shortest window is full."""
-        bins, last, worst = list(self.bins), self.bins[-1], None
+        bins, last, worst = self.bins, self.bins[-1], None
         for seconds in WINDOWS_S:
             before = max(bisect.bisect_right(bins, last.end_s - seconds, key=_END_S) - 1, 0)
             first = bins[before]

@@ -20,7 +20,8 @@ from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.window import BIN_S, Window
 from localization.trajectory import BoolArray
 from motion_models import se2
-from motion_models.se2 import FloatArray, Points2, Pose2
+from motion_models.compiled import kernel
+from motion_models.se2 import FloatArray, Points2, Pose2, triple
 
 MOVING_OBJECTS = SensorFault(
     "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
@@ -41,7 +42,7 @@ _MIN_UNSURE = 0.06
 """Share of a scan on objects that move, from where on it is not sure that the scene is still."""
 _MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
 """Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
-from where on labels show whether they do [m]."""
+more than labels can show that they do [m]: of points that move along, wheels explain as few as they do by chance in a still scene."""
 _MAX_SLIP_M, _MAX_TURN_SLIP_RAD = 0.15, 0.2
 """Distance of the estimate from the motion by the wheels since that view, up to which the wheels slip as they do without moving objects
 [m, rad]: a way of .6 m, along which fr079's robot slides by up to 14 deg."""
@@ -83,8 +84,6 @@ class _Lidar:
     last_s: float = -math.inf
     """Time of the last one that did [s]."""
     is_active: bool = False
-    slipped: int = 0
-    """Successive comparisons that showed wheels that slip."""
 
 
 class MovingObjects:
@@ -107,12 +106,10 @@ class MovingObjects:
         """View that the last scan was compared with."""
         self._is_unsure = False
         """Objects may move, or the wheels slip."""
-        self._have_wheels_slipped = False
-        """Successive labels show wheels that slip."""
         self._suspected: FloatArray | None = None
-        """(2, 3) poses before labels began to show that either happens."""
-        self._suspected_s = -math.inf
-        """Time of the last labels that showed it [s]."""
+        """(2, 3) poses before labels, or the distance of estimate and wheels, began to show that either happens."""
+        self._suspected_s = self._shown_s = -math.inf
+        """Time of the last ones that showed it, and of the last labels that showed moving objects [s]."""
         self._since: FloatArray | None = None
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
         self._is_by_scans = False
@@ -154,7 +151,8 @@ class MovingObjects:
         points = self._window.points_about_lidar(scan)
         references = self._references(lidar)
         if references:
-            found = self._label(references[0], profile, points)
+            is_quiet = not lidar.is_active and self._suspected is None
+            found = self._label(references[0], profile, points, _MIN_UNSURE if is_quiet else 0.0)
             self._update(step, lidar, found)
             if lidar.is_active:
                 step = self._lead_back(step) if self._is_led_away and is_to_come else step
@@ -194,24 +192,18 @@ class MovingObjects:
         if begin is None and view is not None and (self._is_unsure or self._is_near(view)):
             begin = view.poses
         if begin is not None:
-            off = self._distance(begin)
-            is_off = self._is_unsure or self._is_undecided(math.hypot(off[0], off[1])) or (nis is not None and nis > MAX_NIS)
-            inflation.possible = off if is_off else None
+            is_off = self._is_unsure or (nis is not None and nis > MAX_NIS) or _compare_motions(begin, self._poses)[2] > _MIN_OFF_M
+            inflation.possible = self._distance(begin) if is_off else None
 
-    def is_off(self, poses: FloatArray) -> bool:
-        """Whether the estimate is off the motion by the wheels at ``poses`` (5, 3) of a `Reckoning`, to which no step was applied: since
-        the oldest view that a scan would be compared with."""
-        now = poses[GYRO : ESTIMATE + 1]
-        oldest = (next((view for view in lidar.views if self._is_near(view, now)), None) for lidar in self._lidars.values())
-        return any(view is not None and self._is_undecided(math.hypot(*_distance(view.poses, now)[:2])) for view in oldest)
-
-    def _is_undecided(self, distance: float) -> bool:
-        """Whether the estimate is farther from the motion by the wheels than these slip as a rule [m], and labels do not show that they
-        do."""
-        return distance > _MIN_OFF_M and (distance < _MAX_OFF_M or not self._have_wheels_slipped)
+    def is_off(self) -> bool:
+        """Whether the estimate is off the motion by the wheels since the oldest view that a scan would be compared with."""
+        oldest = (next((view for view in lidar.views if self._is_near(view)), None) for lidar in self._lidars.values())
+        return any(view is not None and _compare_motions(view.poses, self._poses)[2] > _MIN_OFF_M for view in oldest)
 
     def _distance(self, since: FloatArray) -> FloatArray:
-        return _distance(since, self._poses)
+        """(3,) of the motion by the wheels since the poses ``since`` (2, 3) from that by the estimate."""
+        by_wheels, by_estimate = se2.between(since, self._poses)
+        return se2.local(by_estimate, by_wheels)
 
     def _agree(self, poses: FloatArray) -> bool:
         """Whether wheels and estimate have moved alike since ``poses`` (2, 3)."""
@@ -228,7 +220,7 @@ class MovingObjects:
         assert self._since is not None
         self._is_led_away = False
         motion, by_wheels = step.predicted, se2.between(self._since[0], self._poses[0])
-        before = self._faults.inflation.reckoning.before
+        before = self._faults.inflation.reckoning.step.before[ESTIMATE]
         off = se2.local(se2.compose(se2.between(self._since[1], before), motion.delta), by_wheels)
         if math.hypot(off[0], off[1]) >= _MIN_OFF_M:
             motion = replace(motion, delta=se2.retract(motion.delta, off), cov=motion.cov + np.outer(off, off))
@@ -253,44 +245,42 @@ class MovingObjects:
             views.popleft()
         return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
 
-    def _is_near(self, view: _View, now: FloatArray | None = None) -> bool:
-        (x, y, turn), (u, v, other_turn) = se2.between(view.poses, self._poses if now is None else now).tolist()
-        return max(math.hypot(x, y), math.hypot(u, v)) < _MAX_WAY_M and max(abs(turn), abs(other_turn)) < _MAX_TURN_RAD
+    def _is_near(self, view: _View) -> bool:
+        way, turn, _ = _compare_motions(view.poses, self._poses)
+        return way < _MAX_WAY_M and turn < _MAX_TURN_RAD
 
-    def _label(self, view: _View, profile: Profile, points: Points2) -> _Comparison:
-        """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``."""
+    def _label(self, view: _View, profile: Profile, points: Points2, least_moved: float = 0.0) -> _Comparison:
+        """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``; ``least_moved`` as of `explain`."""
         x, y = profile.center.tolist()
         motions = se2.compose(se2.between(view.poses, self._poses), (x, y, 0.0))
         motions[:, :2] -= view.profile.center  # of the LiDAR
-        return _Comparison(view, profile, points, explain(view.profile, profile, points, motions[0]), motions[1])
+        return _Comparison(view, profile, points, explain(view.profile, profile, points, motions[0], least_moved), motions[1])
 
     def _update(self, step: Step, lidar: _Lidar, found: _Comparison) -> None:
         """Whether objects move now."""
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        distance = math.hypot(*self._distance(found.view.poses)[:2])
-        is_moving, has_turn, slipped = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None, 0
+        _, _, distance = _compare_motions(found.view.poses, self._poses)
+        is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
-            if unique >= _KEPT_UNIQUE:
+            if unique >= _KEPT_UNIQUE or distance >= _MAX_OFF_M:
                 self._suspected = found.view.poses if self._suspected is None else self._suspected
                 self._suspected_s = now_s
-            else:
-                slipped = lidar.slipped + 1
+                self._shown_s = now_s if unique >= _KEPT_UNIQUE else self._shown_s
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
             is_moving = unique >= least and (has_turn or moved_share >= _MIN_MOVED_WITHOUT_GYRO)
         is_moving &= moved_share >= _MIN_MOVED
-        lidar.shown, lidar.slipped = lidar.shown + 1 if is_moving else 0, slipped
+        lidar.shown = lidar.shown + 1 if is_moving else 0
         if is_moving:
             lidar.last_s = now_s
         again = 1 if is_standing else _AGAIN if has_turn else _AGAIN_WITHOUT_GYRO
-        self._have_wheels_slipped = slipped >= again
         lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
         if now_s - self._suspected_s >= _CALM_S:
             self._suspected = None
-        self._is_unsure = self._suspected is not None or self._is_undecided(distance)
-        self._window.is_scene_moving = self._suspected is not None or lidar.is_active
+        self._is_unsure = self._suspected is not None or distance > _MIN_OFF_M
+        self._window.is_scene_moving = now_s - self._shown_s < _CALM_S or lidar.is_active
         if lidar.is_active:
             self.report.add(moved_share)
             if self._since is None:
@@ -359,10 +349,15 @@ class _Comparison:
         return least
 
 
-def _distance(since: FloatArray, now: FloatArray) -> FloatArray:
-    """(3,) of the motion by the wheels from that by the estimate, between the poses ``since`` and ``now``, (2, 3) of both."""
-    by_wheels, by_estimate = se2.between(since, now)
-    return se2.local(by_estimate, by_wheels)
+@kernel
+def _compare_motions(since: FloatArray, now: FloatArray) -> tuple[float, float, float]:
+    """The longer way and the larger turn by wheels and estimate between the poses ``since`` and ``now``, (2, 3) of both, and the distance
+    of the motion by the estimate from that by the wheels [m, rad, m]."""
+    by_wheels = se2.scalar_between(triple(since[0]), triple(now[0]))
+    by_estimate = se2.scalar_between(triple(since[1]), triple(now[1]))
+    off = se2.scalar_log(se2.scalar_between(by_estimate, by_wheels))
+    way = max(math.hypot(by_wheels[0], by_wheels[1]), math.hypot(by_estimate[0], by_estimate[1]))
+    return way, max(abs(by_wheels[2]), abs(by_estimate[2])), math.hypot(off[0], off[1])
 
 
 def _with_still(step: Step, is_still: BoolArray) -> Step:

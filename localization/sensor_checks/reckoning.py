@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from localization.events import Step
@@ -14,31 +16,39 @@ with the robot file's parameters, and by these with the gyro's turns."""
 _NONE = np.zeros(3)
 
 
+class ReckonedStep(NamedTuple):
+    """`Reckoning.poses`, (5, 3) each, before a step, predicted for its end, and after that is estimated."""
+
+    before: FloatArray
+    predicted: FloatArray
+    after: FloatArray
+
+
 class Reckoning:
     """`predict` each step by its sensors, then `correct` it by its estimate."""
 
     def __init__(self) -> None:
         self.poses = np.zeros((5, 3))
         """(5, 3) now. The array is replaced and never changed, so that it can be kept as a moment to measure from."""
-        self.before = _NONE
-        """(3,) pose by the estimate at the begin of the step."""
+        self.step = ReckonedStep(self.poses, self.poses, self.poses)
+        """The last one."""
 
     def predict(self, step: Step) -> None:
         """Until its end is estimated, ``step`` moves the estimate as wheels and gyro do."""
         delta = step.predicted.delta
         by_gyro = delta if step.turn is None or step.is_standing else np.array([delta[0], delta[1], step.turn.angle])
-        self.before = self.poses[ESTIMATE]
-        self.poses = se2.compose(self.poses, np.array([delta, by_gyro, by_gyro, _NONE, _NONE]))
+        predicted = se2.compose(self.poses, np.array([delta, by_gyro, by_gyro, _NONE, _NONE]))
+        self.step = ReckonedStep(self.poses, predicted, predicted)
+        self.poses = predicted
 
     def correct(self, step: Step, pose: Pose2, file_delta: Pose2 | None) -> None:
-        """The estimate at the end of ``step`` is ``pose`` (3,); ``file_delta`` (3,) is the motion by the wheels with the robot file's
-        parameters."""
-        poses = self.poses.copy()
+        """``pose`` (3,) by the estimate at the end of ``step``; ``file_delta`` (3,) by the wheels with the robot file's parameters."""
+        self.poses = poses = self.poses.copy()
         poses[ESTIMATE] = pose
         if file_delta is not None:
             by_gyro = file_delta if step.turn is None else np.array([file_delta[0], file_delta[1], step.turn.angle])
             poses[FILE:] = se2.compose(poses[FILE:], np.array([file_delta, by_gyro]))
-        self.poses = poses
+        self.step = ReckonedStep(*self.step[:2], poses)
 
     def distance(self, since: FloatArray, row: int) -> FloatArray:
         """(3,) of the ``row`` from the estimate, for their motions since the moment of the poses ``since`` (5, 3)."""

@@ -45,15 +45,15 @@ class SceneMotion(NamedTuple):
     """The larger one of the shares of points that appeared, and of the reference's surfaces in view that are seen through."""
 
 
-def explain(reference: Profile, now: Profile, points: Points2, start: Pose2) -> SceneMotion:
+def explain(reference: Profile, now: Profile, points: Points2, start: Pose2, least_moved: float = 0.0) -> SceneMotion:
     """Label ``points`` (N, 2) about the LiDAR, of which ``now`` is the profile, for a motion (3,) of the LiDAR since ``reference``.
 
-    The motion is ``start`` (3,), refined by those points that it nearly explains: Gauss-Newton for the sum of the squared distances from
-    their lines, and those from ``start`` as a prior. What ends farther from ``start`` than that may be off was led away by points that
-    move: it is ``start`` itself then.
+    The motion is ``start`` (3,) where less than the share ``least_moved`` moves under it, else that refined by those points that it nearly
+    explains: Gauss-Newton for the sum of the squared distances from their lines, and those from ``start`` as a prior. What ends farther
+    from ``start`` than that may be off was led away by points that move: it is ``start`` itself then.
     """
     labels = np.empty(len(points), dtype=np.int8)
-    motion, moved_share = _explain(reference, now, points, triple(start), labels)
+    motion, moved_share = _explain(reference, now, points, triple(start), least_moved, labels)
     return SceneMotion(np.array(motion), labels, moved_share)
 
 
@@ -65,15 +65,24 @@ def align_rest(reference: Profile, points: Points2, still: SceneMotion) -> Pose2
 
 
 @kernel
-def _explain(reference: Profile, now: Profile, points: Points2, start: Triple, labels: Labels) -> tuple[Triple, float]:
+def _explain(reference: Profile, now: Profile, points: Points2, start: Triple, least_moved: float, labels: Labels) -> tuple[Triple, float]:
     """See `explain`: fill ``labels`` (N,); the motion, and `SceneMotion.moved_share`."""
+    moved_share = _label_both(reference, now, points, start, labels)
+    if moved_share < least_moved:
+        return start, moved_share
     motion = _refine(reference, points, start)
     off = se2.scalar_log(se2.scalar_between(start, motion))
     if not (math.hypot(off[0], off[1]) < _PRIOR_M and abs(off[2]) < _PRIOR_RAD):
-        motion = start
+        return start, moved_share
+    return motion, _label_both(reference, now, points, motion, labels)
+
+
+@subroutine
+def _label_both(reference: Profile, now: Profile, points: Points2, motion: Triple, labels: Labels) -> float:
+    """`SceneMotion.moved_share` under ``motion``; fills ``labels`` (N,)."""
     moved, _ = _label(reference, points, motion, labels)
     vanished, in_view = _label(now, reference.points, se2.scalar_inverse(motion), np.empty(BEARINGS, dtype=np.int8))
-    return motion, max(moved / max(len(points), 1), vanished / max(in_view, 1))
+    return max(moved / max(len(points), 1), vanished / max(in_view, 1))
 
 
 @subroutine

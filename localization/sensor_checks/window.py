@@ -54,8 +54,8 @@ class Window:
         self._scans = ScanOdometry()
         self._open = _Accumulator()
         self.bins = Bins.of(np.empty((0, 9)))
-        self.has_scans = False
-        """Whether any scan has come."""
+        self.has_scans = self.has_gyro = False
+        """Whether any scan, or turn by a gyro, has come."""
         self.begin_s = self.end_s = 0.0
         """After the first step [s]."""
         self.is_scene_moving = False
@@ -67,13 +67,14 @@ class Window:
         """Whether ``step`` ends a bin and there are enough to compare. A bin ends where it is long enough, at a scan if there are any."""
         self._open.add(step)
         self.has_scans |= step.scan is not None
+        self.has_gyro |= step.turn is not None
         waits_for_scan = self.has_scans and step.scan is None
         if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else BIN_S):
             return False
         lidar = _UNKNOWN if step.scan is None else self._register(step.scan)
         closed, self._open = self._open, _Accumulator(has_scan_at_start=step.scan is not None)
-        row = closed.duration_s, *closed.wheels, closed.gyro, *lidar, closed.is_standing
-        self.bins = Bins.of(np.vstack([self.bins.rows[1 - WINDOW_BINS :], row]))
+        row = np.array([[closed.duration_s, *closed.wheels, closed.gyro, *lidar, closed.is_standing]])
+        self.bins = Bins.of(np.concatenate((self.bins.rows[1 - WINDOW_BINS :], row)))
         self.begin_s, self.end_s = max(now_s - float(self.bins.durations_s.sum()), 0.0), now_s
         return len(self.bins.rows) >= MIN_BINS
 

@@ -129,7 +129,7 @@ def first_part(source: Path, target: Path, part: float) -> None:
 
 def main(part: str = "all") -> None:
     step_s, share = checks_share()
-    print(f"step of fr079's EKF {1e3 * step_s:.2f} ms, of which sensor checks {100.0 * share:.0f} % (at most 15 is wanted)\n")
+    print(f"step of fr079's EKF {1e3 * step_s:.2f} ms, of which sensor checks {100.0 * share:.1f} % (at most 15 is wanted)\n")
     if part == "checks":
         return
     kiss_seconds(), ekf_seconds()  # compile and warm up

@@ -14,6 +14,7 @@ from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.innovations import InnovationWindows
 from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
+from localization.sensor_checks.reckoning import ESTIMATE
 from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency
 from localization.sensor_checks.sweep_times import REVERSED_TIMES
 from motion_models import se2
@@ -89,7 +90,7 @@ class Driven:
             reckoning = self.faults.inflation.reckoning
             reckoning.predict(step)
             moved = se2.exp(np.array([speed, 0.0, rate + innovation]) * 0.1)
-            reckoning.correct(step, se2.compose(reckoning.before, moved), delta)
+            reckoning.correct(step, se2.compose(reckoning.step.before[ESTIMATE], moved), delta)
             self.check.add(step, Residuals((0.1 * innovation, 1e-5), delta), lambda: [LearnedParameter("k_0", learned, 0.01, 1.0, 0.15)])
             self.check.compare_estimate(nis)
 
