@@ -23,12 +23,10 @@ from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.extended_model import SampleSeries, in_series, needs_series
-from motion_models.friction.model import BoolArray
-from motion_models.friction.slope_effect import SlopeEffect
+from motion_models.friction.slope_effect import SlopeEffect, SlopeMotion
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import Cov3, FloatArray, Twist2
-from motion_models.slope import SlopeTwist
 
 _MIN_REPORTED_S = 0.05
 """Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
@@ -300,26 +298,24 @@ class Synchronizer:
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
             motion = integrate_twists(dt, inside, self._wheel_noise)
         else:
-            warp = self._slope_effect.warp_of(tilt.twist)
+            warp = self._slope_effect.warp_of(tilt.twist), self._slope_effect.warp_of(tilt.twist_sigma)
             found = partial(self._slope_effect.twist, model, rates, cg, self.params, warp=warp)
             twist, motion = self._integrate_on_slope(found, dt, n, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 
-    def _integrate_on_slope(
-        self, effect: Callable[[FloatArray], tuple[SlopeTwist, BoolArray]], dt: FloatArray, m: int, tilt: Tilt
-    ) -> tuple[Twist, Motion]:
+    def _integrate_on_slope(self, effect: Callable[[FloatArray], SlopeMotion], dt: FloatArray, m: int, tilt: Tilt) -> tuple[Twist, Motion]:
         """Twists by ``effect`` at ``m`` samples before and n in the step, and the motion over its intervals ``dt`` (n,), with what is
-        uncertain about the slope in its covariance."""
+        uncertain about the slope and the load on the diagonals in its covariance."""
         whole, k = float(dt.sum()), len(self.params)
         downhill = np.vstack([np.tile(tilt.before, (m, 1)), tilt.at((np.cumsum(dt) - 0.5 * dt) / whole)])
-        found, is_limited = effect(downhill)
+        found = effect(downhill)
         twist = found.twist
-        by = np.concatenate([twist.d_params, found.d_downhill], axis=-1)
+        by = np.concatenate([twist.d_params, found.d_downhill, found.by_warp], axis=-1)
         motion = integrate_twists(dt, Twist(twist.value[m:], twist.d_wheels[m:], twist.d_cg[m:], by[m:]), self._wheel_noise)
-        D = motion.d_params[:, k:]
-        cov = motion.cov + max(1.0, _SLOPE_ERROR_S / whole) * (D @ tilt.cov @ D.T)
-        limited_s = float(dt[is_limited[m:]].sum())
+        D, B = motion.d_params[:, k : k + 2], motion.d_params[:, k + 2 :]
+        cov = motion.cov + max(1.0, _SLOPE_ERROR_S / whole) * (D @ tilt.cov @ D.T + B @ B.T)
+        limited_s = float(dt[found.limited[m:]].sum())
         if limited_s:  # tipping or sliding by itself: no wheel shows the motion
             c = self.config
             unknown = np.array([c.lost_speed_m_s, c.lost_speed_m_s, c.lost_rate_rad_s]) ** 2

@@ -42,6 +42,9 @@ class Geometry:
     """Rolled distance of the left wheels over `wheel_radius_m` times their angle, as in ROS's diff_drive_controller."""
     right_wheel_radius_multiplier: float = 1.0
     """Rolled distance of the right wheels over `wheel_radius_m` times their angle."""
+    wheel_deflection: float = 0.01
+    """How far a wheel gives way under a quarter of the weight, over its radius. A tyre of radius R and half width r carries its load by the
+    pressure p on its contact, an ellipse: m g / (8 pi p R sqrt(R r)), 0.011 on a Husky and 0.015 on a Jackal at 1 bar."""
 
     @property
     def radius_multipliers(self) -> FloatArray:

@@ -123,6 +123,8 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
     for name in ("left_wheel_radius_multiplier", "right_wheel_radius_multiplier"):
         if not 0.1 < getattr(geometry, name) < 10.0:
             raise RobotError(f"{source}: geometry.{name} is {getattr(geometry, name)}; it must be near 1.")
+    if not 1e-4 <= geometry.wheel_deflection <= 0.5:
+        raise RobotError(f"{source}: geometry.wheel_deflection is {geometry.wheel_deflection}; it must be 0.0001 to 0.5.")
     for name, value in dataclasses.asdict(geometry).items():
         if name.endswith("_m") and abs(value) > _LONGEST_M:
             raise RobotError(f"{source}: geometry.{name} is {value:g}; it must be in metres, and at most {_LONGEST_M:g}.")

@@ -1,12 +1,12 @@
 """Dead reckoning on hills by wheels and IMU, its error by parts: what attitude, heading and slip contribute to position and height.
 
-python -m tests.studies.hill_reckoning [--seeds A:B] [--seconds S] [--softness X] [--stiffness K]
+python -m tests.studies.hill_reckoning [--seeds A:B] [--seconds S] [--softness X] [--deflection D] [--stiffness K]
 
 Drives in MuJoCo (`tests.helpers.mujoco_hills`), replayed by the filter (estimator ekf) with defaults, nothing fitted. Each part is the
 error that is left when all else is true: "heading" and "attitude" are true motions in the body turned by the estimated heading or
 attitude, "slip" is the estimated motion in the body turned by the true attitude. "Flat" is the estimate without the law of slopes along
-the true attitude. The softness is that of the wheels, the stiffness the friction model's slip_stiffness (10 by default). Needs the extra
-`mujoco`.
+the true attitude. The softness is that of the wheels, the deflection what the robot file has of it (`wheel_deflection`; by 0.0034 of their
+radius they give way at softness 1), the stiffness the friction model's slip_stiffness (10 by default). Needs the extra `mujoco`.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ class Reckoning:
     attitude: FloatArray
     slip: FloatArray
     flat: FloatArray
+    nees: float
+    """Of the last position of the estimate (3 degrees of freedom)."""
 
 
 def reckon(made: HillDrive) -> Reckoning:
@@ -55,12 +57,15 @@ def reckon(made: HillDrive) -> Reckoning:
     at = np.searchsorted(flat.stamps_ns, stamps).clip(0, len(flat) - 1)
     planar = np.column_stack([flat.poses[at, :2], np.zeros(len(at))])
     by_flat = in_body(planar, np.array([_heading(yaw) for yaw in flat.poses[at, 2]]))
+    spread = start @ run.in_space.covariances[-1, :3, :3] @ start.T
+    end = positions[-1] - ways[-1]
     return Reckoning(
         positions - ways,
         along(own, headed) - ways,
         along(own, turned) - ways,
         along(in_body(positions, turned), R) - ways,
         along(by_flat, R) - ways,
+        float(end @ np.linalg.solve(spread, end)),
     )
 
 
@@ -95,6 +100,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="1:5", metavar="A:B")
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--softness", type=float, default=1.0)
+    parser.add_argument("--deflection", type=float, default=None)
     parser.add_argument("--stiffness", type=float, default=None)
     given = parser.parse_args()
     columns = (
@@ -109,10 +115,13 @@ def main() -> None:
         "by attitude",
         "by slip",
         "flat",
+        "NEES at the end",
     )
     print(f"| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")
     for seed in range(*map(int, given.seeds.split(":"))):
         made = drive(Wander(seed), given.seconds, seed=seed, softness=given.softness)
+        if given.deflection is not None:
+            made = replace(made, robot=replace(made.robot, geometry=replace(made.robot.geometry, wheel_deflection=given.deflection)))
         if given.stiffness is not None:
             friction = {**made.robot.models["friction"], "slip_stiffness": given.stiffness}
             made = replace(made, robot=replace(made.robot, models={**made.robot.models, "friction": friction}))
@@ -120,7 +129,7 @@ def main() -> None:
         rms = [f"{np.sqrt(np.mean(np.sum(e**2, axis=1))):.2f}" for e in (r.whole, r.heading, r.attitude, r.slip, r.flat)]
         ends = [f"{e[-1, 2]:+.2f}" for e in (r.attitude, r.slip, r.flat)]
         heights = f"{r.whole[-1, 2]:+.2f} | {np.sqrt(np.mean(r.whole[:, 2] ** 2)):.2f}"
-        print(f"| {seed} | {' | '.join(rms)} | {heights} | {' | '.join(ends)} |", flush=True)
+        print(f"| {seed} | {' | '.join(rms)} | {heights} | {' | '.join(ends)} | {r.nees:.1f} |", flush=True)
 
 
 if __name__ == "__main__":
