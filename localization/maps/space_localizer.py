@@ -35,8 +35,8 @@ _SAME_COV = np.diag([0.1, 0.1, 0.1, 0.03, 0.03, 0.03]) ** 2
 """Covariance of a searched pose against another of the same place [m^2, rad^2]."""
 _GATE, _OUTLIER = 9.0, 25.0
 """Squared Mahalanobis distances of 3 sigma, within which places agree, and of 5 sigma, beyond which a cloud contradicts the place."""
-_ON, _OFF, _OFFSET = 10.0, -20.0, -4.0
-"""Log-odds of a place by the shares of a cloud's points on and off the map's surfaces."""
+WEIGHTS = (10.0, -20.0, -4.0)
+"""Log-odds of a place are their products with the shares of a cloud's points on and off the map's surfaces, and 1."""
 _MAX_LOG_ODDS = 6.0
 _LOST = 0.5
 """Probability of a tracked place below which the robot is lost."""
@@ -251,7 +251,8 @@ def _is_within(cov: FloatArray, sigma_m: float, sigma_rad: float) -> bool:
 
 
 def _evidence(place: SpacePlace) -> float:
-    return _ON * place.on_surfaces + _OFF * place.off_surfaces + _OFFSET
+    on, off, offset = WEIGHTS
+    return on * place.on_surfaces + off * place.off_surfaces + offset
 
 
 def _weigh(places: Sequence[SpacePlace]) -> list[SpaceHypothesis]:

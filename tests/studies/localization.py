@@ -168,6 +168,7 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
     estimator = pipeline.estimator
     assert isinstance(estimator, MapFusion)
     cut, mapped, found_after, wrong_s, n, cycle, scans = None, None, [], 0.0, 0, -1, keyframes.scans()
+    n_above = np.zeros(2, dtype=int)  # keyframes above `LIKELY`, and those of them that are wrong
     now, last_ns, localized = np.zeros(2), 0, None  # time of the log and of driving [s], and since when the robot is localized
     for event in drive.events:
         now[0] = (event.stamp_ns - begin) * 1e-9
@@ -182,7 +183,10 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
             last_ns, is_localized = estimate.stamp_ns, estimator.localizer.state == "localized"
             localized = (now.copy() if localized is None else localized) if is_localized else None
             k = int(np.searchsorted(keyframes.stamps_ns, estimate.stamp_ns))
-            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns or cut is None:
+            if k >= len(keyframes.stamps_ns) or keyframes.stamps_ns[k] != estimate.stamp_ns:
+                continue
+            n_above += estimator.probability > LIKELY, estimator.probability > LIKELY and not off(keyframes.poses[k], estimate.pose)[1]
+            if cut is None:
                 continue
             left = min(_KEPT_S - now[0] % _CYCLE_S, (end - begin) * 1e-9 - now[0])
             if mapped is None and left >= _FOUND_WITHIN_S and places.align(scans[k], keyframes.poses[k]).score >= MAPPED_SCORE:
@@ -198,7 +202,7 @@ def kidnappings_row(name: str, drive: Drive, keyframes: KeyframeMap, i: int) -> 
     after = np.array(found_after).reshape(-1, 2)
     times = [f"{np.median(column):.1f} / {np.quantile(column, 0.9):.1f}" if len(after) else "-" for column in after.T]
     soon = [str(np.sum(column <= _FOUND_WITHIN_S)) for column in after.T]
-    cells = [f"{name}, map of half {i + 1}", f"{len(after)} of {n}", *times, *soon, f"{wrong_s:.1f}"]
+    cells = [f"{name}, map of half {i + 1}", f"{len(after)} of {n}", *times, *soon, f"{wrong_s:.1f}", f"{n_above[1]} of {n_above[0]}"]
     return "| " + " | ".join(cells) + " |"
 
 
@@ -311,8 +315,8 @@ def main(words: Sequence[str] | None = None) -> None:
             for i in (0, 1):
                 print(drive_row(name, drive, maps[name], i), flush=True)
         columns = "found again, of those mapped | median / p90 [s] | of driving | within 10 s | of driving"
-        print(f"\n| carried | {columns} | wrong, longest [s] |")
-        print("|---" * 7 + "|")
+        print(f"\n| carried | {columns} | wrong, longest [s] | wrong above 0.9 |")
+        print("|---" * 8 + "|")
         for name, drive in drives.items():
             for i in (0, 1):
                 print(kidnappings_row(name, drive, maps[name], i), flush=True)
