@@ -154,7 +154,7 @@ def test_map_commands_refuse_what_is_for_the_other_kind(file: Path, tmp_path: Pa
     room, out = tmp_path / "room.skidmap", tmp_path / "out"
     save_map(room, square_room.saved())
     assert main(["map", "merge", str(room), str(file), "--out", str(out)]) == 2
-    assert "holds clouds in space" in capsys.readouterr().err
+    assert "one map holds planar scans, the other clouds in space" in capsys.readouterr().err
     assert main(["map", "export", str(room), "--out", str(out), "--heights", "0.3", "2"]) == 2
     assert "--heights" in capsys.readouterr().err
     assert not out.exists()
