@@ -49,6 +49,8 @@ _MIN_PART = 0.15
 """Smallest part of the way on each side of a change of the mount."""
 _SNAP_RAD = math.radians(4.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that."""
+_MIN_LEVEL = 0.5
+"""Least vertical component of the axis of a planar LiDAR: beyond 60 degrees of tilt it measures no motion along the floor."""
 _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
 
 
@@ -95,6 +97,7 @@ class LidarCheck:
         self._gyro = GyroHeading(mounts) if has_gyro else None
         self._wheels: list[WheelSample] = []
         self._travels: dict[str, _Travel] = defaultdict(_Travel)
+        self._on_edge: set[str] = set()
         self._config = LidarConfig()
         self._moving_ns: int | None = None
         self._scans, self._next_scan, self._way_m = 0, 0, 0.0
@@ -116,7 +119,7 @@ class LidarCheck:
             self._gyro.add(event)
         elif isinstance(event, Scan) and self.has_moved:
             self._scans += 1
-            travel = self._travels[event.frame_id]
+            travel = self._travel_of(event)
             intervals = len(travel.rows)
             _register(travel, event, self._mounts.get(event.frame_id, Mount()), self._config)
             if self._scans == 1 and self._moving_ns is not None and travel.begin_ns - self._moving_ns < _MAX_START_NS:
@@ -129,6 +132,15 @@ class LidarCheck:
                 self.is_done |= is_healthy or ((found := self.result()) is not None and found.is_certain)
         is_late = self._moving_ns is not None and event.stamp_ns > self._moving_ns + _MAX_S * 1e9
         self.is_done |= is_late or self._scans > _MAX_SCANS
+
+    def _travel_of(self, scan: Scan) -> _Travel:
+        """Of the sensor of ``scan``; a planar one whose plane stands on edge by its transform is taken as level."""
+        frame = scan.frame_id
+        mount = self._mounts.get(frame)
+        if frame not in self._travels and mount is not None and scan.is_planar and abs(mount.rotation[2, 2]) < _MIN_LEVEL:
+            self._mounts = {**self._mounts, frame: Mount(mount.x, mount.y, mount.z)}
+            self._on_edge.add(frame)
+        return self._travels[frame]
 
     def _add_wheels(self, sample: WheelSample) -> None:
         if self._wheels and self._moving_ns is None:
@@ -143,7 +155,7 @@ class LidarCheck:
 
     def result(self) -> LidarFinding | None:
         """What was found so far; None where the mount agrees, or the drive does not show it."""
-        found = (self._judge(frame) for frame in list(self._travels) if frame in self._mounts)
+        found = (self._judge_level(frame) for frame in list(self._travels) if frame in self._mounts)
         return next((one for one in found if one is not None), None)
 
     def _is_healthy(self, frame: str) -> bool:
@@ -196,6 +208,20 @@ class LidarCheck:
                 by_wheels.append(forward * np.exp(0.5j * turn) + lever)
                 by_scans.append(complex(delta[0], delta[1]) + lever)
         return np.array(by_wheels), np.array(by_scans), np.array(turns).reshape(-1, 2)
+
+    def _judge_level(self, frame: str) -> LidarFinding | None:
+        found = self._judge(frame)
+        if frame not in self._on_edge:
+            return found
+        mount = self._mounts[frame] if found is None or found.mount is None else found.mount
+        text = (
+            f"{self._topic}: by the transform of '{frame}' its plane stands on edge, as of an optical frame (z ahead) or a mount with wrong"
+            f" roll or pitch; it is taken as level. Corrected in this run; write roll = {mount.roll:.4f}, pitch = {mount.pitch:.4f}, yaw ="
+            f" {mount.yaw:.4f} rad in /tf_static, or in [mounts.{frame}] where the log has none."
+        )
+        if found is None:
+            return LidarFinding(text, frame, mount)  # the travel may still show a yaw
+        return replace(found, text=text, mount=mount)
 
     def _judge(self, frame: str) -> LidarFinding | None:
         mount, by_turns = self._mounts[frame], self._by_turns(frame)

@@ -48,6 +48,8 @@ _SAME_SCALE = 0.15
 scan to scan errs by some percent."""
 _MIN_SCALE_INTERVALS, _MIN_LIKENESS = 12, 0.97
 """Intervals of 0.5 s, and cosine between the ways, from which on a scale is measured: of scans that slide along a corridor it is lower."""
+_LEAST_CORRELATION = 0.6
+"""Below, a source contradicts the wheels, as in `wheel_wiring`."""
 _MAX_YAW_DEG = 5.0
 """Largest yaw of a LiDAR against the direction of travel [deg]; robots slide by a few degrees."""
 _MAX_TILT_RAD = math.radians(10.0)
@@ -213,7 +215,10 @@ def _stamp_rows(info: LogInfo) -> list[CheckRow]:
             )
         silent = sum(gap.duration_s for gap in topic.gaps)
         if silent > _MAX_ODD_SHARE * info.duration_s:
-            wrong.append(f"{topic.topic}: {len(topic.gaps)} gaps of {silent:.1f} s in all: check cables, CPU load and the recorder.")
+            wrong.append(
+                f"{topic.topic}: {len(topic.gaps)} gaps of {silent:.1f} s in all: check cables, CPU load and the recorder, or whether"
+                " the clock was set."
+            )
     if not wrong:
         return [CheckRow("stamps", "even", "time of recording", "ok")]
     return [CheckRow("stamps", text.split(":")[0], "time of recording", "contradiction", text) for text in dict.fromkeys(wrong)]
@@ -254,13 +259,18 @@ def _wiring_rows(wiring: WiringReport, by_lidar: Mapping[str, float]) -> list[Ch
     ]
     if rows:
         return rows
-    found = [
-        CheckRow("signs and sides", "as in the robot file", f"{name}: correlation {value:+.2f}", "ok" if value > 0.6 else "contradiction")
-        for name, value in {**by_lidar, **wiring.correlations}.items()
-    ]
+    found = [_sign_row(name, value) for name, value in {**by_lidar, **wiring.correlations}.items()]
     found += [CheckRow("units", "as in the robot file", f"{name}: factor {value:.2f}", "ok") for name, value in wiring.ratios.items()]
     missing = CheckRow("signs and sides", "as in the robot file", "", "cannot be seen", f"{_TURN_AND_STRAIGHT}, with gyro or LiDAR.")
     return found or [missing]
+
+
+def _sign_row(name: str, value: float) -> CheckRow:
+    measured = f"{name}: correlation {value:+.2f}"
+    if value > _LEAST_CORRELATION:
+        return CheckRow("signs and sides", "as in the robot file", measured, "ok")
+    advice = "it is another motion than the wheels', and no sign, side or clock explains it: check that sensor's unit and messages."
+    return CheckRow("signs and sides", "as in the robot file", measured, "contradiction", f"{name}: {advice}")
 
 
 def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: LidarMotion | None) -> list[CheckRow]:

@@ -47,6 +47,8 @@ _MAX_UNSHIFTED = 0.85
 """Correlation without an offset below which one is searched: whole drives of healthy logs have 0.95 and more."""
 _MIN_TURN_PART = 1e-3
 """Least root mean square of the sides' difference, of the largest of all wirings'."""
+_FASTEST_M_S = 20.0
+"""Of an odometry in metres."""
 _MIN_AHEAD_M, _MIN_TURNED_RAD, _SAME_END = 0.1, 1.5, 0.25
 """LiDAR ahead of the middle or behind it [m], turns in all, and share of the sideways motion of the other end, that decide at which end it
 is: robots turn about a point up to 5 cm from the middle of their wheels."""
@@ -313,6 +315,13 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's, after their clocks."""
     assert log.sources.wheels is not None
     topic = log.sources.wheels.topic
+    fastest = float(np.nan_to_num(np.nanpercentile(np.abs(signals.speeds[topic]), 95.0))) if topic in signals.speeds else 0.0
+    if fastest > _FASTEST_M_S:
+        text = (
+            f"{topic}: its speeds reach {fastest:.0f} m/s, as no such robot's: its driver has another unit than metres (millimetres?), and"
+            " what wheels cannot reach is left out. Let it publish metres and metres per second."
+        )
+        return WiringReport(_with_unknown_signs(log.robot), (text,))
     gyro, turn = signals.turns.get("gyro"), signals.turns.get(topic)
     if gyro is None or turn is None or not signals.is_gyro_upright:
         return WiringReport(log.robot)

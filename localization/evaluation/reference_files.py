@@ -186,7 +186,7 @@ def _has_commas(path: Path) -> bool:
 
 
 def _words(line: str) -> list[str]:
-    parts = re.split(r"[,;]", line) if re.search("[,;]", line) else line.split()
+    parts = line.replace(",", ".").split(";") if ";" in line else line.split("," if "," in line else None)  # beside ; commas are decimal
     found = [part.strip().strip('"') for part in parts]
     return found[:-1] if found and not found[-1] else found
 

@@ -13,6 +13,8 @@ from localization.logs.reader import Log
 from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
 
 _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
+_MAX_LATCHED, _LATCHED_S = 5, 1.0
+"""Old messages with which a topic begins, and least time by which they are older [s], as where clocks are compared (`clock_sync`)."""
 _GAP_PERIODS, _MIN_GAP_S, _MAX_GAPS = 5.0, 0.25, 10
 _PERIOD_MESSAGES = 200
 _MAX_CLOCK_OFFSET_S = 10.0
@@ -105,7 +107,10 @@ class _StampStats:
         self.backward += stamp < self.last
         self.last = stamp
         step = stamp - self._newest
-        if step > 0:
+        if self.count <= _MAX_LATCHED + 1 and step - (log_ns - self._first_log) > _LATCHED_S * 1e9:
+            self.first, self._longest, self._periods = stamp, [], []  # what came before was latched, and is dropped
+            self._newest = stamp
+        elif step > 0:
             if len(self._periods) < _PERIOD_MESSAGES:
                 self._periods.append(step)
             (heapq.heappush if len(self._longest) < _MAX_GAPS else heapq.heappushpop)(self._longest, (step, self._newest))

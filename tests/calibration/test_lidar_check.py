@@ -18,6 +18,7 @@ from localization.logs import Log, open_log
 from localization.pipeline import Trial
 from motion_models import se2
 from motion_models.registry import make_model
+from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
 from tests.helpers.entrance_drives import Publishing, Vehicle, drive, write
 from tests.helpers.extended import cases
@@ -59,6 +60,20 @@ def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
     found = check_lidar(turned(opened(), degrees))
     assert found is not None
     assert found.mount is not None
+    assert math.remainder(found.mount.yaw - math.pi, math.tau) == pytest.approx(0.0, abs=math.radians(2.5))
+
+
+def test_lidar_whose_plane_stands_on_edge_is_taken_as_level() -> None:
+    """A planar scan in an optical frame, whose z axis is ahead; its yaw, then zero, is wrong as well."""
+    log = opened()
+    mount = log.mounts["laser"]
+    upright = Mount(mount.x, mount.y, mount.z, -math.pi / 2, 0.0, -math.pi / 2)
+    log.__dict__["mounts"] = {**log.mounts, "laser": upright}
+    found = check_lidar(log)
+    assert found is not None
+    assert found.mount is not None
+    assert "stands on edge" in found.text
+    assert (found.mount.roll, found.mount.pitch) == (0.0, 0.0)
     assert math.remainder(found.mount.yaw - math.pi, math.tau) == pytest.approx(0.0, abs=math.radians(2.5))
 
 

@@ -13,6 +13,8 @@ from localization.calibration.wheel_wiring import WiringReport, check_wiring, op
 from localization.events import WheelSample
 from localization.logs import open_log
 from motion_models.robot_file import load_robot, robot_toml
+from tests.helpers import bags
+from tests.helpers.bags import START, S
 from tests.helpers.wiring import CASES, ROBOT_TOML, Change, drive
 
 ROBOT = load_robot(ROBOT_TOML)
@@ -104,3 +106,13 @@ def test_driver_odometry_opposite_to_the_gyro_blames_none(tmp_path: Path) -> Non
 def test_units_of_gyro_in_degrees_beside_odometry_are_corrected(tmp_path: Path) -> None:
     report = report_of(drive(tmp_path / "log.mcap", gyro=1.0 / DEG, has_odometry=True, has_joints=False))
     assert report.robot.imu.rate_unit_rad_s == pytest.approx(DEG, rel=1e-4)
+
+
+def test_driver_odometry_in_millimetres_is_named(tmp_path: Path) -> None:
+    records = []
+    for i in range(200):
+        stamp, way = START + i * S // 20, 25.0 * max(i - 40, 0)
+        records.append(("/odom", bags.odometry(stamp, way, 0.0, 0.0, 500.0 if i > 40 else 0.0), stamp))
+    report = report_of(bags.write_mcap(tmp_path / "log.mcap", records))
+    assert "another unit than metres" in report.findings[0]
+    assert report.robot.wheel_noise.longitudinal_m2_per_m > ROBOT.wheel_noise.longitudinal_m2_per_m

@@ -178,6 +178,17 @@ def test_init_with_a_prefix_in_the_urdf_takes_its_sides(tmp_path: Path, capsys: 
     assert "by the sides of the URDF's wheels" in printed
 
 
+def test_init_with_a_controller_of_another_prefix_compares_its_sides(tmp_path: Path) -> None:
+    """In a node of a namespace, below the parameters of all nodes; its sides are not those of the names and the gyro."""
+    own = _CONTROLLER.replace("diff_drive_base_controller", "/j100/velocity_controller").replace('"front', '"j100/front')
+    own = own.replace('"rear', '"j100/rear').replace("left_wheel_names", "x").replace("right_wheel_names", "left_wheel_names")
+    own = own.replace("x:", "right_wheel_names:")
+    (tmp_path / "control.yaml").write_text("/**:\n  ros__parameters: {use_sim_time: false}" + own)
+    robot = init(tmp_path, BASE_LOG, "--controller", str(tmp_path / "control.yaml"), "--wheelbase-m", "0.5")
+    assert robot.geometry.track_width_m == 0.57
+    assert "left wheels = front_right_wheel, rear_right_wheel (by control.yaml" in (tmp_path / "r.toml").read_text()
+
+
 def test_init_of_a_urdf_with_an_axle_in_place_of_two_asks_for_the_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vehicle = Vehicle(left=("left_wheel",), right=("right_wheel",))
     (tmp_path / "robot.urdf").write_text(urdf_of(vehicle, ("left_wheel", "right_wheel")))

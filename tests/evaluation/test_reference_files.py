@@ -91,6 +91,11 @@ def test_reference_csv_is_read_by_names_of_columns(tmp_path, head, row):
     _check(_track(tmp_path / "a.csv", [head, *rows]))
 
 
+def test_reference_csv_of_semicolons_has_decimal_commas(tmp_path):
+    rows = [f"{t / 1e9:.3f};{x};{y};{a}".replace(".", ",") for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    _check(_track(tmp_path / "a.csv", ["time;x;y;yaw", *rows]))
+
+
 def test_reference_with_y_as_height_takes_the_plane_of_z_and_x(tmp_path):
     rows = [f"{t / 1e9:.1f} {y} 0.8 {x} 0 {math.sin(a / 2)} 0 {math.cos(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
     found = _track(tmp_path / "mocap.tum", rows)

@@ -41,6 +41,8 @@ def test_references_latched_first_pose_is_old_and_named() -> None:
     assert len(references) == 114
     assert references[0].stamp_ns - log.start_ns == S // 2
     assert log.warnings()[-1].startswith("/mocap_pose: 1 old message dropped")
+    (topic,) = (topic for topic in inspect_log(log).topics if topic.topic == "/mocap_pose")
+    assert (topic.first_stamp_ns, topic.gaps) == (references[0].stamp_ns, [])
 
 
 COVARIANCE = np.arange(36.0).reshape(6, 6)

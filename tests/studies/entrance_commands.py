@@ -237,10 +237,11 @@ def main(arguments: Sequence[str]) -> None:
     """Judge those that are named, by default all."""
     from tests.studies.entrance_command_cases import CASES
     from tests.studies.entrance_hostile_cases import HOSTILE
+    from tests.studies.entrance_more_cases import MORE
 
     wanted = [a for a in arguments if not a.startswith("-")]
     found = []
-    for case in (c for c in (*HOSTILE, *CASES) if not wanted or any(w == c.kind or w in c.name for w in wanted)):
+    for case in (c for c in (*MORE, *HOSTILE, *CASES) if not wanted or any(w == c.kind or w in c.name for w in wanted)):
         with tempfile.TemporaryDirectory() as folder:
             try:
                 one = case.judge(Path(folder))
