@@ -6,25 +6,20 @@ import bisect
 import math
 import operator
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated
 
 import numpy as np
 
-from localization.attitude import AttitudeFilter, Tilt
+from localization.attitude import AttitudeFilter
 from localization.body_rates import BodyRates
 from localization.bounded_settings import Positive, Settings, at_least
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, Turn, WheelSample, turn_twist
 from localization.gyro import GyroBuffer
 from localization.lidar.frames import LidarFrames
-from localization.wheel_buffer import WheelBuffer
-from motion_models import se2
-from motion_models.base import Motion, MotionModel, Twist
-from motion_models.extended_model import SampleSeries, in_series, needs_series
-from motion_models.friction.slope_effect import SlopeEffect, SlopeMotion
-from motion_models.preintegration import integrate_twists
+from localization.wheel_motion import WheelMotion
+from motion_models.base import MotionModel
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import Cov3, FloatArray, Twist2
 
@@ -59,8 +54,6 @@ class StepConfig(Settings):
 
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 """Upper bounds of the variances of x, y and yaw; yaw: that of a uniform distribution from -pi to pi [rad^2]."""
-_SLOPE_ERROR_S = 5.0
-"""Correlation time of errors of the slope's effect [s]."""
 _MIN_KNOWN_S = 1e-6
 """Least time with wheel data in a step that counts [s]: less than a microsecond is rounding."""
 
@@ -92,6 +85,36 @@ class UnknownVelocity:
         return np.diag(after - before)
 
 
+@dataclass
+class FaultyScans:
+    """Scans that lack something, by what it is."""
+
+    empty: int = 0
+    """Scans without a usable point."""
+    late: int = 0
+    """Scans that came after later ones."""
+    timeless: int = 0
+    """Scans without the times of their points."""
+    has_turned: bool = False
+    """The robot turned in a step with one of these."""
+
+    def warnings(self) -> list[str]:
+        """A sentence each."""
+        found = []
+        if self.empty:
+            scans = f"{self.empty} scan{'s' * (self.empty > 1)}"
+            found.append(f"{scans} without a usable point: the pose is by wheels and gyro there.")
+        if self.late:
+            found.append(f"{self.late} scan{'s' * (self.late > 1)} came after later ones and could not be used.")
+        if self.has_turned:
+            found.append(
+                f"{self.timeless} scan{'s' * (self.timeless > 1)} without the times of their points, taken as measured at one "
+                "instant: if the scanner sweeps, turns distort them. Let its driver publish the times (time_increment of a scan, a "
+                "field of a cloud)."
+            )
+        return found
+
+
 class Synchronizer:
     """Cuts a stream of events into steps: `insert` an event, then take each `next_interval` and `preintegrate` it.
 
@@ -99,31 +122,28 @@ class Synchronizer:
     """
 
     def __init__(self, model: MotionModel, robot: Robot, mounts: Mapping[str, Mount], has_lidar: bool, config: StepConfig | None = None):
-        self.config = config or StepConfig()
-        self.model, self._wheel_noise, self._needs_series = model, robot.wheel_noise, needs_series(model)
-        self.params = model.nominal
-        self._wheels = WheelBuffer(robot.center_of_gravity)
+        self.config = c = config or StepConfig()
+        has_slopes = c.slopes and model.traits.is_level
+        unknown = np.array([c.lost_speed_m_s, c.lost_speed_m_s, c.lost_rate_rad_s])
+        self.wheels = WheelMotion(model, robot, c.max_hold_s, unknown, has_slopes)
+        """Wheel samples, and the motion model."""
         self._gyro = GyroBuffer(robot.gyro_noise, mounts)
         self.attitude: AttitudeFilter | None = None
         """The vertical; None for models of robots that do not skid, and where `StepConfig.slopes` is off."""
-        has_slopes = self.config.slopes and model.traits.is_level
-        self._slope_effect = SlopeEffect.from_robot(robot) if has_slopes else None
         self._imu = robot.gyro_noise, mounts, robot.geometry.wheel_radius_m  # of which attitude and body rates are made
         self._body_rates: BodyRates | None = None
         if has_slopes:
             self._measure_attitude()
-        if self.config.planar is False:
+        if c.planar is False:
             self.measure_in_space()
         self.frames = LidarFrames(mounts)
         """Frames of the scans, with their mounts."""
         self._has_lidar = has_lidar
         self._scans: deque[tuple[int, Scan]] = deque()  # and the middle of its sweep
-        self._empty_scans, self._late_scans, self._no_wheel_data_s = 0, 0, 0.0
-        self._velocity = UnknownVelocity(self.config)  # in gaps of the wheel data
-        self._wait_ns, self._max_step_ns = _ns(self.config.wait_s), _ns(self.config.max_step_s)
-        self._timeless, self._has_turned = 0, False  # scans without the times of their points, and whether the robot turned at one
+        self._faulty, self._no_wheel_data_s = FaultyScans(), 0.0
+        self._velocity = UnknownVelocity(c)  # in gaps of the wheel data
+        self._wait_ns, self._max_step_ns = _ns(c.wait_s), _ns(c.max_step_s)
         self._start_ns: int | None = None
-        self._first_wheel_ns: int | None = None
         self._now_ns = -(1 << 62)
         self._clock_offset_ns = 0
 
@@ -133,7 +153,7 @@ class Synchronizer:
         ``clock_offset_s``: the wheels' stamps are late by this much [s]; what happened at t is stamped t + offset.
         """
         if params is not None:
-            self.params = params
+            self.wheels.params = params
         self._clock_offset_ns = _ns(clock_offset_s)
 
     def measure_in_space(self) -> None:
@@ -154,9 +174,7 @@ class Synchronizer:
         """Store ``event`` in the buffer of its sensor."""
         self._now_ns = max(self._now_ns, event.stamp_ns)
         if isinstance(event, WheelSample):
-            self._wheels.insert(event)
-            if self._first_wheel_ns is None:
-                self._first_wheel_ns = event.stamp_ns
+            self.wheels.buffer.insert(event)
             if self._start_ns is None and not self._has_lidar:
                 self._start_ns = event.stamp_ns
         elif isinstance(event, ImuSample):
@@ -166,9 +184,9 @@ class Synchronizer:
             if self._body_rates is not None:
                 self._body_rates.insert(event)
         elif isinstance(event, CgSample):
-            self._wheels.set_cg(event)
+            self.wheels.buffer.set_cg(event)
         elif isinstance(event, Scan) and self.frames.admit(event):
-            self._empty_scans += not len(event.points)
+            self._faulty.empty += not len(event.points)
             middle_ns = event.middle_ns
             # one that was overtaken goes where it belongs, if that still waits
             self._scans.insert(bisect.bisect_right(self._scans, middle_ns, key=operator.itemgetter(0)), (middle_ns, event))
@@ -180,7 +198,7 @@ class Synchronizer:
     @property
     def stored_samples(self) -> int:
         """Samples of wheels and gyro, and scans, that are stored; bounded."""
-        return len(self._wheels) + len(self._gyro) + len(self._scans)
+        return len(self.wheels.buffer) + len(self._gyro) + len(self._scans)
 
     @property
     def is_waiting(self) -> bool:
@@ -192,17 +210,7 @@ class Synchronizer:
         found = self._gyro.warnings()
         if self.attitude is not None:
             found += self.attitude.warnings()
-        if self._empty_scans:
-            scans = f"{self._empty_scans} scan{'s' * (self._empty_scans > 1)}"
-            found.append(f"{scans} without a usable point: the pose is by wheels and gyro there.")
-        if self._late_scans:
-            found.append(f"{self._late_scans} scan{'s' * (self._late_scans > 1)} came after later ones and could not be used.")
-        if self._has_turned:
-            found.append(
-                f"{self._timeless} scan{'s' * (self._timeless > 1)} without the times of their points, taken as measured at one "
-                "instant: if the scanner sweeps, turns distort them. Let its driver publish the times (time_increment of a scan, a "
-                "field of a cloud)."
-            )
+        found += self._faulty.warnings()
         if self._no_wheel_data_s >= _MIN_REPORTED_S:
             found.append(f"no wheel data for {self._no_wheel_data_s:.1f} s in all: motion there is predicted with a wide covariance.")
         return [*found, *self.frames.warnings()]
@@ -215,7 +223,7 @@ class Synchronizer:
             if end_ns >= start_ns:
                 self._start_ns = end_ns
                 return StepInterval(start_ns, end_ns, scan)
-            self._late_scans += 1  # going back would count the motion since then twice
+            self._faulty.late += 1  # going back would count the motion since then twice
         return None
 
     def _next_end(self, is_last: bool) -> tuple[int, Scan | None] | None:
@@ -224,11 +232,12 @@ class Synchronizer:
             middle_ns, _ = self._scans[0]
             is_late = self._now_ns > middle_ns + self._wait_ns
             return self._scans.popleft() if is_last or is_late or self._has_rates_until(middle_ns) else None
-        if self._start_ns is None and self._first_wheel_ns is not None and (is_last or self._now_ns > self._first_wheel_ns + _SCAN_WAIT_NS):
-            self._start_ns = self._first_wheel_ns
-        if self._start_ns is None or self._wheels.newest_ns is None:
+        first_ns, newest_ns = self.wheels.buffer.first_ns, self.wheels.buffer.newest_ns
+        if self._start_ns is None and first_ns is not None and (is_last or self._now_ns > first_ns + _SCAN_WAIT_NS):
+            self._start_ns = first_ns
+        if self._start_ns is None or newest_ns is None:
             return None
-        end_ns = self._wheels.newest_ns - self._clock_offset_ns
+        end_ns = newest_ns - self._clock_offset_ns
         if self._has_lidar:
             end_ns = min(end_ns, self._now_ns)  # wheels stamped too early must not overtake a scan that is still to come
             least_ns = self._max_step_ns + (0 if is_last else self._wait_ns)
@@ -243,7 +252,7 @@ class Synchronizer:
     def _has_rates_until(self, stamp_ns: int) -> bool:
         """Whether the rates of the wheels, and of a gyro that is not silent, are known until ``stamp_ns``: which of them comes first must
         not matter."""
-        known_ns, gyro_ns = self._wheels.rates_known_until_ns, self._gyro.newest_ns
+        known_ns, gyro_ns = self.wheels.buffer.rates_known_until_ns, self._gyro.newest_ns
         is_gyro_known = gyro_ns is None or gyro_ns >= stamp_ns or self._now_ns > gyro_ns + self._wait_ns
         return is_gyro_known and known_ns is not None and known_ns >= stamp_ns + self._clock_offset_ns
 
@@ -251,12 +260,11 @@ class Synchronizer:
         """The wheels' motion, the gyro's turn and the scan of ``interval``."""
         start_ns, end_ns, scan = interval
         shift = self._clock_offset_ns
-        dt, rates, cg, missing = self._wheels.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
+        dt, rates, cg, missing = self.wheels.buffer.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
         tilt = None if self.attitude is None else self.attitude.advance(end_ns, dt, rates)
-        motion, d_clock, last = self._integrate(start_ns + shift, dt, rates, cg, tilt)
+        motion, d_clock, last = self.wheels.integrate(start_ns + shift, dt, rates, cg, tilt)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
-            rates, cg = self._wheels.at(end_ns + shift, self.config.max_hold_s)
-            last = self.model.twist(rates, cg, self.params).value.sum(axis=0)
+            rates, last = self.wheels.twist_at(end_ns + shift)
         is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
         turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
@@ -266,61 +274,16 @@ class Synchronizer:
         if missing < (end_ns - start_ns) * 1e-9 - _MIN_KNOWN_S:  # wheels measured the velocity in this step
             self._velocity.lasted_s = missing
         if scan is not None and len(scan.points) and not len(scan.offsets):
-            self._timeless += 1
-            self._has_turned |= bool(motion.delta[2])
+            self._faulty.timeless += 1
+            self._faulty.has_turned |= bool(motion.delta[2])
         if has_wheels:
             self._velocity.measured = last
         twist = last if has_wheels else turn_twist(turn)
         body_turn, gravity = None, None
         if self._body_rates is not None and self.attitude is not None:
             body_turn, gravity = self._body_rates.turn(start_ns, end_ns), self.attitude.gravity
-        return Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, self._wheels.cg_cov, body_turn, gravity)
-
-    def _integrate(
-        self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt | None
-    ) -> tuple[Motion, FloatArray, FloatArray]:
-        """Motion of the wheels over the intervals, its derivative by the wheels' clock (3,), and the twist (3,) at the end.
-
-        A window that is late by c has motion exp(-c twist_before) delta exp(c twist_end): the derivative is the twist just before the end
-        less that just before the start, expressed in the body frame at the end. It is not zero where each window has one wheel sample.
-        """
-        if not len(dt):
-            return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
-        before, before_cg = self._wheels.at(start_ns - 1, self.config.max_hold_s)
-        n = len(before)
-        rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
-        model = self.model
-        if self._needs_series:
-            since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self._first_wheel_ns or start_ns)) * 1e-9
-            model = in_series(model, SampleSeries(np.r_[np.zeros(n), dt], since))
-        if tilt is None or self._slope_effect is None:
-            twist = model.twist(rates, cg, self.params)
-            inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
-            motion = integrate_twists(dt, inside, self._wheel_noise)
-        else:
-            warp = self._slope_effect.warp_of(tilt.twist), self._slope_effect.warp_of(tilt.twist_sigma)
-            found = partial(self._slope_effect.twist, model, rates, cg, self.params, warp=warp)
-            twist, motion = self._integrate_on_slope(found, dt, n, tilt)
-        first, last = twist.value[0], twist.value[-1]
-        return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
-
-    def _integrate_on_slope(self, effect: Callable[[FloatArray], SlopeMotion], dt: FloatArray, m: int, tilt: Tilt) -> tuple[Twist, Motion]:
-        """Twists by ``effect`` at ``m`` samples before and n in the step, and the motion over its intervals ``dt`` (n,), with what is
-        uncertain about the slope and the load on the diagonals in its covariance."""
-        whole, k = float(dt.sum()), len(self.params)
-        downhill = np.vstack([np.tile(tilt.before, (m, 1)), tilt.at((np.cumsum(dt) - 0.5 * dt) / whole)])
-        found = effect(downhill)
-        twist = found.twist
-        by = np.concatenate([twist.d_params, found.d_downhill, found.by_warp], axis=-1)
-        motion = integrate_twists(dt, Twist(twist.value[m:], twist.d_wheels[m:], twist.d_cg[m:], by[m:]), self._wheel_noise)
-        D, B = motion.d_params[:, k : k + 2], motion.d_params[:, k + 2 :]
-        cov = motion.cov + max(1.0, _SLOPE_ERROR_S / whole) * (D @ tilt.cov @ D.T + B @ B.T)
-        limited_s = float(dt[found.limited[m:]].sum())
-        if limited_s:  # tipping or sliding by itself: no wheel shows the motion
-            c = self.config
-            unknown = np.array([c.lost_speed_m_s, c.lost_speed_m_s, c.lost_rate_rad_s]) ** 2
-            cov = cov + np.diag(unknown) * limited_s * max(1.0, limited_s)
-        return twist, Motion(motion.delta, cov, motion.d_params[:, :k], motion.d_cg)
+        cg_cov = self.wheels.buffer.cg_cov
+        return Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, cg_cov, body_turn, gravity)
 
 
 def _ns(seconds: float) -> int:

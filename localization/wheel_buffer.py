@@ -37,11 +37,14 @@ class WheelBuffer:
     """
 
     def __init__(self, cg: FloatArray, keep_s: float = 10.0) -> None:
-        self._cg = cg
+        self.cg = cg
+        """(2,) CG of the samples to come [m]."""
         self.cg_cov: FloatArray = np.zeros((2, 2))
         """(2, 2) covariance of the CG [m^2]."""
         self._keep_ns = int(keep_s / _NS)
         self._last: WheelSample | None = None
+        self.first_ns: int | None = None
+        """Stamp of the first sample; None before that."""
         self.newest_ns: int | None = None
         """Stamp of the newest sample; None before the first."""
         self.rates_known_until_ns: int | None = None
@@ -55,10 +58,11 @@ class WheelBuffer:
 
     def set_cg(self, sample: CgSample) -> None:
         """Set the CG of the samples to come."""
-        self._cg, self.cg_cov = sample.position, sample.covariance
+        self.cg, self.cg_cov = sample.position, sample.covariance
 
     def insert(self, sample: WheelSample) -> None:
         """Store the next sample. One that does not come after the newest, or has no number for a side, changes nothing."""
+        self.first_ns = sample.stamp_ns if self.first_ns is None else self.first_ns
         # plain numbers: numpy takes five times as long on two of them, and this is done for every message of the wheels
         (p_left, p_right), (v_left, v_right) = sample.position.tolist(), sample.velocity.tolist()
         if not ((isfinite(p_left) or isfinite(v_left)) and (isfinite(p_right) or isfinite(v_right))):
@@ -80,7 +84,7 @@ class WheelBuffer:
             return
         self._ends.append(sample.stamp_ns)
         self.rates_known_until_ns = sample.stamp_ns
-        x, y = self._cg.tolist()
+        x, y = self.cg.tolist()
         self._intervals.append(WheelInterval(last.stamp_ns, left, right, x, y, has_angles))
         if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)

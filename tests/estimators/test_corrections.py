@@ -157,11 +157,11 @@ def test_corrections_of_missing_parameter_are_refused():
 
 def test_pipeline_gives_synchronizer_the_filters_parameters():
     pipeline = Pipeline(Trial(make_model("friction", ROBOT), "ekf", OFFSET), ROBOT, {}, True)
-    assert isinstance(pipeline.synchronizer.model, CorrectedFriction)
-    np.testing.assert_array_equal(pipeline.synchronizer.params, pipeline.estimator.params)
+    assert isinstance(pipeline.synchronizer.wheels.model, CorrectedFriction)
+    np.testing.assert_array_equal(pipeline.synchronizer.wheels.params, pipeline.estimator.params)
     assert set(OFFSET.split("+")) <= set(pipeline.estimator.parameters())
     plain = Pipeline(Trial(make_model("friction", ROBOT), "ekf", "none"), ROBOT, {}, True)
-    assert isinstance(plain.synchronizer.model, FrictionModel)
+    assert isinstance(plain.synchronizer.wheels.model, FrictionModel)
 
 
 # --- learned where the motion shows it

@@ -189,9 +189,9 @@ def test_graph_corrections_hold_for_next_prediction() -> None:
     names = pipeline.estimator.odometry.corrections.names
     learned = pipeline.estimator.graph.corrections()[0][: len(names)]
     assert np.abs(learned).min() > 0.0
-    assert pipeline.synchronizer.params == pytest.approx(pipeline.estimator.params)
+    assert pipeline.synchronizer.wheels.params == pytest.approx(pipeline.estimator.params)
     nominal = make_model("diff_drive", rooms.ROBOT).nominal
-    assert not np.allclose(pipeline.synchronizer.params, nominal)
+    assert not np.allclose(pipeline.synchronizer.wheels.params, nominal)
 
 
 def test_graph_predicts_with_the_corrections_that_its_filter_has() -> None:
@@ -200,7 +200,7 @@ def test_graph_predicts_with_the_corrections_that_its_filter_has() -> None:
     estimator, step = pipeline.estimator, pipeline.estimator.odometry.step
 
     def record(given):
-        used.append((pipeline.synchronizer.params, estimator.odometry.params))
+        used.append((pipeline.synchronizer.wheels.params, estimator.odometry.params))
         return step(given)
 
     estimator.odometry.step = record

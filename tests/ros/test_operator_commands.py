@@ -165,7 +165,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     assert "/skidloc/payload: 20 kg at 'left_gripper'" in reports
     alone, loaded = node.payloads._unloaded.position, node.payloads.sample(0).position
     assert np.hypot(*(loaded - alone)) > 0.01
-    assert node.session.pipeline.synchronizer._wheels._cg == pytest.approx(loaded)
+    assert node.session.pipeline.synchronizer.wheels.buffer.cg == pytest.approx(loaded)
     node._publish_status()
     (status,) = [s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: payload"]
     assert status.message == "20 kg at 'left_gripper'"
@@ -181,7 +181,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     assert any("resumed from" in text for text in reports)
     assert any("no payload is set" in text for text in reports)
     assert node.payloads.loads == {}
-    assert node.session.pipeline.synchronizer._wheels._cg == pytest.approx(node.payloads._unloaded.position)
+    assert node.session.pipeline.synchronizer.wheels.buffer.cg == pytest.approx(node.payloads._unloaded.position)
 
 
 def test_payload_with_wrong_content_is_ignored_with_a_reason():
