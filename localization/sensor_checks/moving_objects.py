@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -140,7 +141,7 @@ class MovingObjects:
         if scan is None or not scan.is_planar or not step.has_wheels:
             return step
         lidar = self._lidars[scan.frame_id] = self._lidars.get(scan.frame_id) or _Lidar()
-        if lidar.standing is not None and not self._is_near(lidar.standing):
+        if lidar.standing is not None and not _compare_motions(lidar.standing.poses, self._poses)[0]:
             lidar.standing = None
         is_due = scan is self._window.registered
         if not (is_due or lidar.is_active):
@@ -186,19 +187,19 @@ class MovingObjects:
             self._since = self._poses
         inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
         inflation.possible = None
-        begin = self._suspected
-        if self._since is not None:
+        begin = self._suspected if view is None or self._suspected is not None else view.poses
+        if self._since is not None or begin is None:
             return
-        if begin is None and view is not None and (self._is_unsure or self._is_near(view)):
-            begin = view.poses
-        if begin is not None:
-            is_off = self._is_unsure or (nis is not None and nis > MAX_NIS) or _compare_motions(begin, self._poses)[2] > _MIN_OFF_M
-            inflation.possible = self._distance(begin) if is_off else None
+        is_near, distance = _compare_motions(begin, self._poses)
+        is_off = distance > _MIN_OFF_M or (nis is not None and nis > MAX_NIS)
+        if self._is_unsure or (is_near and is_off):
+            inflation.possible = self._distance(begin)
 
     def is_off(self) -> bool:
         """Whether the estimate is off the motion by the wheels since the oldest view that a scan would be compared with."""
-        oldest = (next((view for view in lidar.views if self._is_near(view)), None) for lidar in self._lidars.values())
-        return any(view is not None and _compare_motions(view.poses, self._poses)[2] > _MIN_OFF_M for view in oldest)
+        now = self._poses
+        distances = [_distance_since_oldest(lidar.views, now) for lidar in self._lidars.values()]
+        return max(distances, default=0.0) > _MIN_OFF_M
 
     def _distance(self, since: FloatArray) -> FloatArray:
         """(3,) of the motion by the wheels since the poses ``since`` (2, 3) from that by the estimate."""
@@ -238,16 +239,12 @@ class MovingObjects:
 
     def _references(self, lidar: _Lidar) -> list[_View]:
         """The oldest view from which wheels and estimate have hardly moved, and the middle one of those after it."""
-        if lidar.standing is not None and not lidar.is_active and self._is_near(lidar.standing):
+        views, now = lidar.views, self._poses
+        if lidar.standing is not None and not lidar.is_active and _compare_motions(lidar.standing.poses, now)[0]:
             return [lidar.standing]
-        views = lidar.views
-        while views and not self._is_near(views[0]):
+        while views and not _compare_motions(views[0].poses, now)[0]:
             views.popleft()
         return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
-
-    def _is_near(self, view: _View) -> bool:
-        way, turn, _ = _compare_motions(view.poses, self._poses)
-        return way < _MAX_WAY_M and turn < _MAX_TURN_RAD
 
     def _label(self, view: _View, profile: Profile, points: Points2, least_moved: float = 0.0) -> _Comparison:
         """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``; ``least_moved`` as of `explain`."""
@@ -260,7 +257,7 @@ class MovingObjects:
         """Whether objects move now."""
         self._compared = found.view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        _, _, distance = _compare_motions(found.view.poses, self._poses)
+        _, distance = _compare_motions(found.view.poses, self._poses)
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active
@@ -350,14 +347,24 @@ class _Comparison:
 
 
 @kernel
-def _compare_motions(since: FloatArray, now: FloatArray) -> tuple[float, float, float]:
-    """The longer way and the larger turn by wheels and estimate between the poses ``since`` and ``now``, (2, 3) of both, and the distance
-    of the motion by the estimate from that by the wheels [m, rad, m]."""
+def _compare_motions(since: FloatArray, now: FloatArray) -> tuple[bool, float]:
+    """Whether a scan at the poses ``now`` by wheels and estimate, (2, 3), is compared with one at ``since``, for both are near; and the
+    distance of the motion by the estimate from that by the wheels [m]."""
     by_wheels = se2.scalar_between(triple(since[0]), triple(now[0]))
     by_estimate = se2.scalar_between(triple(since[1]), triple(now[1]))
     off = se2.scalar_log(se2.scalar_between(by_estimate, by_wheels))
     way = max(math.hypot(by_wheels[0], by_wheels[1]), math.hypot(by_estimate[0], by_estimate[1]))
-    return way, max(abs(by_wheels[2]), abs(by_estimate[2])), math.hypot(off[0], off[1])
+    turn = max(abs(by_wheels[2]), abs(by_estimate[2]))
+    return way < _MAX_WAY_M and turn < _MAX_TURN_RAD, math.hypot(off[0], off[1])
+
+
+def _distance_since_oldest(views: Iterable[_View], now: FloatArray) -> float:
+    """Of the motion by the estimate from that by the wheels since the oldest of the ``views`` that is near [m]; 0 without one."""
+    for view in views:
+        is_near, distance = _compare_motions(view.poses, now)
+        if is_near:
+            return distance
+    return 0.0
 
 
 def _with_still(step: Step, is_still: BoolArray) -> Step:
