@@ -15,7 +15,7 @@ from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive import drive_of_table, path_of
 from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.findings import MAX_NOISE_OVER_REFERENCE, Attribution, Component, Finding, Trend, Verdict
-from localization.diagnosis.linearization import Linearization, nuisance_part, regression
+from localization.diagnosis.linearization import Linearization, Regression, noise_beside, nuisance_part, regression
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.selection import max_statistic, p_value, price, statistics
 from motion_models import se2
@@ -75,7 +75,9 @@ _TREND_NAMES = (
     *("distance x CG x", "distance x CG y"),
     *("time into the drive", "distance x time into the drive", "turning x time into the drive"),
     *("heading (cosine)", "heading (sine)", "distance x heading (cosine)", "distance x heading (sine)"),
-    *("turning x heading (cosine)", "turning x heading (sine)", "gain in speed", "gain in turning rate"),
+    *("turning x heading (cosine)", "turning x heading (sine)"),
+    *("direction of driving", "direction of turning", "v^3", "wz^3"),
+    *("gain in speed", "gain in turning rate"),
 )
 
 
@@ -90,6 +92,7 @@ def _increments(twist: FloatArray, dt: FloatArray, cg: FloatArray, heading: Floa
         *(v * cg[:, 0], v * cg[:, 1]),
         *(np.full(len(dt), clock), clock * v, clock * w),
         *(c, s, c * v, s * v, c * w, s * w),
+        *(np.sign(v), np.sign(w), v**3, w**3),
     )
     gains = np.diff(v, prepend=v[0]), np.diff(w, prepend=w[0])
     return np.column_stack([*(d * dt for d in density), *gains])
@@ -161,24 +164,30 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
     Where a cause of the catalogue is at work, no shape without a cause fits better but by chance: both are compared by their likelihood
     ratio against the other causes, beyond what so many trends gain by chance and the accuracy of signatures. Distance and turning are not
     compared: causes of the catalogue have these shapes (radii, rotation), so that they are no sign of an unknown effect. In place of
-    several causes a trend is simpler: both pay for their number as in the search for causes.
+    several causes a trend is simpler: both pay for their number as in the search for causes. Both are compared by the noise that is left
+    beside all causes and the trend: noise that contains what a trend would explain hides it.
     """
     trends, names = _trend_columns(predictor, linearization.linear)
-    y = linearization.noise.whiten(linearization.linear).ravel()
-    s = linearization.noise.whiten(np.concatenate([trends, linearization.signatures], axis=-1)).reshape(len(y), -1)
-    z = linearization.noise.whiten(linearization.nuisances).reshape(len(y), -1)
     n, spreads = len(names), linearization.problem.scale
     is_rival = np.array([name not in _SHAPES_OF_CAUSES for _, name in names])
-    problem = regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
+
+    def problem_by(noise: Noise) -> Regression:
+        y = noise.whiten(linearization.linear).ravel()
+        s = noise.whiten(np.concatenate([trends, linearization.signatures], axis=-1)).reshape(len(y), -1)
+        z = noise.whiten(linearization.nuisances).reshape(len(y), -1)
+        return regression(y, s, z, np.r_[np.ones(n), spreads], np.r_[np.zeros(n), spreads * linearization.problem.tolerance])
+
     groups = len({cause.group for cause in linearization.causes})
-    found = []
+    plain, found = problem_by(linearization.noise), []
     for replaced in ([i] for i in chosen) if len(chosen) < 2 else (*([i] for i in chosen), list(chosen)):
         others = tuple(n + j for j in chosen if j not in replaced)
+        best = int(np.argmax(np.where(is_rival, np.abs(statistics(plain, others, list(range(n)))), 0.0)))
+        problem = problem_by(noise_beside(predictor, linearization, trends[..., [best]]))
         score, cov = problem.scores(others, [n + i for i in replaced])
         own = float(score @ np.linalg.solve(cov + 1e-9 * np.eye(len(replaced)), score))
-        t = np.where(is_rival, statistics(problem, others, list(range(n))), 0.0)
-        best = int(np.argmax(np.abs(t)))
-        lead = float(t[best]) ** 2 - own
+        tolerated = float(score @ np.linalg.solve(cov + np.diag(linearization.problem.tolerance[replaced] ** -2.0), score))
+        t = float(statistics(problem, others, [best])[0])
+        lead = t**2 - (own - tolerated)  # beside the trend the causes stay within their tolerance
         if len(replaced) == 1:
             margin = max(_LEAD_LOG_ODDS + 2.0 * math.log(n), _LEAD_SHARE * own)
         else:
@@ -186,7 +195,7 @@ def find_better_trends(predictor: DrivePredictor, linearization: Linearization, 
         if lead > margin:
             names_replaced = " and ".join(dict.fromkeys(linearization.causes[i].id for i in replaced))
             over = math.sqrt(max(lead, 0.0) / len(linearization.rows))
-            found.append(Trend(*names[best], float(t[best]), min(math.exp(-0.5 * lead), 1.0), over, names_replaced, 0.5 * lead))
+            found.append(Trend(*names[best], t, min(math.exp(-0.5 * lead), 1.0), over, names_replaced, 0.5 * lead))
     return tuple(found)
 
 

@@ -69,7 +69,7 @@ _MOST_BY_A_CAUSE = 0.8
 _TWO_SIDED_95 = 1.96
 _COMPONENTS = {"vx": "x", "vy": "y", "wz": "yaw"}
 _VARIABLES_OF_TRENDS = {
-    "v": ("distance", "|v|", "v wz", "v |"),
+    "v": ("distance", "|v|", "v wz", "v |", "v^3", "direction of driving"),
     "wz": ("turning", "wz"),
     "dv": ("gain in speed",),
     "dwz": ("gain in turning",),
