@@ -8,7 +8,6 @@ file that a user gets has the coefficients of all windows.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,13 +68,13 @@ class Extension:
     """Check of its file on the half of the drive that it was not fitted to; None without terms, and where nothing was measured there."""
     effects: tuple[FoundEffect, ...] = ()
     """Effects bound to time, place or sensors, which are not written."""
-    is_lasting: bool = True
-    """Whether the terms hold early and late in the drive."""
+    refusal: str = ""
+    """Why the terms are not written, whatever the half held out shows; empty without a reason."""
 
     @property
     def is_better(self) -> bool:
-        """Whether the terms last, and their file is better on the half held out, beyond its scatter."""
-        return self.is_lasting and self.check is not None and self.check.is_better
+        """Whether nothing refuses the terms, and their file is better on the half held out, beyond its scatter."""
+        return not self.refusal and self.check is not None and self.check.is_better
 
     def describe_effects(self) -> str:
         """The bound effects as sentences; empty without any."""
@@ -92,8 +91,8 @@ class Extension:
         if any("t" in t.term.expression.variables for t in self.terms):
             known += "; t counts from the start of each drive, so that it holds for drives that start as this one did"
         text = f"{', and '.join(parts)} beyond {self.model} ({known}); "
-        if not self.is_lasting:
-            return f"{text}it holds in one half of the drive, early or late, and not in the other, so that it is not written"
+        if self.refusal:
+            return f"{text}{self.refusal}, so that it is not written"
         if self.check is None or not self.is_better:
             return f"{text}on the other half of the drive it improves nothing beyond the noise, so it is not written"
         fallen = [
@@ -178,8 +177,8 @@ def extend(
     kept = {causes[i].id for i in search.kept}
     replaced = tuple(dict.fromkeys(f.cause for f in found.diagnosis.findings if f.cause in {c.id for c in causes} - kept))
     whole, sizes = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))
-    is_lasting = not search.terms or _is_lasting(predictor, search, whole, sizes)
-    extension = Extension(model.name, search.terms, replaced, _check(predictor, search, reader), search.effects, is_lasting)
+    refusal = _refusal(predictor, search, CandidateRobot(whole, sizes, np.ones(len(drive.maneuvers), dtype=bool)))
+    extension = Extension(model.name, search.terms, replaced, _check(predictor, search, reader), search.effects, refusal)
     if not extension.is_better:
         return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
     left = _without(drive, predictor, search.removed) if search.effects else drive
@@ -206,12 +205,27 @@ def _check(predictor: DrivePredictor, search: Search, reader: Reader | None) -> 
     return check_written(predictor, search.state.noise, CandidateRobot(by_half, sizes, held), reader)
 
 
-def _is_lasting(predictor: DrivePredictor, search: Search, whole: CorrectedRobot, sizes: Mapping[Cause, float]) -> bool:
-    """Whether both the first and the second half of the drive show at least half of what the terms by all of its windows change there: what
-    acts in a part of it alone is no law of the motion, and yet terms may describe it by the motions of that part."""
-    is_late = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
-    checks = [check_written(predictor, search.state.noise, CandidateRobot(whole, sizes, part), None) for part in (~is_late, is_late)]
-    return not any(check is not None and check.is_refuted for check in checks)
+_PARTS = 4
+"""Parts of a drive in which terms have to hold."""
+
+
+def _refusal(predictor: DrivePredictor, search: Search, whole: CandidateRobot) -> str:
+    """Why the terms of the robot ``whole``, by all windows, are no law of the motion; empty where the drive does not show that.
+
+    What acts in a part of the drive alone, or differs with time, terms may describe by the motions of that part.
+    """
+    if not search.terms:
+        return ""
+    if not search.has_sides:
+        return (
+            "other terms, which differ from it in turns to the other side, explain this drive as well (drive arcs to both sides, ahead and"
+            " back)"
+        )
+    part = np.arange(len(whole.held)) * _PARTS // len(whole.held)
+    checks = [check_written(predictor, search.state.noise, dataclasses.replace(whole, held=part == k), None) for k in range(_PARTS)]
+    if any(check is not None and check.is_refuted for check in checks):
+        return "its size differs from part to part of the drive by more than a half"
+    return ""
 
 
 def _with_effects(

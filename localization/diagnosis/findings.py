@@ -268,9 +268,9 @@ class HandoverCheck:
 
     @property
     def is_refuted(self) -> bool:
-        """Whether the windows clearly show less than half of what the file changes: with it errors grow."""
+        """Whether the windows clearly show less than half of what the file changes, or half as much again."""
         share, sigma = self.shown
-        return share + _CLEAR_SIGMAS * sigma < 0.5
+        return abs(share - 1.0) - _CLEAR_SIGMAS * sigma > 0.5
 
     def describe(self) -> str:
         """Errors of the half held out before and after, as a sentence without a stop."""

@@ -81,6 +81,8 @@ _MIN_STABILITY = 0.5
 SEARCHED = ("log", "windows")
 """Kinds of drives whose windows have all kinds of motion."""
 _NEWTON_STEPS = 2
+_RIVAL_LOG_ODDS = 7.0
+"""Twice the log-likelihood by which terms have to be better than others in their place: odds of 33."""
 _LEAST_SHARE = 0.02
 """Least share of all that is explained for a term: accuracy of columns, which are those of small terms."""
 
@@ -132,6 +134,8 @@ class Search(NamedTuple):
     """What is bound to time, place or sensors, strongest first."""
     removed: FloatArray
     """(M, 6) what these add to the discrepancies."""
+    has_sides: bool = True
+    """Whether the drive shows what the terms are in mirrored motions; else terms with other signs there explain it as well."""
 
 
 def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[CandidateTerm, ...]:
@@ -312,7 +316,32 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
         previous = terms
         noise = noise_beside(predictor, state, design.columns[..., list(terms)])
     chosen, stability = _supported(design, noise, chosen, f, rng)
-    return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)
+    has_sides = not _has_mirrored_rival(design.problem(noise), prices, limits, chosen, dict(enumerate(candidates, f)))
+    return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(has_sides=has_sides)
+
+
+def _has_mirrored_rival(
+    problem: _Regression, prices: FloatArray, limits: FloatArray, chosen: tuple[int, ...], candidates: Mapping[int, CandidateTerm]
+) -> bool:
+    """Whether for a component whose ``chosen`` terms have one mirror symmetry, as many terms with the other one explain the drive as well.
+
+    Where the robot turned left whenever it drove ahead, and right whenever it drove back, v^2 sign(wz) is v |v|, and what the robot does in
+    other turns is a guess. ``candidates`` are those of the columns that are terms.
+    """
+    symmetry = {i: (c.component, Term(c.component, c.expression, 0.0).is_symmetric) for i, c in candidates.items()}
+    found = {symmetry[i] for i in chosen if i in symmetry}
+    least = min(c.price for c in candidates.values())
+    for component, is_symmetric in found:
+        other = component, not is_symmetric
+        allowed = np.array([i in chosen or symmetry.get(i) == other for i in range(len(prices))])
+        allowed[[i for i in chosen if symmetry.get(i) == (component, is_symmetric)]] = False
+        if other in found:
+            continue
+        start = tuple(i for i in chosen if allowed[i])
+        _, rival = _best_set(problem, np.where(allowed, prices, math.inf), limits, start, len(chosen) + 1)
+        if problem.gain(rival) - least * len(rival) > problem.gain(chosen) - least * len(chosen) - _RIVAL_LOG_ODDS:
+            return True
+    return False
 
 
 def _size_limits(state: Linearization) -> FloatArray:
@@ -431,7 +460,7 @@ def refine(
 def _alike(problem: _Regression, i: int, others: tuple[int, ...], names: list[str], f: int) -> tuple[str, ...]:
     """Names of the candidates that would gain nearly as much as column ``i`` beside the ``others``, best first."""
     gains = problem.gains_beside(others)
-    near = [j for j in np.argsort(-gains) if j >= f and j != i and gains[j] > gains[i] - 7.0]
+    near = [j for j in np.argsort(-gains) if j >= f and j != i and gains[j] > gains[i] - _RIVAL_LOG_ODDS]
     return tuple(names[j - f] for j in near[:3])
 
 
@@ -451,7 +480,7 @@ def _stability(design: _Design, noise: Noise, chosen: tuple[int, ...], rng: np.r
             best = int(np.argmax(gains))
             G = problem.gram
             alike = abs(G[best, i]) / math.sqrt(max(G[best, best] * G[i, i], 1e-18))
-            hits[i] += best == i or alike > _ALIKE or gains[i] > gains[best] - 7.0
+            hits[i] += best == i or alike > _ALIKE or gains[i] > gains[best] - _RIVAL_LOG_ODDS
     return {i: hit / _HALVES for i, hit in hits.items()}
 
 
