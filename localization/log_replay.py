@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,8 @@ class Run:
     corrections: str | None = None
     """Form of the corrections to the motion model, or None where the estimator makes none."""
     filtered: Trajectory | None = None
-    """Filtered poses, as they were estimated at each moment and published live, where ``trajectory`` is smoothed."""
+    """Poses as they are published live, where ``trajectory`` is not: filtered where that is smoothed, and without a LiDAR those that never
+    jump."""
     lidar: LidarLosses | None = None
     """How long the LiDAR was lost; None where no scans were matched to a map."""
     keyframes: KeyframeMap | SpaceMap | None = None
@@ -124,6 +125,7 @@ class _Replay:
 
     def __init__(self, trial: Trial, pipeline: Pipeline) -> None:
         self._trial, self._pipeline, self._table, self._seconds = trial, pipeline, EstimateTable(), 0.0
+        self._continuous = EstimateTable()
         self._attitudes, self._in_space = AttitudeTable(), SpaceTable()
         self._parameters: dict[str, list[tuple[float, float, float]]] = {}
         self._next_ns = 0
@@ -136,6 +138,8 @@ class _Replay:
     def _add(self, estimates: Iterator[Estimate]) -> None:
         for estimate in estimates:
             self._table.add(estimate)
+            if estimate.odometry is not None and estimate.map_T_odom is None:
+                self._continuous.add(replace(estimate, pose=estimate.odometry[0], covariance=estimate.odometry[1]))
             if estimate.stamp_ns >= self._next_ns:
                 self._next_ns = estimate.stamp_ns + _PARAMETERS_EVERY_NS
                 for name, (mean, sigma) in self._pipeline.estimator.parameters().items():
@@ -153,6 +157,7 @@ class _Replay:
         if not len(stamps):
             raise LogError("no two wheel samples or scans span an interval of time. Check the log's length and options of topics.")
         filtered, estimator = trajectory(stamps, table), self._pipeline.estimator
+        continuous = self._continuous.stamps(), self._continuous.rows()
         smoothed = estimator.finish(filtered)
         smoothed = None if smoothed is None else self._pipeline.checks.inflate_trajectory(smoothed)
         attitude, final = self._pipeline.attitude, filtered if smoothed is None else smoothed
@@ -175,7 +180,7 @@ class _Replay:
             self._pipeline.warnings(),
             self._seconds,
             self._trial.corrections if self._trial.estimator in ESTIMATORS_WITH_CORRECTIONS else None,
-            None if smoothed is None else filtered,
+            filtered if smoothed is not None else trajectory(*continuous) if len(continuous[0]) else None,
             self._pipeline.lidar,
             estimator.keyframe_map(),
             estimator.localization(),

@@ -104,6 +104,10 @@ def test_replay_husky_with_gyro_error_is_below_its_odometry(husky):
         assert -0.13 < offset < -0.07
         assert sigma < 0.03
         assert found[model, "ekf"]["parameters"]["gyro_bias_rad_per_s"][1] > 0.0
+        # as a node publishes it: without the corrections of a late gyro bias
+        published = found[model, "ekf"]["moments"]
+        assert found[model, "ekf"]["ate_rmse_m"] < published["ate_rmse_m"] <= 0.5 * found["diff_drive", "odometry"]["ate_rmse_m"]
+        assert published["distance_m"] == pytest.approx(358.0, abs=4.0)  # by GPS; of the corrected poses 380
 
 
 def test_warnings_of_runs_name_all_trials_that_have_them():

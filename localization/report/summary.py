@@ -65,7 +65,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     return [
         *ranking,
         *losses,
-        *_smoothing(best),
+        *_as_published(best),
         *_coverage(best),
         *_consistency(best),
         *_exactness(best, reference),
@@ -204,9 +204,12 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
 
-def _smoothing(best: PlottedRun) -> list[str]:
-    """Error of the filtered poses, where loop closures have smoothed them."""
-    loops, then = best.result.run.counts.get("loops", 0), headline(best.result.filtered)
+def _as_published(best: PlottedRun) -> list[str]:
+    """Error of the poses as they were published, where loop closures have smoothed them, or what is found at rest has corrected them."""
+    run, then = best.result.run, headline(best.result.filtered)
+    loops = run.counts.get("loops", 0)
+    if then is not None and run.lidar is None and run.estimator == "ekf":
+        return [f"That is with what was found later of the gyro; as published while it drove, without jumps, its error was {metres(then)}."]
     if not loops or then is None:
         return []
     places = "a place" if loops == 1 else f"{loops} places"

@@ -66,6 +66,16 @@ def test_summary_names_a_track_reference_with_ate_and_distance():
     assert f"over {results[2].accuracy.distance_m:.1f} m driven" in text
 
 
+def test_summary_of_corrected_poses_says_the_error_of_the_published_ones():
+    """Without a LiDAR, where poses that never jump are published."""
+    corrected = dataclasses.replace(run(noise=0.1), filtered=run(noise=0.4, seed=1).trajectory)
+    results = score([corrected, run(estimator="odometry", noise=0.9)], track())
+    published = f"{results[0].filtered.ate_rmse_m:.3f} m"
+    assert results[0].filtered.ate_rmse_m > 2.0 * results[0].accuracy.ate_rmse_m
+    assert f"as published while it drove, without jumps, its error was {published}" in verdict(results, track())
+    assert "without jumps" not in verdict(score([run(noise=0.1)], track()), track())
+
+
 def test_summary_with_a_wrong_reference_judges_nothing():
     results = [dataclasses.replace(r, contradictions=("its scale is 1000.",)) for r in score([run(noise=0.1), run(noise=0.2)], track())]
     text = verdict(results, track())
