@@ -1,7 +1,8 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [KIND | part of a NAME ...] [-v]` prints kind, name and outcome (of `tests.studies.entrances`);
-with `-v` also the errors of trajectories [m], of wheels alone and of the EKF, with those of the same drive with nothing wrong in brackets.
+`python -m tests.studies.entrance_commands [more | hostile | KIND | part of a NAME ...] [-v]` prints kind, name and outcome (of
+`tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the EKF, with those of the same drive with
+nothing wrong in brackets.
 """
 
 from __future__ import annotations
@@ -240,8 +241,11 @@ def main(arguments: Sequence[str]) -> None:
     from tests.studies.entrance_more_cases import MORE
 
     wanted = [a for a in arguments if not a.startswith("-")]
+    sets = {"more": MORE, "hostile": HOSTILE}
     found = []
-    for case in (c for c in (*MORE, *HOSTILE, *CASES) if not wanted or any(w == c.kind or w in c.name for w in wanted)):
+    for case in (
+        c for c in (*MORE, *HOSTILE, *CASES) if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
+    ):
         with tempfile.TemporaryDirectory() as folder:
             try:
                 one = case.judge(Path(folder))
