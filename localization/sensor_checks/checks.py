@@ -85,9 +85,9 @@ class SensorChecks:
         step = self._compare_sensors(step, is_to_come=True)
         self._reckoning.predict(step)
         step = self._moving.apply(step, is_to_come=True)
-        if self._sweep_times.has_drawn_map:
-            self._sweep_times.has_drawn_map = False
-            step = replace(step, restarts_map=True)  # without the scans that were distorted
+        if self._faults.is_map_wrong:
+            self._faults.is_map_wrong = False
+            step = replace(step, restarts_map=True)  # without the scans that had the fault
         if self._faults.have_scans_led_away:
             self._faults.have_scans_led_away = False
             step = self._inflation.lead_back(step)
@@ -121,7 +121,7 @@ class SensorChecks:
 
     def _has_to_act(self) -> bool:
         """Whether a check changes the next step, or its estimate."""
-        is_led_away = self._sweep_times.has_drawn_map or self._faults.have_scans_led_away
+        is_led_away = self._faults.is_map_wrong or self._faults.have_scans_led_away
         is_step_changed = self._gyro_rate.is_acting or self._contradictions.is_acting or self._moving.is_acting
         return is_led_away or is_step_changed or self._inflation.is_acting
 

@@ -29,6 +29,8 @@ class SensorFault(NamedTuple):
     """Dead reckoning by sensors without this fault: its distance from the estimate inflates the covariance when the fault is found."""
     is_of_scans: bool = False
     """Whether the fault is one of scans, which have moved the estimate: it is then moved back to ``reference``."""
+    draws_map: bool = False
+    """Whether scans with the fault have drawn the map: it begins anew."""
     explains: SensorFault | None = None
     """A fault that is no longer reported where this one is."""
 
@@ -55,6 +57,8 @@ class FaultLog:
         self._start_ns: int | None = None
         self.have_scans_led_away = False
         """A fault of scans was found, and the estimate is where these have led it."""
+        self.is_map_wrong = False
+        """A fault was found with which scans have drawn the map."""
         self._revised: dict[SensorFault, DetectedFault] = {}
 
     def start_step(self, step: Step) -> None:
@@ -71,6 +75,7 @@ class FaultLog:
         if fault.explains is not None:
             self.declared.pop(fault.explains, None)
         self.have_scans_led_away |= fault.is_of_scans
+        self.is_map_wrong |= fault.draws_map
         if fault.reference is not None:
             self.inflation.add_distance_from(fault.reference)
 

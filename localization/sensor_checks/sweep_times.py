@@ -25,6 +25,7 @@ REVERSED_TIMES = SensorFault(
     "as the robot turns, scans are distorted as if their points were measured in the opposite order ({sigmas:.1f} sigma): the sweep goes"
     " the other way than time_increment has it. From now on its sign is reversed; correct it in the LiDAR's driver.",
     reference="wheels and gyro",
+    draws_map=True,
 )
 
 _MIN_RATE_RAD_S = 0.05
@@ -59,8 +60,6 @@ class SweepTimes:
         """The times are likelier right than reversed."""
         self.is_reversed = False
         """The sweep goes the other way than the scans' times have it."""
-        self.has_drawn_map = False
-        """Scans of the submap were distorted: it is to begin anew."""
 
     def compare(self, window: Window) -> None:
         """Take the scan that ended a bin."""
@@ -90,7 +89,7 @@ class SweepTimes:
         self._is_decided = abs(sigmas) > _SIGMAS
         self.are_likely_right = self._is_decided or sigmas > 0.0  # as they are corrected from then on
         if self._is_decided and sigmas < 0.0:
-            self.is_reversed = self.has_drawn_map = True
+            self.is_reversed = True
             self._faults.declare(REVERSED_TIMES, self._faults.now_s, {"sigmas": -sigmas})
 
 
