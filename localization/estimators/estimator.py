@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -44,6 +44,13 @@ class Estimate:
     """``odom_T_body`` of an estimator of poses in space, of which ``pose`` or ``odometry`` is the one seen from above."""
     in_map: Pose3 | None = None
     """``map_T_body`` in a saved map in space, of which ``pose`` is the one seen from above."""
+
+    def widened(self, spread: Cov3) -> Estimate:
+        """With the covariance ``spread`` (3, 3) of the pose besides."""
+        odometry = self.odometry
+        if odometry is not None and odometry[1] is not None:
+            odometry = odometry[0], odometry[1] + spread
+        return replace(self, covariance=None if self.covariance is None else self.covariance + spread, odometry=odometry)
 
 
 class LearnedParameter(NamedTuple):
@@ -94,12 +101,13 @@ class GyroCalibration(NamedTuple):
 
 
 class ClocksApart(NamedTuple):
-    """Offset of the wheels' stamps that no latency explains, where a single other sensor measures it: either clock may be the one that
-    is off."""
+    """Offset of the wheels' stamps against another sensor's: either clock may be the one that is off."""
 
     late_s: float
     """What happened at t is stamped t + late_s by the wheels [s]."""
     other: Literal["gyro", "LiDAR"]
+    is_latency: bool
+    """A driver's latency explains it, or of three sensors nothing shows which clock is off."""
 
 
 class Estimator(ABC):

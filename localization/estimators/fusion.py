@@ -189,10 +189,11 @@ class EkfFusion(Estimator):
     def clocks_apart(self) -> ClocksApart | None:
         """See `Estimator.clocks_apart`."""
         offset, sigma = self.clock_offset_s, math.sqrt(self.state.variance("clock"))
-        has_lidar = self._sensor is not None
-        if self._has_gyro == has_lidar or abs(offset) < max(_MAX_LATENCY_S, OUTLIER_SIGMAS * sigma):
+        if abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
             return None
-        return ClocksApart(offset, "LiDAR" if has_lidar else "gyro")
+        has_lidar = self._sensor is not None
+        is_latency = self._has_gyro == has_lidar or abs(offset) < _MAX_LATENCY_S
+        return ClocksApart(offset, "LiDAR" if has_lidar else "gyro", is_latency)
 
     @property
     def params(self) -> FloatArray:
@@ -265,15 +266,15 @@ class EkfFusion(Estimator):
     def warnings(self) -> list[str]:
         """A long way by wheels alone, and a clock offset that is large and certain; those of two sensors that no latency explains are
         reported by `sensor_checks.clocks`."""
-        offset, sigma = self.clock_offset_s, math.sqrt(self.state.variance("clock"))
-        if self.clocks_apart is not None or abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
+        apart = self.clocks_apart
+        if apart is None or not apart.is_latency:
             return self._open_way.warnings()
         others = "LiDAR" if not self._has_gyro else "gyro" if self._sensor is None else "LiDAR or gyro"
-        direction = "later" if offset > 0.0 else "earlier"
+        direction = "later" if apart.late_s > 0.0 else "earlier"
         return [
             *self._open_way.warnings(),
-            f"the wheels' stamps are {abs(offset):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize the"
-            " clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each.",
+            f"the wheels' stamps are {abs(apart.late_s):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize"
+            " the clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each.",
         ]
 
     def map_points(self) -> Points2:

@@ -104,11 +104,13 @@ class SensorChecks:
             self._add(record, estimator)
         else:
             self._records.append(record)
-            if not self._moving.is_off() and (estimate.nis is None or estimate.nis < MAX_NIS):
-                return estimate
-            self._examine_records(estimator)
-        estimate, self._is_acting = self._inflate(record, estimator), self._has_to_act()
-        return estimate
+            self._is_acting = self._moving.is_off() or not (estimate.nis is None or estimate.nis < MAX_NIS)
+            if self._is_acting:
+                self._examine_records(estimator)
+        if self._is_acting:
+            estimate, self._is_acting = self._inflate(record, estimator), self._has_to_act()
+        late_s, twist = self._inflation.late_s, estimate.twist  # the way in the time by which the clock of the poses may be off
+        return estimate if not late_s or twist is None else estimate.widened(twist[:, None] * twist * late_s**2)
 
     def examine(self, estimator: Estimator, *, is_last: bool = False) -> None:
         """Examine the steps that ``estimator`` has published, once there are enough, or none ``is_last``."""

@@ -30,7 +30,8 @@ def apart_message(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: floa
 
 
 class ClockCheck:
-    """`add` the estimator after each step: clocks that are apart are declared, and inflate the covariance while the robot moves."""
+    """`add` the estimator after steps: clocks that are apart inflate the covariance while the robot moves, and are declared where that is
+    no latency."""
 
     def __init__(self, faults: FaultLog, sigma_s: float) -> None:
         """``sigma_s``: by how much the clock of the poses may be off, whatever the drive shows [s]."""
@@ -43,7 +44,7 @@ class ClockCheck:
         apart = estimator.clocks_apart
         late_s = 0.0 if apart is None else round(apart.late_s, 2)
         self._faults.inflation.late_s = max(self._sigma_s, abs(late_s))
-        if apart is None or late_s == self._reported_s:
+        if apart is None or apart.is_latency or late_s == self._reported_s:
             return
         self._reported_s = late_s
         self._faults.update(CLOCKS_APART, 0.0, _numbers(apart.other, late_s, late_s, -late_s))

@@ -78,7 +78,7 @@ class CovarianceInflation:
     @property
     def is_acting(self) -> bool:
         """Whether estimates get another covariance."""
-        return self.is_inflating or self.possible is not None or self.late_s > 0.0 or self._turned_about_m is not None
+        return self.is_inflating or self.possible is not None or self._turned_about_m is not None
 
     @property
     def is_inflating(self) -> bool:
@@ -107,18 +107,16 @@ class CovarianceInflation:
             A = se2.adjoint(se2.between(self._pose, before))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
-        if self.late_s and estimate.twist is not None:
-            estimate = _widen(estimate, np.outer(estimate.twist, estimate.twist) * self.late_s**2)
         if self._turned_about_m is not None:
-            estimate = _widen(estimate, _turned_about(self._pose, self._turned_about_m))
+            estimate = estimate.widened(_turned_about(self._pose, self._turned_about_m))
         if estimate.covariance is not None and self.possible is not None:
-            estimate = _widen(estimate, np.outer(self.possible, self.possible))
+            estimate = estimate.widened(np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
             return estimate
         spread = self.total
         if self._since_ns is None:
             self._since_ns = estimate.stamp_ns
-        return _widen(estimate, spread)
+        return estimate.widened(spread)
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes; and with the way in the time by
@@ -152,14 +150,6 @@ def _turned_about(pose: Pose2, ahead_m: float) -> Cov3:
     difference = np.array([2.0 * x, 2.0 * y, 0.0])
     lever = (2.0 * ahead_m) ** 2
     return np.asarray(np.outer(difference, difference) + np.diag([lever, lever, 0.0]))
-
-
-def _widen(estimate: Estimate, spread: Cov3) -> Estimate:
-    """``estimate`` whose pose has the covariance ``spread`` (3, 3) besides."""
-    odometry = estimate.odometry
-    if odometry is not None and odometry[1] is not None:
-        odometry = odometry[0], odometry[1] + spread
-    return replace(estimate, covariance=None if estimate.covariance is None else estimate.covariance + spread, odometry=odometry)
 
 
 def _widen_by_way(trajectory: Trajectory, late_s: float) -> Trajectory:

@@ -16,13 +16,13 @@ from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFau
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
 from localization.sensor_checks.reckoning import ESTIMATE, GYRO
 from localization.sensor_checks.scan_motion import Profile
-from localization.sensor_checks.scene_motion import STILL, SceneMotion, align_rest, explain
+from localization.sensor_checks.scene_motion import STILL, SceneComparison, explain
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.window import BIN_S, Window
 from localization.trajectory import BoolArray
 from motion_models import se2
 from motion_models.compiled import kernel
-from motion_models.se2 import FloatArray, Points2, Pose2, triple
+from motion_models.se2 import FloatArray, Points2, triple
 
 MOVING_OBJECTS = SensorFault(
     "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
@@ -52,10 +52,6 @@ MAX_NIS = 16.3
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
 """Share that the wheels' motion explains, of the points that a rival does not, from where on there are two motions; and while that lasts.
 Wheels that slip in a still scene explain 14 to 33 % by chance where they turn otherwise (fr079 at 168 to 185 s), else 15 to 20 %."""
-_MAX_WHEEL_TURN_RAD = 0.1
-"""Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
-_RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
-"""A rival leaves less than this share of what moves; and the share of a scan that it leaves unexplained counts as this much at least."""
 _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
 """Successive comparisons that show it."""
 _CALM_S = 1.0
@@ -154,7 +150,7 @@ class MovingObjects:
         if references:
             is_quiet = not lidar.is_active and self._suspected is None
             found = self._label(references[0], profile, points, _MIN_UNSURE if is_quiet else 0.0)
-            self._update(step, lidar, found)
+            self._update(step, lidar, references[0], found)
             if lidar.is_active:
                 step = self._lead_back(step) if self._is_led_away and is_to_come else step
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
@@ -246,24 +242,25 @@ class MovingObjects:
             views.popleft()
         return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
 
-    def _label(self, view: _View, profile: Profile, points: Points2, least_moved: float = 0.0) -> _Comparison:
+    def _label(self, view: _View, profile: Profile, points: Points2, least_moved: float = 0.0) -> SceneComparison:
         """Label ``points`` (N, 2), about the LiDAR, by the motion of the wheels since ``view``; ``least_moved`` as of `explain`."""
         x, y = profile.center.tolist()
         motions = se2.compose(se2.between(view.poses, self._poses), (x, y, 0.0))
         motions[:, :2] -= view.profile.center  # of the LiDAR
-        return _Comparison(view, profile, points, explain(view.profile, profile, points, motions[0], least_moved), motions[1])
+        scene = explain(view.profile, profile, points, motions[0], least_moved)
+        return SceneComparison(view.profile, profile, points, scene, motions[1])
 
-    def _update(self, step: Step, lidar: _Lidar, found: _Comparison) -> None:
+    def _update(self, step: Step, lidar: _Lidar, view: _View, found: SceneComparison) -> None:
         """Whether objects move now."""
-        self._compared = found.view
+        self._compared = view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        _, distance = _compare_motions(found.view.poses, self._poses)
+        _, distance = _compare_motions(view.poses, self._poses)
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE or distance >= _MAX_OFF_M:
-                self._suspected = found.view.poses if self._suspected is None else self._suspected
+                self._suspected = view.poses if self._suspected is None else self._suspected
                 self._suspected_s = now_s
                 self._shown_s = now_s if unique >= _KEPT_UNIQUE else self._shown_s
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
@@ -281,7 +278,7 @@ class MovingObjects:
         if lidar.is_active:
             self.report.add(moved_share)
             if self._since is None:
-                self._since = found.view.poses if self._suspected is None else self._suspected
+                self._since = view.poses if self._suspected is None else self._suspected
                 self._is_led_away = self._is_by_scans
         elif self._since is not None and not any(other.is_active for other in self._lidars.values()):
             self._end()
@@ -317,33 +314,6 @@ class _Report:
         self.scans, self._last_s, self._largest = self.scans + 1, now_s, max(self._largest, share)
         message = MOVING_OBJECTS.message.format(percent=100.0 * self._largest, seconds=self._seconds)
         self._faults.revise(DetectedFault(MOVING_OBJECTS, self._begin_s, message))
-
-
-@dataclass(frozen=True, eq=False)
-class _Comparison:
-    """A scan, and one from before under the motion by the wheels."""
-
-    view: _View
-    profile: Profile
-    points: Points2
-    scene: SceneMotion
-    by_estimate: Pose2
-    """(3,) motion of the LiDAR meanwhile, by the estimate."""
-
-    def unique_share(self, has_turn: bool) -> float:
-        """Share, of the points that a rival motion does not explain, which the wheels' motion explains; the least of all rivals. A rival
-        explains most of what moves under the wheels' motion. Unless ``has_turn``, by a gyro, rivals that turn otherwise are right.
-        """
-        least = math.inf
-        for start in (self.by_estimate, align_rest(self.view.profile, self.points, self.scene)):
-            other = None if start is None else explain(self.view.profile, self.profile, self.points, start)
-            if other is None or other.moved_share >= _RIVAL_MOVED * self.scene.moved_share:
-                continue
-            if not has_turn and abs(float(se2.scalar_wrap(other.motion[2] - self.scene.motion[2]))) > _MAX_WHEEL_TURN_RAD:
-                return 0.0
-            unique = float(np.sum((self.scene.labels == STILL) & (other.labels != STILL)))
-            least = min(least, unique / max(float(np.sum(other.labels != STILL)), _MIN_UNEXPLAINED * len(self.points)))
-        return least
 
 
 @kernel

@@ -8,6 +8,7 @@ has left (free-space violations; Pomerleau et al. 2014, "Long-term 3D map mainte
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,10 @@ _PRIOR_M, _PRIOR_RAD, _RESIDUAL_M = 0.1, 0.05, 0.05
 _ITERATIONS = 4
 _MAX_DISTANCE_M, _MIN_ALIGNED = 1.0, 15
 """Largest distance of a point from its associated one [m], and least number of points that have a motion of their own."""
+_MAX_WHEEL_TURN_RAD = 0.1
+"""Turn of a rival from the wheels', without a gyro, from where on these have slipped [rad]."""
+_RIVAL_MOVED, _MIN_UNEXPLAINED = 0.5, 0.1
+"""A rival leaves less than this share of what moves; and the share of a scan that it leaves unexplained counts as this much at least."""
 HIDDEN, STILL, MOVED = 0, 1, -1
 """Labels of points: nothing was measured there before; of the still world; in what was free space."""
 
@@ -62,6 +67,34 @@ def align_rest(reference: Profile, points: Points2, still: SceneMotion) -> Pose2
     rest = points[still.labels != STILL]
     motion, inliers = align_profiles(reference, rest, triple(still.motion), np.empty((2, 2)))
     return np.array(motion) if inliers >= _MIN_ALIGNED and np.isfinite(motion).all() else None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneComparison:
+    """A scan, and one from before under the motion by the wheels."""
+
+    reference: Profile
+    """Of the one before."""
+    profile: Profile
+    points: Points2
+    scene: SceneMotion
+    by_estimate: Pose2
+    """(3,) motion of the LiDAR meanwhile, by the estimate."""
+
+    def unique_share(self, has_turn: bool) -> float:
+        """Share, of the points that a rival motion does not explain, which the wheels' motion explains; the least of all rivals. A rival
+        explains most of what moves under the wheels' motion. Unless ``has_turn``, by a gyro, rivals that turn otherwise are right.
+        """
+        least = math.inf
+        for start in (self.by_estimate, align_rest(self.reference, self.points, self.scene)):
+            other = None if start is None else explain(self.reference, self.profile, self.points, start)
+            if other is None or other.moved_share >= _RIVAL_MOVED * self.scene.moved_share:
+                continue
+            if not has_turn and abs(float(se2.scalar_wrap(other.motion[2] - self.scene.motion[2]))) > _MAX_WHEEL_TURN_RAD:
+                return 0.0
+            unique = float(np.sum((self.scene.labels == STILL) & (other.labels != STILL)))
+            least = min(least, unique / max(float(np.sum(other.labels != STILL)), _MIN_UNEXPLAINED * len(self.points)))
+        return least
 
 
 @kernel

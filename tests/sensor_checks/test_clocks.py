@@ -29,3 +29,15 @@ def test_clocks_of_two_sensors_apart_accuse_neither(late_s: float) -> None:
     is_learned = np.arange(len(outcome.errors)) > 0.75 * len(outcome.errors)  # the turn rate changes at 13, 17 and 20 s
     assert (outcome.errors[is_learned] < 3.0 * outcome.sigmas[is_learned] + 0.03).all()
     assert outcome.sigmas[is_learned].max() < 2.0 * math.hypot(0.5, 0.05) * abs(late_s)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("has_gyro", [False, True])
+def test_latency_of_a_lidar_is_in_the_covariance_and_no_fault(has_gyro: bool) -> None:
+    """.1 s at up to .5 m/s: 5 cm, which scans alone have as sigma of millimetres."""
+    fault = change_scans(lambda scan, begin_ns: replace(scan, stamp_ns=scan.stamp_ns + 100_000_000))
+    outcome = run(in_room(), fault if has_gyro else without_gyro(fault))
+    assert CLOCKS_APART not in outcome.pipeline.checks.found
+    is_learned = np.arange(len(outcome.errors)) > 0.5 * len(outcome.errors)
+    assert outcome.errors[is_learned].max() > 0.03
+    assert (outcome.errors[is_learned] < 3.0 * outcome.sigmas[is_learned] + 0.01).all()
