@@ -350,11 +350,19 @@ def removed_share(answer: Answer, fresh: Drive, floor: Drive, robot: Robot, base
             path.write_text(robot_toml(relocated(answer.robot, path.parent)), encoding="utf-8")
             read = load_robot(path)
         corrected = CorrectedRobot(read, (), np.zeros((len(before.batch.dt), 2)))
-        after = predictor_after(before, corrected, name).discrepancies(Hypothesis())[:, :3]
+        after = predictor_after(before, corrected, name).discrepancies(_moved_lidar(fresh, read))[:, :3]
     else:
         after = rows[0]
     old, lowest, new = (float(np.nansum(np.clip(r / sigmas, -1e3, 1e3) ** 2)) for r in (*rows, after))
     return 1.0 - (new - lowest) / max(old - lowest, 1e-9)
+
+
+def _moved_lidar(drive: Drive, robot: Robot) -> Hypothesis:
+    """That the LiDAR sits where the file of ``robot`` has it: the ``drive`` was measured by its mount of before."""
+    old, new = drive.lidar_mount, robot.mounts.get(drive.lidar_frame)
+    if old is None or new is None or drive.lidar_frame not in robot.tf.overridden:
+        return Hypothesis()
+    return Hypothesis(lidar_offset=(new.x - old.x, new.y - old.y, new.yaw - old.yaw))
 
 
 def table(rows: list[dict[str, Any]]) -> str:
