@@ -79,8 +79,6 @@ class Tilt:
     """(2, 2) of both, by the attitude, the mount, friction and the CG's height."""
     twist: float = 0.0
     """Twist of the ground, the second derivative of its height by x and y in the body's axes [1/m]."""
-    twist_sigma: float = 0.0
-    """Sigma of `twist` [1/m]."""
 
     def at(self, shares: FloatArray) -> FloatArray:
         """(n, 2) at ``shares`` (n,) of the step, 0 to 1."""
@@ -309,7 +307,7 @@ class AttitudeFilter:
         now = self._downhill - error
         own = np.array([[P[1, 1], -P[0, 1]], [-P[0, 1], P[0, 0]]]) + _ACCELEROMETER_RAD**2 * np.eye(2)
         cov = own + self._split_cov[:2, :2] + _SLOPE_EFFECT**2 * np.outer(now, now)
-        return Tilt(before - error, now, cov, self._curvature.twist, math.sqrt(self._curvature.twist_variance))
+        return Tilt(before - error, now, cov, self._curvature.twist)
 
     def _slope(self) -> FloatArray:
         """(2,) `motion_models.slope.Slope.downhill` by the vertical as it is, mount and ground together."""
