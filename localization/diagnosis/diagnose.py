@@ -311,7 +311,8 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
     reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
     excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
-    chosen, gains, dropped = _keep_useful(linearization, chosen, config, max(excess) <= MAX_NOISE_OVER_REFERENCE)
+    is_noise_own = max(excess) <= MAX_NOISE_OVER_REFERENCE and not predictor.unmodelled.slip_share
+    chosen, gains, dropped = _keep_useful(linearization, chosen, config, is_noise_own)
     sizes, gained = problem.fit_by_likelihood(chosen)[0], problem.gain(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
     has_other_contacts = error.is_shown or bool(predictor.unmodelled.log_stiffness)
@@ -406,7 +407,8 @@ def _keep_useful(
     """``chosen`` without those within tolerance, those for which another cause within its tolerance would do, and those that do not predict
     windows to which they were not fitted; the gain of each; size and sigma of those within tolerance.
 
-    In short drives tolerated differences mask the gain in discrepancies, but not in likelihood, if the noise is that of the reference.
+    In short drives tolerated differences mask the gain in discrepancies, but not in likelihood, if the noise is that of the reference
+    and the contacts are the model's.
     """
     within: dict[str, tuple[float, float]] = {}
     causes, problem = linearization.causes, linearization.problem
