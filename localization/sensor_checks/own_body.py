@@ -45,6 +45,8 @@ class OwnBody:
     def remove(self, step: Step) -> Step:
         """``step`` without these points. Only planar scans are examined."""
         x, y, turn = step.predicted.delta.tolist()
+        if step.turn is not None:  # the smaller turn: one of both in a wrong unit makes every wall the robot itself
+            turn = min(turn, step.turn.angle, key=abs)
         self._way, self._heading = self._way + math.hypot(x, y), self._heading + turn
         scan = step.scan
         if scan is None or not scan.is_planar or not len(scan.points):

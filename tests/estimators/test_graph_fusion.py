@@ -523,7 +523,7 @@ def test_graph_after_a_gap_of_all_sensors_is_where_the_scans_find_it() -> None:
     sigmas = np.array([np.sqrt(np.trace(e.covariance[:2, :2])) for e in estimates])
     stamps = np.array([e.stamp_ns for e in estimates])
     lost = (stamps > until_wheels) & (stamps < until_scans)
-    keyframes = np.array(pipeline.estimator._stamps_ns)[np.array(pipeline.estimator._nodes)]
+    keyframes = pipeline.estimator.keyframe_map().stamps_ns
     assert ((keyframes > until_wheels) & (keyframes < until_scans)).sum() > 1
     assert sigmas[lost].min() > 0.5
     found = stamps > until_scans + 3 * 10**9

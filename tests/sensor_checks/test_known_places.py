@@ -56,6 +56,7 @@ def test_wheels_in_rpm_leave_pose_and_covariance_of_a_lidar(begin: float, end: f
     outcome = run(in_room(), multiply_wheels(60.0 / (2.0 * np.pi), begin, end))
     error, sigma = outcome.last
     assert outcome.warnings
+    assert not any("robot itself" in warning for warning in outcome.warnings)
     assert outcome.worst[0] < 0.1
     assert error < 0.02
     assert sigma < 0.1
