@@ -184,9 +184,11 @@ class OperatorCommands:
     def save_map(self, name: str) -> ServiceReply:
         """Write the map as it is into the new file ``name``, beside the estimates; what comes of it is reported."""
         session = self._node.session
-        mapped = session.pipeline.estimator.keyframe_map()
+        mapped, estimate = session.pipeline.estimator.keyframe_map(), session.health.estimate
         if not isinstance(mapped, KeyframeMap) or not str(name).strip():
             text = "give the name of a new file." if mapped is not None else "this estimator has no map of its own. Use graph."
+            if estimate is not None and estimate.in_space is not None:
+                text = "poses are in space, whose map is made from the whole drive: record it, and use `skidloc replay --save-map`."
             self._report(f"save_map: nothing is saved: {text}")
             return ServiceReply(False, text)
         mounts = {frame: asdict(mount) for frame, mount in sorted(session.pipeline.mounts.items())}

@@ -112,6 +112,16 @@ def test_node_on_hills_refuses_planar_maps_and_goes_on(hills, places, tmp_path) 
     assert estimator.localization()["state"] == "searching"
 
 
+def test_node_of_a_graph_in_space_says_how_its_map_is_saved(hills, tmp_path) -> None:
+    drive, _, clouds = hills
+    transport = LogTransport(hill_log.write(tmp_path / "hills.mcap", drive, clouds))
+    run_node(transport, "graph", config=NodeConfig(wait_s=0.0), robot=drive.robot)
+    reply = transport.services["/skidloc/save_map"](str(tmp_path / "hill"))
+    assert not reply.is_success
+    assert "skidloc replay --save-map" in reply.message
+    assert not list(tmp_path.glob("*.skidmap"))
+
+
 def test_node_with_a_planar_lidar_refuses_a_map_in_space(places) -> None:
     with pytest.raises(MapError, match="holds clouds in space, and the LiDAR is planar"):
         run_node(LogTransport(drive_log()), "map", prior=PriorMap(places))
