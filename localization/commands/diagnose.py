@@ -109,8 +109,8 @@ class Diagnose:
                 baseline = estimate_baseline(self._cut(self._open(self.healthy, robot)), model)
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
-            found = self._with_suited_model(found, drive)
-            notes = (*unused_terms_notes(robot, [model.name]), *found.diagnosis.warnings)
+            by_suited = self._notes_by_suited_model(found, drive)
+            notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings)
             found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
         extended = None
         if self.extend:
@@ -132,7 +132,7 @@ class Diagnose:
         if self.json is not None:
             write_json(self.json, content)
         print_diagnosis(console, found.diagnosis)
-        print_extension(console, found, extended)
+        print_extension(console, found, extended, is_suggested=not by_suited)
         if self.out is not None:
             print_handover(console, corrected, manual_steps, shares)
             console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
@@ -168,15 +168,16 @@ class Diagnose:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
 
-    def _with_suited_model(self, found: DiagnosisResult, drive: Drive) -> DiagnosisResult:
-        """``found`` with what the model that suits the robot would find, where a simpler one was chosen and differs from the drive."""
+    def _notes_by_suited_model(self, found: DiagnosisResult, drive: Drive) -> tuple[str, ...]:
+        """What the model that suits the robot would find, in a sentence, where a simpler one was chosen and differs from the drive: what it
+        does not have comes out as causes, or as unexplained."""
         d, name = found.diagnosis, default_model(drive.robot)
-        if not self.model or self.model == name or not d.findings or self.healthy is not None:
-            return found
+        is_off = bool(d.findings) or d.verdict == "unexplained"
+        if not self.model or self.model == name or not is_off or self.healthy is not None:
+            return ()
         other = examine(drive, make_model(name, drive.robot), self.config).diagnosis
         causes = ", ".join(f"{f.definition.label} {f.size:+.3g}{unit_of(f.cause)}" for f in other.findings) or "no cause"
-        note = f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}."
-        return dataclasses.replace(found, diagnosis=dataclasses.replace(d, warnings=(note, *d.warnings)))
+        return (f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}.",)
 
     def _with_written_robot(self, found: DiagnosisResult, reader: Reader | None) -> DiagnosisResult:
         """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""
@@ -227,10 +228,10 @@ class Diagnose:
         return corrected, tuple(manual_steps)
 
 
-def print_extension(console: Console, found: DiagnosisResult, extended: ExtendedResult | None) -> None:
-    """The terms of the model, or that a search for them is possible."""
+def print_extension(console: Console, found: DiagnosisResult, extended: ExtendedResult | None, is_suggested: bool) -> None:
+    """The terms of the model, or that a search for them is possible, where it ``is_suggested``: no other model suits the robot better."""
     if extended is None:
-        if suggests_extension(found):
+        if is_suggested and suggests_extension(found):
             console.print("next: diagnose with --extend, which searches a term of the model for it.", markup=False, soft_wrap=True)
         return
     if extended.extension is None:

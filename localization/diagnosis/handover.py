@@ -255,8 +255,15 @@ def _window_noise(noise: Noise, windows: IntArray, turn_m: float) -> FloatArray:
 
 
 def _window_error(run: Run, drive: Drive, windows: IntArray, turn_m: float) -> FloatArray:
-    spans, used = drive.spans_ns[windows], [drive.maneuvers[int(i)] for i in windows]
-    moved = se2.between(run.trajectory.at(spans[:, 0]), run.trajectory.at(spans[:, 1]))  # NaN where the run does not cover the window
-    known = np.array([np.isfinite(np.diagonal(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1])) for m in used])
-    off = se2.between(np.array([m.measured[-1] for m in used]), moved) * np.array([1.0, 1.0, turn_m])
-    return np.asarray(np.sum(np.where(known, off, 0.0) ** 2, axis=1))
+    """(W,) squared error of the motion in ``windows`` that was measured, headings times ``turn_m`` [m^2]; NaN where the run does not cover
+    the window."""
+    spans = drive.spans_ns[windows]
+    covered = np.flatnonzero(np.all(run.trajectory.covers(spans), axis=1))
+    used, spans = [drive.maneuvers[int(i)] for i in windows[covered]], spans[covered]
+    found = np.full(len(windows), np.nan)
+    if used:
+        moved = se2.between(run.trajectory.at(spans[:, 0]), run.trajectory.at(spans[:, 1]))
+        known = np.array([np.isfinite(np.diagonal(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1])) for m in used])
+        off = se2.between(np.array([m.measured[-1] for m in used]), moved) * np.array([1.0, 1.0, turn_m])
+        found[covered] = np.sum(np.where(known, off, 0.0) ** 2, axis=1)
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,9 @@ _W = ("", "wz", "abs(wz)", "wz^2", "wz*abs(wz)")
 _CAUSES = ("vx[v]", "vy[wz]", "wz[wz]", "vy[v*wz]", "vx[v*abs(wz)]", "wz[abs(v)*wz]", "wz[wz*abs(wz)]")
 
 
-def random_term(seed: int) -> Term:
-    """A product of powers of speed and yaw rate that a robot with equal sides may have, and that no cause has."""
+def random_term(seed: int, powers: Collection[int] = (1, 2, 3)) -> Term:
+    """A product of so many ``powers`` of speed and yaw rate that a robot with equal sides may have, and that no cause has; the search has
+    products of three at most."""
     rng = np.random.default_rng(seed)
     while True:
         component = str(rng.choice(["vx", "vy", "wz"]))
@@ -41,8 +43,13 @@ def random_term(seed: int) -> Term:
         if not parts:
             continue
         term = Term(component, parse_expression("*".join(parts)), float(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.25)))
-        if term.is_symmetric and term.name not in _CAUSES:
+        if term.is_symmetric and term.name not in _CAUSES and powers_of(term) in powers:
             return term
+
+
+def powers_of(term: Term) -> int:
+    """Powers of speed and yaw rate in a product of `random_term`, or of the search without time and CG."""
+    return sum(f.power for f in term.expression.factors if f.form != "sign")
 
 
 def run(tmp_path: Path, drive: list[Maneuver], robot: str) -> tuple[str, dict[str, Any]]:
@@ -56,9 +63,17 @@ def run(tmp_path: Path, drive: list[Maneuver], robot: str) -> tuple[str, dict[st
 
 DRAWN = [(robot, seed) for robot in ROBOTS for seed in range(20)]
 NAMES = [f"{robot}_{seed}" for robot, seed in DRAWN]
+_DRAWS = 40
+_OF_A_CAUSE = pytest.mark.xfail(strict=True, reason="vy = 0.12 v |v| wz is named lateral_slip_speed, vy = c v wz: 89 % of its squares")
 
 
-@pytest.mark.parametrize(("name", "seed"), cases(DRAWN, ["pioneer_3dx_3"], NAMES, pytest.mark.slow))
+def effects() -> list[Any]:
+    """Drawn effects as parameters; in one case a cause of the catalogue takes the place of the term."""
+    found = cases(DRAWN, ["pioneer_3dx_3"], NAMES, pytest.mark.slow)
+    return [pytest.param(*p.values, id=p.id, marks=[*p.marks, *([_OF_A_CAUSE] if p.id == "pioneer_3dx_4" else [])]) for p in found]
+
+
+@pytest.mark.parametrize(("name", "seed"), effects())
 def test_extend_finds_a_random_effect_and_its_file_drives_better(tmp_path: Path, name: str, seed: int) -> None:
     """What the effect adds to the error of other windows falls by 70 % at least with the file that was written."""
     hidden, plain, model = random_term(seed), load_robot(name), ROBOTS[name]
@@ -96,14 +111,34 @@ def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> N
     assert extension.check.replays["odometry"].after_m < extension.check.replays["odometry"].before_m
 
 
-@pytest.mark.parametrize("drawn", [pytest.param(range(8), marks=pytest.mark.extended), pytest.param(range(40), marks=pytest.mark.slow)])
-def test_find_terms_sigmas_are_those_of_their_errors(drawn: range) -> None:
+@pytest.mark.extended
+@pytest.mark.parametrize("seed", range(8))
+def test_extend_writes_at_most_three_powers_and_not_to_the_harm_of_other_drives(seed: int) -> None:
+    """Products of more are many times too large on a faster drive. For 26 of 40 effects of four powers (seeds 0 to 39) a product of fewer
+    is written, which leaves 19 % of what they add to the squares of errors on other windows, at most 81 %; for the others none is."""
+    name = "pioneer_3dx"
+    plain, model, hidden = load_robot(name), ROBOTS[name], random_term(seed, powers=(4,))
+    real = dataclasses.replace(plain, terms={model: (hidden,)})
+    table = drive_of_table("drive.csv", plain, windows([real] * 40, model, seed), "windows")
+    made = make_model(model, plain)
+    extended = extend(examine(table, made), table, made)
+    if extended.robot is None:
+        assert extended.extension is None or not extended.extension.is_better
+        return
+    assert max(powers_of(term) for term in extended.robot.terms[model]) <= 3
+    fresh = windows([real] * 40, model, 1000 + seed)
+    before, after = (np.mean(errors(robot, model, fresh) ** 2) for robot in (plain, extended.robot))
+    assert after < before, (hidden, extended.robot.terms[model])
+
+
+@pytest.mark.extended
+def test_find_terms_sigmas_are_those_of_their_errors() -> None:
     """The root mean square of errors over sigmas is within the 99 % interval of chi squared; the selection of terms among candidates is
     part of it."""
     name = "pioneer_3dx"
     plain, model = load_robot(name), ROBOTS[name]
     errors_over_sigma = []
-    for seed in drawn:
+    for seed in range(_DRAWS):
         hidden = random_term(seed)
         drive = windows([dataclasses.replace(plain, terms={model: (hidden,)})] * 40, model, seed)
         search = find_terms(
@@ -111,6 +146,6 @@ def test_find_terms_sigmas_are_those_of_their_errors(drawn: range) -> None:
         )
         assert search is not None
         errors_over_sigma += [(t.term.value - hidden.value) / t.term.sigma for t in search.terms if t.term.name == hidden.name]
-    assert len(errors_over_sigma) >= 0.9 * len(drawn)
+    assert len(errors_over_sigma) >= 0.9 * _DRAWS
     low, high = np.sqrt(chi2.ppf([0.005, 0.995], len(errors_over_sigma)) / len(errors_over_sigma))
     assert low < np.sqrt(np.mean(np.square(errors_over_sigma))) < high
