@@ -87,7 +87,7 @@ class UnknownVelocity:
 
 @dataclass
 class FaultyScans:
-    """Scans that lack something, by what it is."""
+    """Numbers of scans with missing points or times, or that came too late."""
 
     empty: int = 0
     """Scans without a usable point."""

@@ -7,6 +7,7 @@ one that is not finished by then waits for it.
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -57,6 +58,32 @@ class BackgroundSearch(Generic[Found]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._start()
+
+
+Search = TypeVar("Search", bound=BackgroundSearch[Any])
+
+
+class BackgroundSearcher(ABC, Generic[Search]):
+    """What runs at most one search beside the estimates."""
+
+    _running: Search | None = None
+
+    def advance(self, duration_s: float) -> bool:
+        """``duration_s`` more have passed in the log; returns whether the result of a search was due, and has been taken."""
+        if self._running is None or not self._running.advance(duration_s):
+            return False
+        self.finish_search()
+        return True
+
+    def finish_search(self) -> None:
+        """Take the result of the search that runs, if one does."""
+        search, self._running = self._running, None
+        if search is not None:
+            self._take(search)
+
+    @abstractmethod
+    def _take(self, search: Search) -> None:
+        """Conclude from the result of ``search``."""
 
 
 class PlanarSearch(BackgroundSearch[Place]):

@@ -61,9 +61,7 @@ class KeyframeMap:
 
     def select(self, kept: IntArray) -> KeyframeMap:
         """The keyframes ``kept`` (N,) in their order, with the motions between these alone."""
-        number, scans = {int(k): i for i, k in enumerate(kept)}, self.scans()
-        is_kept = np.array([a in number and b in number for a, b in self.edges.tolist()], dtype=bool)
-        edges = [[number[a], number[b]] for a, b in self.edges[is_kept].tolist()]
+        scans, (edges, is_kept) = self.scans(), edges_among(self.edges, kept)
         return KeyframeMap(
             stamps_ns=self.stamps_ns[kept],
             poses=self.poses[kept],
@@ -71,9 +69,17 @@ class KeyframeMap:
             points=np.vstack([np.empty((0, 2)), *(scans[k] for k in kept)]).astype(np.float32),
             counts=self.counts[kept],
             sensors=self.sensors[kept],
-            edges=np.array(edges, dtype=np.int64).reshape(-1, 2),
+            edges=edges,
             edge_deltas=self.edge_deltas[is_kept],
             edge_information=self.edge_information[is_kept],
             edge_is_loop=self.edge_is_loop[is_kept],
             plane=self.plane,
         )
+
+
+def edges_among(edges: IntArray, kept: IntArray) -> tuple[IntArray, NDArray[np.bool_]]:
+    """The ``edges`` (E, 2) that tie two of the keyframes ``kept`` (N,), numbered as these are there, and which of all they are (E,)."""
+    number = {int(k): i for i, k in enumerate(kept)}
+    is_kept = np.array([a in number and b in number for a, b in edges.tolist()], dtype=bool)
+    among = [[number[a], number[b]] for a, b in edges[is_kept].tolist()]
+    return np.array(among, dtype=np.int64).reshape(-1, 2), is_kept

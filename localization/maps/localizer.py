@@ -16,7 +16,7 @@ import numpy as np
 from localization.lidar.correlative_search import prior_outlier_cov
 from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanobis
 from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
-from localization.maps.background_search import PlanarSearch
+from localization.maps.background_search import BackgroundSearcher, PlanarSearch
 from localization.maps.grid import Grid
 from localization.maps.place_probability import (
     MAX_SEARCH_ODDS,
@@ -87,7 +87,7 @@ INITIAL_COV = np.diag([0.5, 0.5, 0.26]) ** 2
 """Covariance of a pose that a person gives [m^2, m^2, rad^2]: the default of RViz's tool for /initialpose."""
 
 
-class Localizer:
+class Localizer(BackgroundSearcher[PlanarSearch]):
     """`add` keyframe after keyframe; `state`, `probability`, `pose` and `covariance` are those at the last one."""
 
     def __init__(
@@ -117,7 +117,6 @@ class Localizer:
         self._searched_m, self._is_whole_searched, self._since_search = 0.0, False, np.zeros((3, 3))
         self._failures, self._wait = 0, 0
         self._fix: PositionFix | None = None
-        self._running: PlanarSearch | None = None
         if initial is not None:
             self.set_pose(initial, initial_cov)
 
@@ -186,18 +185,8 @@ class Localizer:
         elif self._running is None:
             self._start_search()
 
-    def advance(self, duration_s: float) -> bool:
-        """``duration_s`` more have passed in the log; returns whether the result of a search was due, and has been taken."""
-        if self._running is None or not self._running.advance(duration_s):
-            return False
-        self.finish_search()
-        return True
-
-    def finish_search(self) -> None:
-        """Take the result of the search that runs, if one does."""
-        search, self._running = self._running, None
-        if search is not None:
-            self._conclude(search.result(), search.n_points, search.is_by_fix, search.moved, search.cov)
+    def _take(self, search: PlanarSearch) -> None:
+        self._conclude(search.result(), search.n_points, search.is_by_fix, search.moved, search.cov)
 
     @property
     def grid(self) -> Grid:

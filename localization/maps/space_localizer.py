@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.maps.background_search import BackgroundSearch
+from localization.maps.background_search import BackgroundSearch, BackgroundSearcher
 from localization.maps.grid import Grid
 from localization.maps.localizer import INITIAL_COV, LIKELY, State, within
 from localization.maps.place_probability import sigmoid
@@ -79,7 +79,7 @@ class SpaceHypothesis:
     """Way over which all searches have found it [m]."""
 
 
-class SpaceLocalizer:
+class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
     """`add` keyframe after keyframe; `state`, `probability`, `pose` and `covariance` are those at the last one."""
 
     def __init__(
@@ -92,7 +92,6 @@ class SpaceLocalizer:
         self.hypotheses: list[SpaceHypothesis] = []
         """Places that the last search found, the most probable first."""
         self._cov: FloatArray = np.zeros((6, 6))
-        self._running: BackgroundSearch[SpacePlace] | None = None
         self.is_outside = False
         """Whether most of the last cloud is where the map has nothing: the tracked pose is by odometry meanwhile."""
         if initial is None:
@@ -160,18 +159,8 @@ class SpaceLocalizer:
         if self._running is None:
             self._search(cloud, rotation)
 
-    def advance(self, duration_s: float) -> bool:
-        """``duration_s`` more have passed in the log; returns whether the result of a search was due, and has been taken."""
-        if self._running is None or not self._running.advance(duration_s):
-            return False
-        self.finish_search()
-        return True
-
-    def finish_search(self) -> None:
-        """Take the result of the search that runs, if one does."""
-        search, self._running = self._running, None
-        if search is not None:
-            self._conclude(search.result())
+    def _take(self, search: BackgroundSearch[SpacePlace]) -> None:
+        self._conclude(search.result())
 
     def _track(self, cloud: FloatArray) -> None:
         """Register near the pose. Where that contradicts, again and again, the robot is lost."""

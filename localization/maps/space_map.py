@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.maps.keyframe_map import edges_among
 from localization.trajectory import IntArray
 from motion_models import se3
 from motion_models.se2 import FloatArray
@@ -59,10 +60,7 @@ class SpaceMap:
 
     def select(self, kept: IntArray) -> SpaceMap:
         """The keyframes ``kept`` (N,) in their order, with the motions between these alone."""
-        number = {int(k): i for i, k in enumerate(kept)}
-        parts = np.split(self.points, np.cumsum(self.counts)[:-1])
-        is_kept = np.array([a in number and b in number for a, b in self.edges.tolist()], dtype=bool)
-        edges = [[number[a], number[b]] for a, b in self.edges[is_kept].tolist()]
+        parts, (edges, is_kept) = np.split(self.points, np.cumsum(self.counts)[:-1]), edges_among(self.edges, kept)
         return SpaceMap(
             stamps_ns=self.stamps_ns[kept],
             poses=self.poses[kept],
@@ -70,7 +68,7 @@ class SpaceMap:
             points=np.vstack([np.empty((0, 3), np.int16), *(parts[k] for k in kept)]),
             counts=self.counts[kept],
             sensors=self.sensors[kept],
-            edges=np.array(edges, dtype=np.int64).reshape(-1, 2),
+            edges=edges,
             edge_deltas=self.edge_deltas[is_kept],
             edge_information=self.edge_information[is_kept],
             edge_is_loop=self.edge_is_loop[is_kept],

@@ -72,7 +72,7 @@ def test_odometry_at_rest_moves_by_less_than_the_pose() -> None:
 
 
 def test_corrected_pose_is_the_better_one_at_the_end() -> None:
-    """Rest tells about the way before: why both are estimated."""
+    """The bias that is measured at rest corrects the way before: why both are estimated."""
     errors = []
     for seed in range(DRIVES):
         estimates, truth = drive(seed)

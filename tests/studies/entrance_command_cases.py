@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -292,6 +294,11 @@ TOPICS = (
 # references
 
 
+def nmea_sentence(body: str) -> str:
+    """``body`` between the dollar sign and its checksum, the exclusive or of all characters (NMEA 0183)."""
+    return f"${body}*{functools.reduce(operator.xor, map(ord, body)):02X}"
+
+
 def nmea(motion: Motion) -> str:
     """GGA and RMC sentences at 2 Hz."""
     lines = []
@@ -305,10 +312,7 @@ def nmea(motion: Motion) -> str:
             f"GPRMC,{clock},A,{angles[0]},N,{angles[1]},E,0.0,0.0,{time:%d%m%y},,,A",
             f"GPGGA,{clock},{angles[0]},N,{angles[1]},E,4,12,0.6,300.0,M,47.0,M,,",
         ):
-            total = 0
-            for character in body:
-                total ^= ord(character)
-            lines.append(f"${body}*{total:02X}")
+            lines.append(nmea_sentence(body))
     return "\n".join(lines) + "\n"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 from tests.helpers.entrance_drives import Motion, Publishing, Vehicle, with_times
-from tests.studies.entrance_command_cases import ALL, JACKAL, ROSBOT, SCANS, TURTLE, WARTHOG, both, changed, nmea, stamp_of
+from tests.studies.entrance_command_cases import ALL, JACKAL, ROSBOT, SCANS, TURTLE, WARTHOG, both, changed, nmea, nmea_sentence, stamp_of
 from tests.studies.entrance_commands import Edit, driven, initialized, scored
 from tests.studies.entrance_hostile_cases import IMU_MOUNT, LASER_MOUNT, LEVEL, each, mounted_at
 from tests.studies.entrance_unseen import gpx, rows
@@ -111,7 +111,7 @@ def two_bases(m: Any) -> Any:
 
 
 def optical(vehicle: Vehicle) -> Edit:
-    """A depth camera's scan frame: the transform says z ahead, x to the right, as optical frames have it."""
+    """A depth camera's scan frame: its transform has z ahead and x to the right, as optical frames have it."""
     return mounted_at(IMU_MOUNT, ("base_link", "laser", (0.15, 0.0, 0.3), bags.quaternion(-math.pi / 2, 0.0, -math.pi / 2)))
 
 
@@ -233,10 +233,7 @@ def nmea_of_day(motion: Motion, days: int) -> str:
     wrong = right + timedelta(days=days)
     for line in nmea(motion).splitlines():
         body = line[1:].split("*")[0].replace(f"{right:%d%m%y}", f"{wrong:%d%m%y}")
-        total = 0
-        for character in body:
-            total ^= ord(character)
-        found.append(f"${body}*{total:02X}")
+        found.append(nmea_sentence(body))
     return "\n".join(found) + "\n"
 
 
