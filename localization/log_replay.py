@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -48,9 +48,10 @@ class Run:
     """Computing time of this trial, without reading the log."""
     corrections: str | None = None
     """Form of the corrections to the motion model, or None where the estimator makes none."""
-    filtered: Trajectory | None = None
-    """Poses as they are published live, where ``trajectory`` is not: filtered where that is smoothed, and without a LiDAR those that never
-    jump."""
+    hindsight: Literal["smoothing", "gyro bias"] | None = None
+    """What poses of ``trajectory`` know that was found after them: smoothing by all of the log, or, without a LiDAR, the gyro's bias."""
+    live: Trajectory | None = None
+    """Poses as they are published live, where there is hindsight: filtered, and without a LiDAR those that never jump."""
     lidar: LidarLosses | None = None
     """How long the LiDAR was lost; None where no scans were matched to a map."""
     keyframes: KeyframeMap | SpaceMap | None = None
@@ -65,6 +66,16 @@ class Run:
     """Stamp after which poses are in space because the IMU shows that the ground tilts; None where that was not found, or not asked."""
 
     @property
+    def published(self) -> Trajectory:
+        """Poses as they are published live."""
+        return self.trajectory if self.live is None else self.live
+
+    @property
+    def driven_m(self) -> float:
+        """Distance driven by the published poses, at a resolution above the jitter at standstill: corrected poses jump, which is no way."""
+        return self.published.distance(_JITTER_M)
+
+    @property
     def in_space_from_s(self) -> float | None:
         """Time after the first pose from which on poses are in space by choice [s]; None where there was none."""
         return None if self.left_plane_ns is None else float(self.left_plane_ns - self.trajectory.stamps_ns[0]) * 1e-9
@@ -73,6 +84,8 @@ class Run:
         return f"<Run {self.model} {self.estimator}: {self.trajectory!r}, {len(self.warnings)} warnings>"
 
 
+_JITTER_M = 0.05
+"""Steps of the path below which an estimate's jitter at standstill would count as distance."""
 _PARAMETERS_EVERY_NS = 2_000_000_000
 """Time between two samples of the estimated parameters, in `Run.parameter_history`."""
 _EQUAL_CHARACTERS = 60
@@ -180,6 +193,7 @@ class _Replay:
             self._pipeline.warnings(),
             self._seconds,
             self._trial.corrections if self._trial.estimator in ESTIMATORS_WITH_CORRECTIONS else None,
+            "smoothing" if smoothed is not None else "gyro bias" if len(continuous[0]) else None,
             filtered if smoothed is not None else trajectory(*continuous) if len(continuous[0]) else None,
             self._pipeline.lidar,
             estimator.keyframe_map(),

@@ -376,11 +376,11 @@ def _accuracy_cells(results: Sequence[Result], columns: Sequence[Column]) -> Tab
 def _distance(results: Sequence[Result]) -> float | None:
     """Distance driven [m] by the reference, else by the last estimate, at a resolution above the jitter at standstill."""
     known = [r.accuracy.distance_m for r in results if r.accuracy and r.accuracy.distance_m is not None]
-    return known[-1] if known else results[-1].run.trajectory.distance(0.05)
+    return known[-1] if known else results[-1].run.driven_m
 
 
 def _estimates(run: Run) -> Iterator[FusedEstimate]:
-    t = run.trajectory if run.filtered is None else run.filtered  # what would have been published
+    t = run.published
     in_space = (
         {} if run.in_space is None or run.in_space.is_lifted else dict(zip(run.in_space.stamps_ns, run.in_space.poses(), strict=True))
     )

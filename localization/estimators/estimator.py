@@ -62,6 +62,8 @@ class LearnedParameter(NamedTuple):
     file_value: float
     prior_sigma: float
     """Standard deviation of the true value from the robot file's."""
+    owner: str = "the robot"
+    """The motion model that has the parameter, where it is no property of the robot."""
 
 
 class Residuals(NamedTuple):

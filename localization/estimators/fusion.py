@@ -247,7 +247,8 @@ class EkfFusion(Estimator):
         for name, change, sigma, prior in zip(
             self.corrections.names, changes.tolist(), sigmas.tolist(), self.corrections.sigmas.tolist(), strict=True
         ):
-            found.append(LearnedParameter(name, float(nominal.get(name, 0.0) + change), sigma, nominal.get(name, 0.0), prior))
+            value = nominal.get(name, 0.0)
+            found.append(LearnedParameter(name, float(value + change), sigma, value, prior, self.model.name))
         return found
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:

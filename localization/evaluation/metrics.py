@@ -132,12 +132,19 @@ class Accuracy:
         return scalars
 
 
-def evaluate(trajectory: Trajectory, reference: ReferenceTrack | Relations, config: EvaluateConfig | None = None) -> Accuracy:
-    """Score a trajectory. Raises `EvaluationError` if it and the reference share no time, or too little of it."""
+def evaluate(
+    trajectory: Trajectory,
+    reference: ReferenceTrack | Relations,
+    config: EvaluateConfig | None = None,
+    driven: Trajectory | None = None,
+) -> Accuracy:
+    """Score a trajectory. Where positions alone are measured, whose noise is no way, the distance driven is that of ``driven``: the poses
+    that do not jump, where ``trajectory`` is corrected by what was found later. Raises `EvaluationError` if trajectory and reference share
+    no time, or too little of it."""
     config = config or EvaluateConfig()
     if isinstance(reference, Relations):
         return _evaluate_relations(trajectory, reference, config)
-    return _evaluate_track(trajectory, reference, config)
+    return _evaluate_track(trajectory, reference, config, trajectory if driven is None else driven)
 
 
 def match(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float) -> tuple[FloatArray, ReferenceTrack]:
@@ -249,7 +256,7 @@ def relation_errors(trajectory: Trajectory, relations: Relations, max_gap_s: flo
     return RelationSeries(use, spans, motions, np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2]))
 
 
-def _evaluate_track(trajectory: Trajectory, reference: ReferenceTrack, config: EvaluateConfig) -> Accuracy:
+def _evaluate_track(trajectory: Trajectory, reference: ReferenceTrack, config: EvaluateConfig, driven: Trajectory) -> Accuracy:
     estimate, part = match(trajectory, reference, config.max_gap_s)
     alignment = align(estimate, part.positions, part.yaws)
     aligned = se2.compose(alignment, estimate)
@@ -258,8 +265,9 @@ def _evaluate_track(trajectory: Trajectory, reference: ReferenceTrack, config: E
     rpe: tuple[RpeAtLength, ...] = ()
     if part.yaws is None:
         end_error = float(position_error[-1])
-        span = (trajectory.stamps_ns >= part.stamps_ns[0]) & (trajectory.stamps_ns <= part.stamps_ns[-1])
-        path = np.vstack([estimate[0, :2], trajectory.poses[span, :2], estimate[-1, :2]])
+        ends = driven.at(part.stamps_ns[[0, -1]])
+        span = (driven.stamps_ns >= part.stamps_ns[0]) & (driven.stamps_ns <= part.stamps_ns[-1])
+        path = np.vstack([ends[0, :2], driven.poses[span, :2], ends[1, :2]])
     else:
         rpe = relative_pose_errors(estimate, part.poses, config)
         start = se2.compose(part.poses[0], se2.inverse(estimate[0]))

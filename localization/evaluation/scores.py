@@ -28,9 +28,9 @@ class Result:
     """None without a reference."""
     nees_mean: float | None
     """Mean of the pose's normalised error squared since the first match, 3 expected; None where the reference has no headings.
-    Of the filtered poses, where the trajectory is smoothed."""
-    filtered: Accuracy | None = None
-    """Accuracy of the filtered poses, where the run's trajectory is smoothed."""
+    Of the poses as they were published, where they are not the trajectory."""
+    live: Accuracy | None = None
+    """Accuracy of the poses as they were published, where they are not the trajectory."""
     nees_band: tuple[float, float] | None = None
     """Where `nees_mean` is in 95 % of drives of consistent covariances, for as many independent samples as this drive has."""
     position_nees: Consistency | None = None
@@ -71,7 +71,7 @@ class Result:
             "stretch_nees_mean": None if self.stretch_nees is None else self.stretch_nees.mean,
             "stretch_nees_band": None if self.stretch_nees is None else list(self.stretch_nees.band),
             "nis_mean": self.nis_mean,
-            "moments": None if self.filtered is None else self.filtered.numbers(),
+            "moments": None if self.live is None else self.live.numbers(),
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
             "counts": dict(self.run.counts),
@@ -104,16 +104,16 @@ def score(runs: Sequence[Run], reference: ReferenceTrack | Relations | None) -> 
 def _score(run: Run, reference: ReferenceTrack | Relations | None, contradictions: tuple[str, ...]) -> Result:
     if reference is None:
         return Result(run, None, None)
-    accuracy = evaluate(run.trajectory, reference)
-    filtered = run.trajectory if run.filtered is None else run.filtered  # their errors grow by increments, as the NEES here assumes
-    published = None if run.filtered is None else evaluate(run.filtered, reference)
+    accuracy = evaluate(run.trajectory, reference, driven=run.published)
+    published = run.published  # their errors grow by increments, as the NEES here assumes
+    live = None if run.live is None else evaluate(run.live, reference)
     if isinstance(reference, Relations) or contradictions:
-        return Result(run, accuracy, None, published, contradictions=contradictions)
+        return Result(run, accuracy, None, live, contradictions=contradictions)
     drifts = not np.isfinite(run.nis).any()  # no scan has corrected it
-    stretches = stretch_consistency(filtered, reference, _LEVER_SIGMA_M) if drifts else None
-    found = pose_consistency(filtered, reference, is_dead_reckoning=drifts)
+    stretches = stretch_consistency(published, reference, _LEVER_SIGMA_M) if drifts else None
+    found = pose_consistency(published, reference, is_dead_reckoning=drifts)
     mean, band = (None, None) if found is None else (found.mean, found.band)
     by_distances = None
     if reference.yaws is None:
-        by_distances = position_consistency(filtered, reference, _LEVER_SIGMA_M, is_dead_reckoning=drifts)
-    return Result(run, accuracy, mean, published, band, by_distances, stretches)
+        by_distances = position_consistency(published, reference, _LEVER_SIGMA_M, is_dead_reckoning=drifts)
+    return Result(run, accuracy, mean, live, band, by_distances, stretches)

@@ -318,7 +318,7 @@ _SQUARES = tuple(
         Column("Rotation²", "deg²", 3, _relations(group, "rotation_deg2")),
     )
 )
-_DRIVEN = Column("Driven", "m, by its own estimate", 1, lambda result: result.run.trajectory.distance(0.05), is_error=False)
+_DRIVEN = Column("Driven", "m, by its own estimate", 1, lambda result: result.run.driven_m, is_error=False)
 
 
 def number(value: float | None, digits: int) -> str:

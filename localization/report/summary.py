@@ -206,9 +206,9 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
 
 def _as_published(best: PlottedRun) -> list[str]:
     """Error of the poses as they were published, where loop closures have smoothed them, or what is found at rest has corrected them."""
-    run, then = best.result.run, headline(best.result.filtered)
+    run, then = best.result.run, headline(best.result.live)
     loops = run.counts.get("loops", 0)
-    if then is not None and run.lidar is None and run.estimator == "ekf":
+    if then is not None and run.hindsight == "gyro bias":
         return [f"That is with what was found later of the gyro; as published while it drove, without jumps, its error was {metres(then)}."]
     if not loops or then is None:
         return []
@@ -221,6 +221,9 @@ def _coverage(best: PlottedRun) -> list[str]:
     if accuracy is None or accuracy.overlap >= 0.9:
         return []
     return [f"The reference covers only {100.0 * accuracy.overlap:.0f} % of the drive's time."]
+
+
+_LESS_THAN_NOISE = "wheels and scans differ less than their noise allows"
 
 
 def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
@@ -258,10 +261,11 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     also = f" ({join_words(found['fits'])})" if found["fits"] else ""
     if found["under"] and by_pose == "under":
         return [f"{whose} are larger than need be: {join_words(found['under'])}{also}; safe to fuse, but given less weight than is due."]
+    if found["under"] and by_pose == "fits":
+        return [f"{whose} fit the reference: {join_words(found['fits'])}; {_LESS_THAN_NOISE} ({found['under'][0]})."]
     if found["under"]:  # innovations are of one step: they test the noise of wheels and scans, not the pose's covariance
-        allowed = f"wheels and scans differ less than their noise allows ({found['under'][0]}){also}"
-        unknown = "" if by_pose else "; whether those of the pose are too large, only a reference with headings can show"
-        return [f"{whose} are not too small: {allowed}{unknown}."]
+        unknown = "whether those of the pose are too large, only a reference with headings can show"
+        return [f"{whose} are not too small: {_LESS_THAN_NOISE} ({found['under'][0]}){also}; {unknown}."]
     if found["fits"]:
         return [f"{whose} are consistent: {join_words(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings or with covariances of its positions."]
@@ -333,13 +337,13 @@ def _unscored(lines: Sequence[PlottedRun]) -> list[str]:
     advice = "Pass --reference with a pose or GPS topic, a TUM file or a relations file to have them scored."
     if len(lines) == 1:
         line = lines[0]
-        driven = metres(line.result.run.trajectory.distance(0.05))
+        driven = metres(line.result.run.driven_m)
         return [f"No reference was given: {line.words} drove {driven}, its accuracy is unknown.", advice]
     found = [(gap, a, b) for i, a in enumerate(lines) for b in lines[i + 1 :] if (gap := _separation(a, b)) is not None]
     apart = []
     if found:
         gap, a, b = max(found, key=lambda each: each[0])
-        driven = metres(max(line.result.run.trajectory.distance(0.05) for line in lines))
+        driven = metres(max(line.result.run.driven_m for line in lines))
         apart = [f"After {driven} at most, {a.words} and {b.words} are farthest apart, by {metres(gap)} at the last moment of both."]
     return ["No reference was given, so which run is right is unknown.", *apart, advice]
 

@@ -27,8 +27,8 @@ DIFFERENCES: Mapping[Pair, SensorFault] = {
 }
 """What is reported of each pair that differs."""
 PARAMETER_FAR = SensorFault(
-    "{name} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or load, a"
-    " wrong scale of the gyro, or encoders that lose counts. {use} Fit the file with `skidloc calibrate`.",
+    "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or"
+    " load, a wrong scale of the gyro, or encoders that lose counts. {use} Fit the file with `skidloc calibrate`.",
 )
 _NAMED_WITHIN_S = 10.0
 """A named fault is found at most so long after a pair begins to differ."""
@@ -172,8 +172,8 @@ class SensorConsistency:
             return
         bins = next(window.bins for window in self._windows.values() if window.bins)
         episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
-        numbers: dict[str, float | str] = {"name": off.name, "value": off.value, "sigma": off.sigma, "file": off.file_value}
-        self._report(PARAMETER_FAR, episode, abs(off.value - off.file_value) / off.sigma, numbers)
+        numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
+        self._report(PARAMETER_FAR, episode, abs(off.value - off.file_value) / off.sigma, {**numbers, "file": off.file_value})
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""

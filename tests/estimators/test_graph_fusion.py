@@ -444,8 +444,8 @@ def test_graph_replay_equals_live_bitwise() -> None:
     found += live.finish()
     (replayed,) = replay(drive.events, [Trial(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
     assert list(map(numbers, found)) == list(map(numbers, estimates))
-    assert replayed.filtered is not None
-    assert np.array_equal(replayed.filtered.poses[-1], found[-1].pose)
+    assert replayed.live is not None
+    assert np.array_equal(replayed.live.poses[-1], found[-1].pose)
     assert np.array_equal(replayed.trajectory.poses, smoothed(estimates, pipeline).poses)
 
 
@@ -458,8 +458,8 @@ def test_graph_without_loops_is_as_certain_as_the_filter(has_lidar):
     drive = rooms.drive_through(world.box(-5, -1, 60, 1), rooms.path((1, 0, 0), (30, 0.5, 0.0), (1, 0, 0)), 0, (0.0, 0.1, 0.02))
     trials = [Trial(make_model("diff_drive", rooms.ROBOT), name, "none") for name in ("ekf", "graph")]
     ekf, graph = replay(drive.events, trials, rooms.ROBOT, drive.mounts, has_lidar)
-    assert graph.filtered is not None
-    for found in (graph.filtered, graph.trajectory):
+    assert graph.live is not None
+    for found in (graph.live, graph.trajectory):
         assert ekf.trajectory.covariances is not None
         assert found.covariances is not None
         certain, ours = (np.sqrt(np.diagonal(t.covariances[-1])) for t in (ekf.trajectory, found))
@@ -479,15 +479,15 @@ def test_smoothed_poses_between_keyframes_have_the_noise_of_scans() -> None:
     early = (drive.stamps > drive.stamps[0] + 2e9) & (drive.stamps < drive.stamps[0] + 12e9)
     found = nees(se2.log(se2.between(drive.poses, poses))[early], covs[early])
     assert found.mean() < 8.0
-    live = np.searchsorted(run.filtered.stamps_ns, drive.stamps)
-    assert (np.sqrt(covs[early, 0, 0]) > 0.4 * np.sqrt(run.filtered.covariances[live][early, 0, 0])).all()
+    live = np.searchsorted(run.live.stamps_ns, drive.stamps)
+    assert (np.sqrt(covs[early, 0, 0]) > 0.4 * np.sqrt(run.live.covariances[live][early, 0, 0])).all()
 
 
 @pytest.mark.extended
 def test_graph_with_a_field_of_corrections_can_be_smoothed() -> None:
     """Prior sigmas of a field over the CG differ by a factor of 1,500, and corrections are 16 variables in a row."""
     run = BUILDINGS["fr079"].open().run("graph", "skid_steer", "cg_field")
-    assert run.filtered is not None
+    assert run.live is not None
     assert not [warning for warning in run.warnings if "smoothed" in warning]
 
 
@@ -498,7 +498,7 @@ def test_graph_that_cannot_be_smoothed_keeps_its_live_poses(monkeypatch: pytest.
     drive = around()
     monkeypatch.setattr(PoseGraph, "smooth", fail)
     (run,) = replay(drive.events[:600], [Trial(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
-    assert run.filtered is None
+    assert run.live is None
     assert len(run.trajectory) > 50
     assert [warning for warning in run.warnings if "could not be smoothed" in warning and "cannot be solved" in warning]
 

@@ -24,8 +24,8 @@ def main(log: str, estimator: str, matcher: str, out: str, folder: str = "") -> 
     run = drive.run(estimator, matcher=matcher)
     seconds = time.process_time() - begin
     _write(Path(f"{out}.npz"), run.trajectory)
-    if run.filtered is not None:
-        _write(Path(f"{out} live.npz"), run.filtered)
+    if run.live is not None:
+        _write(Path(f"{out} live.npz"), run.live)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     Path(f"{out}.json").write_text(json.dumps({"cpu_s": seconds, "memory_mb": memory}))
 

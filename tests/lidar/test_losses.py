@@ -169,7 +169,7 @@ def test_comparison_without_long_losses_is_silent(share: float | None) -> None:
 
 def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -> None:
     """Also of a run with live poses besides the smoothed ones."""
-    smoothed = replace(lost_and_found()[0], filtered=run().trajectory)
+    smoothed = replace(lost_and_found()[0], live=run().trajectory)
     (result,) = score([smoothed], track())
     scores = _scores(result.metrics(200.0, with_timing=False))
     assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)

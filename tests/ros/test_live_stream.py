@@ -586,11 +586,11 @@ def test_odometry_of_a_graph_is_published_without_its_corrections():
     """Live: the published chain map -> odom -> base_link ends where the graph's estimates are."""
     transport, log = undisturbed("graph")[0], open_log(drive_log(scans_hz=6.25), ROBOT)
     run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "graph")], ROBOT, log.mounts, True)[0]
-    assert run.filtered is not None
+    assert run.live is not None
     tf = [m.transforms[0] for m in published(transport, TF)]
     map_T_odom, odom_T_body = (np.array([planar(t) for t in tf if t.header.frame_id == frame]) for frame in ("map", "odom"))
-    assert len(map_T_odom) == len(odom_T_body) == len(run.filtered)
-    off = se2.between(run.filtered.poses, se2.compose(map_T_odom, odom_T_body))
+    assert len(map_T_odom) == len(odom_T_body) == len(run.live)
+    off = se2.between(run.live.poses, se2.compose(map_T_odom, odom_T_body))
     assert np.abs(off).max() < 1e-9
 
 

@@ -155,7 +155,10 @@ def test_learned_factor_far_from_the_robot_file_is_reported(learned: float, is_r
     robot = Driven()
     robot.drive(5.0, 0.0, learned=learned)
     assert (list(robot.faults.found) == [PARAMETER_FAR]) == is_reported
-    assert not is_reported or f"k_0 is learned as {learned:.3g} +- 0.01, 25 sigma from this robot's file (1)" in robot.faults.warnings()[0]
+    assert (
+        not is_reported
+        or f"k_0 of the robot is learned as {learned:.3g} +- 0.01, 25 sigma from this robot's file (1)" in robot.faults.warnings()[0]
+    )
 
 
 @pytest.mark.parametrize("limit", [1.0, 2.0])

@@ -153,7 +153,7 @@ def measure(drive: Drive, estimator: str, model: str, form: str, matcher: str) -
     lidar = "–" if run.lidar is None else f"{100.0 * (1.0 - run.lidar.matched / max(run.lidar.scans, 1)):.2f}"  # noqa: RUF001
     scans = sum(hasattr(event, "points") for event in drive.events)
     rest = f"{lidar} | {1e3 * seconds / scans:.2f}"
-    names = {"": run.trajectory} if run.filtered is None else {" live": run.filtered, " smoothed": run.trajectory}
+    names = {"": run.trajectory} if run.live is None else {" live": run.live, " smoothed": run.trajectory}
     for kind, trajectory in names.items():
         has_nees = trajectory.covariances is not None and isinstance(drive.reference, ReferenceTrack)
         consistency = "{:.1f} / {:.1f}".format(*nees_at_instants(trajectory, drive.reference)) if has_nees else "–"  # noqa: RUF001
@@ -170,7 +170,7 @@ def reference_noise(drive: Drive, reference: ReferenceTrack) -> str:
     half = 0.5 * sum(value**2 for value in apart.values())
     errors = {"submap": half - apart["kiss"] ** 2, "kiss": half - apart["submap"] ** 2, "reference": half - apart["reference"] ** 2}
     sigma = math.sqrt(max(errors["reference"], 0.0) / 2.0)  # of one pose
-    tracks = {"ekf": drive.run("ekf").trajectory, "graph live": graph.filtered or graph.trajectory, "graph smoothed": graph.trajectory}
+    tracks = {"ekf": drive.run("ekf").trajectory, "graph live": graph.live or graph.trajectory, "graph smoothed": graph.trajectory}
     noise = np.array([sigma, sigma, REFERENCE_SIGMA[2]])
     nees_of = ", ".join("{} {:.1f} / {:.1f}".format(name, *nees_at_instants(track, reference, noise)) for name, track in tracks.items())
     error_of = ", ".join(f"{name} {math.sqrt(max(square, 0.0)):.3f}" for name, square in errors.items())

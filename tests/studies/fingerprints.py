@@ -99,7 +99,7 @@ def run(case: Case, drive: Drive) -> Run:
 def digest(found: Run) -> str:
     """SHA-256 of all that ``found`` has but its computing time."""
     total = hashlib.sha256()
-    for trajectory in (found.trajectory, found.filtered):
+    for trajectory in (found.trajectory, found.live):
         if trajectory is not None:
             for part in (trajectory.stamps_ns, trajectory.poses, trajectory.covariances):
                 total.update(b"" if part is None else np.ascontiguousarray(part).tobytes())

@@ -56,7 +56,7 @@ def errors(name: str, robot: str, begins_s: list[float]) -> list[list[float]]:
         events = [event for event in drive.events if event.stamp_ns >= start_ns]
         trials = [Trial(make_model("diff_drive", drive.robot), estimator) for estimator in ESTIMATORS]
         odometry, ekf, graph = replay(events, trials, drive.robot, drive.mounts, has_lidar=True)
-        tracks = odometry.trajectory, ekf.trajectory, graph.filtered, graph.trajectory
+        tracks = odometry.trajectory, ekf.trajectory, graph.live, graph.trajectory
         found.append([errors_of(_at(track, point), drive.reference)[0] for track in tracks if track is not None])
     return found
 
