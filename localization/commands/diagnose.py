@@ -110,13 +110,13 @@ class Diagnose:
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
             by_suited = self._notes_by_suited_model(found, drive)
-            notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings)
-            found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
         extended = None
         if self.extend:
             with console.status("searching for terms"):
                 extended = extend(found, drive, model, self.config, reader)
                 found = extended.found
+        notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings)
+        found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
         if self.out is not None and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):
                 found = self._with_written_robot(found, reader)

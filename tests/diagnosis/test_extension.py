@@ -21,7 +21,7 @@ from localization.diagnosis.extension import extend
 from localization.diagnosis.missing_terms import find_terms
 from motion_models.calibration.maneuvers import Maneuver, windows_text
 from motion_models.registry import make_model
-from motion_models.robot_file import load_robot
+from motion_models.robot_file import load_robot, robot_toml
 from motion_models.terms import Term, parse_expression
 from tests.helpers.diagnosis_windows import SIGMA, errors, windows
 from tests.helpers.extended import cases
@@ -93,6 +93,21 @@ def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name
     output, content = run(tmp_path, windows([load_robot(name)] * 40, ROBOTS[name], 500 + seed), name)
     assert content["verdict"] == "consistent", output
     assert not load_robot(tmp_path / "out" / "robot.toml").terms
+
+
+def test_extend_keeps_the_notes_of_the_first_diagnosis(tmp_path: Path) -> None:
+    """Of a robot file with terms of another model."""
+    name, seed = "pioneer_3dx", 0
+    plain, model, hidden = load_robot(name), ROBOTS[name], random_term(seed)
+    path = tmp_path / "robot.toml"
+    path.write_text(robot_toml(dataclasses.replace(plain, terms={"full_linear": (hidden,)})))
+    drive = windows([dataclasses.replace(plain, terms={model: (hidden,)})] * 40, model, seed)
+    table = tmp_path / "drive.csv"
+    table.write_text(windows_text(drive))
+    Diagnose(table, str(path), model=model, extend=True, json=tmp_path / "d.json").run(Console(file=io.StringIO()))
+    content = json.loads((tmp_path / "d.json").read_text())
+    assert content["verdict"] == "extended"
+    assert any("terms of its file are of full_linear" in note for note in content["notes"])
 
 
 def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> None:
