@@ -24,6 +24,7 @@ from localization.pipeline import Trial
 from motion_models import se2
 from motion_models.calibration.cross_validation import root_mean_gain
 from motion_models.calibration.maneuvers import IntArray
+from motion_models.errors import CgError, ModelError
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
@@ -103,7 +104,11 @@ def check_findings(
         sizes = _first_half_sizes(predictor, linearization, named[:count])
         if sizes is None:
             break
-        found = check_written(predictor, linearization.noise, CandidateRobot(correct_robot(predictor, sizes), sizes, held), reader)
+        try:
+            corrected = correct_robot(predictor, sizes)
+        except (CgError, ModelError):  # no robot has the sizes of this half
+            continue
+        found = check_written(predictor, linearization.noise, CandidateRobot(corrected, sizes, held), reader)
         if found is None:
             break
         found = dataclasses.replace(found, corrected=tuple(named[:count]))
@@ -173,7 +178,8 @@ def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: Candidat
 
 
 def _first_half_sizes(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> dict[Cause, float] | None:
-    """Sizes of the causes with keys ``named`` by the first half of the drive alone; None for tables, and halves with too few windows."""
+    """Sizes of the causes with keys ``named`` by the first half of the drive alone, within the bounds of each; None for tables, and halves
+    with too few windows."""
     half = len(predictor.drive.maneuvers) // 2
     if predictor.drive.kind != "log" or half < _MIN_HALF_WINDOWS or not named:
         return None
@@ -184,7 +190,7 @@ def _first_half_sizes(predictor: DrivePredictor, linearization: Linearization, n
     causes = tuple(linearization.causes[i] for i in chosen)
     problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
     sizes = problem.fit(tuple(range(len(causes))))[0]
-    return dict(zip(causes, (float(v) for v in sizes), strict=True))
+    return {cause: float(np.clip(size, *cause.bounds)) for cause, size in zip(causes, sizes, strict=True)}
 
 
 def _compared_rows(before: FloatArray, after: FloatArray, sigmas: FloatArray, weights: FloatArray) -> HandoverCheck | None:

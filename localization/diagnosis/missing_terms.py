@@ -28,7 +28,7 @@ from localization.diagnosis.causes.cause import Hypothesis, with_sizes
 from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
-from localization.diagnosis.noise import FLAT, Noise
+from localization.diagnosis.noise import FLAT, Noise, reference_noise
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
 from motion_models.se2 import FloatArray
@@ -78,6 +78,8 @@ _HALVES = 40
 _ALIKE = 0.9
 """Correlation of two candidates that one drive does not separate."""
 _MIN_STABILITY = 0.5
+_CLEAR_GAIN = 200.0
+"""Twice the log-likelihood, ten times the price of a term, from which it is there whichever of several shapes it has."""
 SEARCHED = ("log", "windows")
 """Kinds of drives whose windows have all kinds of motion."""
 _NEWTON_STEPS = 2
@@ -303,9 +305,8 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     limits[:f] = _size_limits(state)
     noise, chosen, previous = state.noise, named, None
     fading = [tuple(f + i for i in pair) for pair in _fading_pairs(candidates)]
-    if found.diagnosis.verdict == "unexplained":  # noise that contains what is unexplained hides it
-        strongest = f + int(np.argmax((design.problem(noise).gains_beside(named) - prices)[f:]))
-        noise = noise_beside(predictor, state, design.columns[..., [strongest]])
+    if found.diagnosis.verdict == "unexplained":
+        noise = _noise_beside_terms(predictor, state, design, prices)
     for _ in range(_ROUNDS):
         problem = design.problem(noise)
         starts = sorted({chosen, named, (), *fading})
@@ -318,6 +319,35 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     chosen, stability = _supported(design, noise, chosen, f, rng)
     has_sides = not _has_mirrored_rival(design.problem(noise), prices, limits, chosen, dict(enumerate(candidates, f)))
     return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(has_sides=has_sides)
+
+
+def _noise_beside_terms(predictor: DrivePredictor, state: Linearization, design: _Design, prices: FloatArray) -> Noise:
+    """Noise of a drive of which a part is unexplained, beside that part.
+
+    Noise that contains what is unexplained hides it, most where it is largest. So terms are added one by one by the noise that the motion
+    reference states, and by that of the drive, as many as pay their price by the noise that is left beside them.
+    """
+    best = _twice_log_determinant(state.noise), state.noise
+    stated = reference_noise(predictor, state.linear, state.causes)
+    for first in (state.noise, dataclasses.replace(stated, weights=state.noise.weights)):
+        problem, given, terms = design.problem(first), (), []  # type: _Regression, tuple[int, ...], list[int]
+        while len(terms) < _MOST:
+            gains = problem.gains_beside(given) - prices
+            gains[list(given)] = -math.inf
+            strongest = int(np.argmax(gains))
+            if gains[strongest] <= 0.0:
+                break
+            given = (*given, strongest)
+            if strongest >= len(state.causes):  # causes are beside all noise
+                terms.append(strongest)
+                noise = noise_beside(predictor, state, design.columns[..., terms])
+                best = min(best, (_twice_log_determinant(noise) + float(prices[terms].sum()), noise), key=lambda pair: pair[0])
+    return best[1]
+
+
+def _twice_log_determinant(noise: Noise) -> float:
+    """Of its standard deviations: less twice the log-likelihood of a drive by its own noise, but for a constant."""
+    return 2.0 * float(np.log(noise.sigmas[noise.known]).sum())
 
 
 def _has_mirrored_rival(
@@ -355,13 +385,15 @@ def _supported(
     design: _Design, noise: Noise, chosen: tuple[int, ...], f: int, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], dict[int, float]]:
     """``chosen`` without terms (from column ``f`` on) that random halves of the drive do not show again, or that are within the accuracy of
-    columns: they repair what others miss; and the stability of each."""
+    columns: they repair what others miss; and the stability of each. Where the library does not have a law, the best of several shapes
+    near it differs from half to half, but what they gain together does not."""
     problem = design.problem(noise)
     while True:
         stability = _stability(design, noise, chosen, rng)
         whole = problem.gain(chosen)
         gains = {i: whole - problem.gain(tuple(j for j in chosen if j != i)) for i in chosen if i >= f}
-        weak = [i for i, gain in gains.items() if stability[i] < _MIN_STABILITY or gain < _LEAST_SHARE * whole]
+        is_shown = {i: stability[i] >= _MIN_STABILITY or gain > _CLEAR_GAIN for i, gain in gains.items()}
+        weak = [i for i, gain in gains.items() if not is_shown[i] or gain < _LEAST_SHARE * whole]
         if not weak:
             return chosen, stability
         worst = min(weak, key=lambda i: gains[i])

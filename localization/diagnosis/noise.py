@@ -209,27 +209,38 @@ def _correlation(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, 0.05)) @ vectors.T)
 
 
+def reference_noise(predictor: DrivePredictor, linear: FloatArray, causes: tuple[Cause, ...]) -> Noise:
+    """As the motion reference states it, and with errors of the model; of discrepancies ``linear`` (M, 6)."""
+    batch, drive = predictor.batch, predictor.drive
+    follows = np.r_[False, batch.owner[1:] == batch.owner[:-1]]
+    if len(drive.spans_ns):
+        follows = np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000]
+    return given_noise(linear, np.hypot(*_claimed_sigmas(predictor, causes)), follows)
+
+
+def _claimed_sigmas(predictor: DrivePredictor, causes: tuple[Cause, ...]) -> tuple[FloatArray, FloatArray]:
+    """(M, 6) each: sigmas that the motion reference states, or a drive without faults had, and those of errors of the model."""
+    variances = np.diagonal(predictor.batch.cov, axis1=1, axis2=2)
+    given = np.sqrt(np.where(np.isfinite(variances), variances, 1.0))
+    sigmas = np.ones((len(given), len(CHANNELS)))
+    sigmas[:, :3] = given * np.array(predictor.baseline.noise_over_reference)
+    sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
+    sigmas[:, 4:] = 0.05
+    creep = np.zeros_like(sigmas)
+    if not any(cause.id == STIFFNESS_EXPONENT for cause in causes):  # else slow turns are part of the model
+        creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
+    creep[:, :_MOTION] = np.hypot(creep[:, :_MOTION], slip_sigmas(predictor))
+    return sigmas, creep
+
+
 def estimate_drive_noise(
     predictor: DrivePredictor, linear: FloatArray, signatures: FloatArray, nuisances: FloatArray, causes: tuple[Cause, ...]
 ) -> Noise:
     """Estimated from what all causes together leave, in a few rounds, as sizes and noise depend on each other."""
-    batch, drive = predictor.batch, predictor.drive
-    g = drive.robot.geometry
+    batch, g = predictor.batch, predictor.drive.robot.geometry
     features = variance_regressors(batch, g.wheel_radius_m, g.track_width_m)
-    starts = np.r_[True, batch.owner[1:] != batch.owner[:-1]]
-    follows = ~starts
-    if len(drive.spans_ns):
-        follows = np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000]
-    given = np.sqrt(np.where(np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2)), np.diagonal(batch.cov, axis1=1, axis2=2), 1.0))
-    sigmas = np.ones_like(linear)
-    sigmas[:, :3] = given * np.array(predictor.baseline.noise_over_reference)
-    sigmas[:, 3] = np.hypot(given[:, 2], 1e-3)
-    sigmas[:, 4:] = 0.05
-    creep = np.zeros_like(linear)
-    if not any(cause.id == STIFFNESS_EXPONENT for cause in causes):  # else slow turns are part of the model
-        creep[:, CHANNELS.index("yaw")] = slow_turn_sigmas(predictor)
-    creep[:, :_MOTION] = np.hypot(creep[:, :_MOTION], slip_sigmas(predictor))
-    noise = given_noise(linear, np.hypot(sigmas, creep), follows)
+    sigmas, creep = _claimed_sigmas(predictor, causes)
+    noise = reference_noise(predictor, linear, causes)
     scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)
     for _ in range(3):
@@ -240,5 +251,5 @@ def estimate_drive_noise(
         spent = np.sum((design @ inverse) * design, axis=1).reshape(linear.shape).sum(axis=0)
         p = len(causes)
         left = linear - signatures @ (x[:p] * scale) - nuisances @ (x[p:] * FLAT)
-        noise = estimate_noise(np.where(known, left, np.nan), features, follows, spent, (sigmas, predictor.baseline.windows), creep)
+        noise = estimate_noise(np.where(known, left, np.nan), features, noise.follows, spent, (sigmas, predictor.baseline.windows), creep)
     return noise

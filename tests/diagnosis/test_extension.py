@@ -17,13 +17,15 @@ from scipy.stats import chi2
 from localization.commands.diagnose import Diagnose
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
-from localization.diagnosis.extension import extend
+from localization.diagnosis.extension import ExtendedResult, extend
+from localization.diagnosis.findings import HandoverCheck
 from localization.diagnosis.missing_terms import find_terms
 from motion_models.calibration.maneuvers import Maneuver, windows_text
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot, robot_toml
 from motion_models.terms import Term, parse_expression
-from tests.helpers.diagnosis_windows import SIGMA, errors, windows
+from tests.helpers.diagnosis_effects import hide
+from tests.helpers.diagnosis_windows import SIGMA, drive_of_windows, errors, windows
 from tests.helpers.extended import cases
 
 ROBOTS = {"husky_a200": "skid_steer", "pioneer_3dx": "diff_drive"}
@@ -95,6 +97,29 @@ def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name
     assert not load_robot(tmp_path / "out" / "robot.toml").terms
 
 
+@pytest.mark.extended
+def test_extend_law_outside_the_library_gets_terms_near_it() -> None:
+    """A law that is far larger than the noise, which it hides: by it the drive's noise is 40 times the reference's. No product of whole
+    powers is the law, so that several share it."""
+    name, model = "husky_a200", "skid_steer"
+    plain = load_robot(name)
+    drive = hide(
+        drive_of_windows(plain, windows([plain] * 40, model, 3)),
+        lambda m: (0.0, 0.0, 2.0 * m.v**3 * np.sqrt(np.abs(m.wz)) * np.sign(m.wz)),
+    )
+    made = make_model(model, plain)
+    check = check_of(extend(examine(drive, made), drive, made))
+    assert check.is_better
+    assert check.after["yaw"] < 0.15 * check.before["yaw"]
+
+
+def check_of(extended: ExtendedResult) -> HandoverCheck:
+    """The check of an extension's file."""
+    assert extended.extension is not None
+    assert extended.extension.check is not None
+    return extended.extension.check
+
+
 def test_extend_keeps_the_notes_of_the_first_diagnosis(tmp_path: Path) -> None:
     """Of a robot file with terms of another model."""
     name, seed = "pioneer_3dx", 0
@@ -118,12 +143,10 @@ def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> N
     by_heading = np.diag([np.inf, np.inf, SIGMA[2] ** 2])
     drive = [dataclasses.replace(m, cov=by_heading) if i in (5, 8) else m for i, m in enumerate(drive)]
     table, made = drive_of_table("drive.csv", plain, drive, "windows"), make_model(model, plain)
-    extension = extend(examine(table, made), table, made).extension
-    assert extension is not None
-    assert extension.check is not None
-    assert extension.check.windows == 20  # of the second half, windows 4 to 7, 12 to 15, ...
-    assert set(extension.check.before) >= {"x", "y", "yaw"}
-    assert extension.check.replays["odometry"].after_m < extension.check.replays["odometry"].before_m
+    check = check_of(extend(examine(table, made), table, made))
+    assert check.windows == 20  # of the second half, windows 4 to 7, 12 to 15, ...
+    assert set(check.before) >= {"x", "y", "yaw"}
+    assert check.replays["odometry"].after_m < check.replays["odometry"].before_m
 
 
 @pytest.mark.extended

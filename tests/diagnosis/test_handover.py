@@ -46,3 +46,13 @@ def test_check_findings_change_of_few_windows_counts_by_noise(larger: float, is_
     assert found is not None
     assert found.gain.low <= 0.0
     assert found.is_better == is_better
+
+
+def test_check_findings_half_with_a_size_of_no_robot_is_within_bounds() -> None:
+    """To first order one side has less than no grip, which no robot file holds."""
+    drive = law_drive("husky_a200")
+    predictor = DrivePredictor(drive, make_model("friction", drive.robot), has_inertia=False)
+    state = linearize(predictor, (CAUSES["split_friction"],), {}, TOLERANCE)
+    found = check_findings(predictor, dataclasses.replace(state, linear=4.0 * state.signatures[..., 0]), ["split_friction"])
+    assert found is not None
+    assert found.corrected == ("split_friction",)

@@ -26,8 +26,10 @@ _ARMATURE = 30.0
 """Inertia of a motor behind its gears, over the wheel's mass times its radius squared."""
 _SERVO_GAIN = 20.0
 """Torque of a wheel's servo per rad/s of error, over m g r."""
-CONTACT = 'solref="0.01 1" solimp="0.05 0.05 0.001" solreffriction="0.12 1"'
-"""Soft contacts whose friction stops a slip within 3 ms: it is full from 0.03 m/s of slip on."""
+FRICTION_TIME_S = 0.12
+"""MuJoCo's time constant of friction: full from 0.03 m/s of slip on, in proportion to it."""
+CONTACT = f'solref="0.01 1" solimp="0.05 0.05 0.001" solreffriction="{FRICTION_TIME_S} 1"'
+"""Soft contacts whose friction stops a slip within 3 ms."""
 CONE = 'cone="elliptic" impratio="200"'
 """MuJoCo's cones couple slip to the normal force: a wheel is lifted off where its slip is 1 + impratio / mu^2 times that from which on
 friction is full. At the default impratio of 1 wheels hopped in all but slow turns (their loads scattered by 10 to 100 %), and slow turns
@@ -50,6 +52,8 @@ EFFECTS = _PHYSICAL | _OF_SENSORS
 class MujocoSimulation(Simulation):
     """`Simulation` of a robot without arms that MuJoCo moves."""
 
+    friction_time_s = FRICTION_TIME_S
+
     def __init__(
         self, experiment: Experiment, robot: Robot, seed: int, effects: Mapping[str, float], config: SimulationConfig | None = None
     ) -> None:
@@ -57,7 +61,7 @@ class MujocoSimulation(Simulation):
         if unknown or robot.arms is not None:
             raise SimulationError(f"MuJoCo's vehicle has no {', '.join(unknown) or 'arms'}.")
         super().__init__(experiment, robot, seed, effects, config)
-        self._model = mujoco.MjModel.from_xml_string(_xml(self.reality, robot))
+        self._model = mujoco.MjModel.from_xml_string(_xml(self.reality, robot, self.friction_time_s))
         self._data = mujoco.MjData(self._model)
         x, y, yaw = experiment.start
         self._data.qpos[:7] = (x, y, self._data.qpos[2], math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
@@ -119,7 +123,13 @@ class MujocoSimulation(Simulation):
         row[CG], row[-1] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset), 1.0
 
 
-def _xml(true: TrueRobot, robot: Robot) -> str:
+class CreepingMujocoSimulation(MujocoSimulation):
+    """As by `MujocoSimulation`, with contacts that creep: friction is full from 0.15 m/s of slip on."""
+
+    friction_time_s = 5.0 * FRICTION_TIME_S
+
+
+def _xml(true: TrueRobot, robot: Robot, friction_time_s: float) -> str:
     """MJCF of the robot as it truly is, on a plane."""
     body, g = true.body, robot.geometry
     mass, mu = body.mass, body.param("mu")
@@ -130,6 +140,7 @@ def _xml(true: TrueRobot, robot: Robot) -> str:
     x, y = ((np.array([g.cg_x_m, g.cg_y_m]) + body.cg_offset) * mass / chassis_mass).tolist()
     height = (body.cg_height - radius) * mass / chassis_mass
     inertia = body.inertia
+    contact = CONTACT.replace(str(FRICTION_TIME_S), str(friction_time_s))
     wheels, servos, contacts = [], [], []
     for name, front, left in _WHEELS:
         own_radius = (body.radius_left if left > 0.0 else body.radius_right) * (1.0 + FLATTENING)
@@ -139,7 +150,7 @@ def _xml(true: TrueRobot, robot: Robot) -> str:
     <joint name="{name}" type="hinge" axis="0 1 0" armature="{_ARMATURE * wheel_mass * radius**2}"/>
     <geom name="{name}" type="ellipsoid" size="{own_radius} {0.25 * radius} {own_radius}" mass="{wheel_mass}" contype="0"/>
    </body>""")
-        contacts.append(f'<pair geom1="floor" geom2="{name}" condim="3" friction="{grip} {grip} 0 0 0" {CONTACT}/>')
+        contacts.append(f'<pair geom1="floor" geom2="{name}" condim="3" friction="{grip} {grip} 0 0 0" {contact}/>')
         servos.append(f'<velocity joint="{name}" kv="{_SERVO_GAIN * mass * 9.81 * radius}"/>')
     edge = f"{0.5 * g.wheelbase_m} 0 {height}"
     load = f'<body pos="{edge}"><inertial pos="0 0 0" mass="{true.payload_kg}" diaginertia="1e-3 1e-3 1e-3"/></body>'

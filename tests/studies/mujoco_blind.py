@@ -39,6 +39,7 @@ from tests.helpers.mujoco_vehicle import EFFECTS, MujocoSimulation
 ROBOTS = ("husky_a200", "jackal", "warthog", "scout_2")
 ROUTES = ("tour", "random_4", "random_9")
 _MISSING_SHARE = 0.2
+_TWO_SIDED_95 = 1.96
 _HEALTHY_ROUTES, _HEALTHY_SEED = ("random_21", "random_22"), 6900
 _PAYLOAD_SHARE = 0.15  # of the robot's mass: 8 kg on a Husky
 _CG_SHARE = {"cg_offset_x": ("wheelbase_m", 0.08), "cg_offset_y": ("track_width_m", 0.06)}
@@ -59,11 +60,20 @@ class BlindCase:
     named: tuple[str, ...]
     """First finding and its aliases."""
     found: float | None
-    """Size of the hidden cause by the first finding, if that names it."""
+    """Size of the hidden cause, where it is a finding or among the first one's aliases."""
     others: tuple[str, ...] = ()
     """Further findings."""
     significance: float | None = None
     """Size over the sigma with which the drive can measure it; None where it does not act on the motion, or nothing was hidden."""
+    sigma: float | None = None
+    """Of the hidden cause's size, where it is a finding."""
+
+    @property
+    def is_in_interval(self) -> bool | None:
+        """Whether the 95 % interval of the size holds the true one; None where the hidden cause is no finding."""
+        if self.sigma is None or self.found is None:
+            return None
+        return abs(self.found - self.size) < _TWO_SIDED_95 * self.sigma
 
     @property
     def is_right(self) -> bool:
@@ -131,7 +141,8 @@ def run_case(number: int) -> BlindCase:
     found, significance = result.diagnosis, significances(result, effects).get(cause)
     sizes = {found.findings[0].cause: found.findings[0].size, **dict(found.findings[0].aliases)} if found.findings else {}
     others = tuple(f.cause for f in found.findings[1:])
-    return BlindCase(number, robot, route, cause, size, found.verdict, tuple(sizes), sizes.get(cause), others, significance)
+    measured = next(((f.size, f.sigma) for f in found.findings if f.cause == cause), (sizes.get(cause), None))
+    return BlindCase(number, robot, route, cause, size, found.verdict, tuple(sizes), measured[0], others, significance, measured[1])
 
 
 def cases(numbers: range, record: Path | None = None, new: int | None = None) -> list[BlindCase]:
@@ -151,7 +162,8 @@ def _line(case: BlindCase) -> str:
     found = "-" if case.found is None else f"{case.found:+.4g}"
     named = ", ".join(case.named) or "nothing"
     mark = " " if case.is_right else "!"
-    hidden_cause = f"{case.cause or 'nothing':24} {case.size:+8.4g} {found:>8}"
+    found += "" if case.sigma is None else f" +- {case.sigma:.2g}{'' if case.is_in_interval else ' off'}"
+    hidden_cause = f"{case.cause or 'nothing':24} {case.size:+8.4g} {found:>18}"
     return f"{mark} {case.robot:10} {case.route:9} {hidden_cause} {case.verdict}: {named} {case.others or ''}"
 
 
@@ -169,6 +181,8 @@ def main() -> None:
     share = 100 * right / max(len(hidden_cases), 1)
     shown = [c for c in hidden_cases if c.is_shown]
     print(f"{sum(c.is_right for c in shown)} of {len(shown)} hidden causes over {STRONG:g} sigma named")
+    intervals = [c.is_in_interval for c in hidden_cases if c.is_in_interval is not None]
+    print(f"{sum(intervals)} of {len(intervals)} 95 % intervals hold the true size")
     print(f"{right} of {len(hidden_cases)} hidden causes named ({share:.0f} %), {quiet} of {len(nulls)} drives without one have no finding")
 
 

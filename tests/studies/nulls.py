@@ -2,8 +2,9 @@
 
 Healthy robots, each off its file by what robot files are accurate to, on drives of about a minute: the simulator's with its usual noise,
 with three times the noise of ranges, on small and large robots, and by MuJoCo's contacts (extra `mujoco`); of robots with casters, which
-the simulator does not have, windows of motion with a reference's noise.
-Every case is determined by its number; drives are kept in --folder.
+the simulator does not have, windows of motion with a reference's noise. From case 1000 on by the thesis's contact law, which the robot's
+file has as well, by MuJoCo's contacts with friction that creeps up to slips of 0.15 m/s, with encoders of few counts, and with five times
+the noise of gyro and accelerometers. Every case is determined by its number; drives are kept in --folder.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from localization.diagnosis.linearization import TOLERANCE, default_model
 from localization.logs import open_log
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig
-from localization.simulation.sensors import ImuConfig, SensorConfig
+from localization.simulation.sensors import EncoderConfig, ImuConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE
@@ -38,6 +39,8 @@ from tests.helpers.diagnosis_windows import drive_of_windows, windows
 
 CASES = 120
 _KINDS = ("usual noise", "usual noise", "three times the noise of ranges", "other robots", "MuJoCo")
+_FURTHER = ("the thesis's contact law", "MuJoCo, friction that creeps", "encoders of 512 counts", "five times the noise of the IMU")
+_FIRST_FURTHER = 1000
 _ROBOTS = ("vaultbot", "husky_a200", "jackal", "warthog")
 _OTHERS = ("leo", "rosbot_xl", "rover_pro", "pioneer_3at", "scout_mini", "husky_a300", "pioneer_3dx", "turtlebot3_burger")
 _IN_MUJOCO = ("husky_a200", "jackal", "warthog", "scout_2")
@@ -58,26 +61,28 @@ class Null:
 
     @property
     def kind(self) -> str:
-        return _KINDS[self.number % len(_KINDS)]
+        kinds = _KINDS if self.number < _FIRST_FURTHER else _FURTHER
+        return kinds[self.number % len(kinds)]
 
     @property
     def robot(self) -> str:
-        names = {"other robots": _OTHERS, "MuJoCo": _IN_MUJOCO}.get(self.kind, _ROBOTS)
-        return names[self.number // len(_KINDS) % len(names)]
+        kinds = _KINDS if self.number < _FIRST_FURTHER else _FURTHER
+        names = _OTHERS if self.kind == "other robots" else _IN_MUJOCO if self.kind.startswith("MuJoCo") else _ROBOTS
+        name = names[self.number // len(kinds) % len(names)]
+        return f"{name}_thesis" if self.kind == "the thesis's contact law" else name
 
     def drive(self) -> Drive:
         """Simulated; what the diagnosis gets of it."""
         rng, robot = np.random.default_rng(_SEED + self.number), robot_named(self.robot)
-        is_plain = self.kind == "MuJoCo" or robot.drive == DIFF_DRIVE
+        is_plain = self.kind.startswith("MuJoCo") or robot.drive == DIFF_DRIVE
         off = {name: float(rng.normal(0.0, TOLERANCE * CAUSES[name].negligible)) for name in (_OF_GEOMETRY if is_plain else _DEVIATING)}
-        noise_m = ScannerConfig().noise_m * (3.0 if self.kind == "three times the noise of ranges" else 1.0)
-        sensors = SensorConfig(scanner=ScannerConfig(beams=191, noise_m=noise_m), imu=ImuConfig(rate_hz=50.0))
-        config = SimulationConfig(experiment=ExperimentConfig(laps=1, payload_kg=0.0), sensors=sensors)
+        config = SimulationConfig(experiment=ExperimentConfig(laps=1, payload_kg=0.0), sensors=_sensors(self.kind))
         route = drive(f"random_{_SEED + self.number}" if self.number % 3 else "tour")
-        if self.kind == "MuJoCo":
-            from tests.helpers.mujoco_vehicle import MujocoSimulation as Simulated
-        else:
-            Simulated = Simulation  # type: ignore[assignment, misc]
+        Simulated: type[Simulation] = Simulation
+        if self.kind.startswith("MuJoCo"):
+            from tests.helpers.mujoco_vehicle import CreepingMujocoSimulation, MujocoSimulation
+
+            Simulated = MujocoSimulation if self.kind == "MuJoCo" else CreepingMujocoSimulation
         if robot.drive == DIFF_DRIVE:  # the simulator's robots skid on four wheels
             g = robot.geometry
             real = dataclasses.replace(g, wheel_radius_m=g.wheel_radius_m * (1.0 + off["wheel_radius_scale"]))
@@ -86,6 +91,19 @@ class Null:
             path = Path(folder) / "drive.mcap"
             write_simulation(path, Simulated(route, robot, _SEED + self.number, off, config))
             return drive_of_log(open_log(path, robot))
+
+
+def _sensors(kind: str) -> SensorConfig:
+    """Sensors of a ``kind`` of drive, of half of the typical beams."""
+    usual, imu = ScannerConfig(beams=191), ImuConfig(rate_hz=50.0)
+    if kind == "three times the noise of ranges":
+        return SensorConfig(scanner=dataclasses.replace(usual, noise_m=3.0 * usual.noise_m), imu=imu)
+    if kind == "encoders of 512 counts":
+        return SensorConfig(scanner=usual, imu=imu, encoders=EncoderConfig(counts=512))
+    if kind == "five times the noise of the IMU":
+        noisy = dataclasses.replace(imu, gyro_noise=5.0 * imu.gyro_noise, force_noise=5.0 * imu.force_noise)
+        return SensorConfig(scanner=usual, imu=noisy)
+    return SensorConfig(scanner=usual, imu=imu)
 
 
 def kept(null: Null, folder: Path) -> Drive:
@@ -145,7 +163,7 @@ def main() -> None:
             marks = "written " * found.is_written + "term written " * found.has_term
             print(f"{number:4d} {null.kind:32s} {null.robot:18s} {found.verdict:12s} {marks}{found.sentence} {found.term}", flush=True)
     print(f"{'':32s} cases  not consistent  written  terms written")
-    for kind in dict.fromkeys(_KINDS):
+    for kind in counts:
         c = counts[kind]
         print(f"{kind:32s} {c['cases']:5d}  {c['alarms']:14d}  {c['written']:7d}  {c['terms']:13d}")
     print(f"CPU time of a diagnosis: median {np.median(seconds):.1f} s, longest {max(seconds):.1f} s")

@@ -66,6 +66,10 @@ def _correct_law(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     return draft.with_step(f"the tyres follow the other law by {100.0 * size:.0f} %; [models.friction] has contact = {law!r}.")
 
 
+_WITH_GRIP_OF_BOTH_SIDES = (-1.9, 1.9)
+"""Differences by which the weaker side has a twentieth of its grip at least: at 2 it has none, which no robot file holds."""
+
+
 def _correct_split(draft: CorrectionDraft, size: float) -> CorrectionDraft:
     draft = _correct_friction("split_friction")(draft, size)
     return draft.with_step(f"the left wheels grip {100.0 * size:+.0f} % more than the right ones: compare the tyres' treads.")
@@ -124,6 +128,7 @@ SPLIT_FRICTION = Cause(
     correct=_correct_split,
     remedy="compare the tyres of both sides, and the floor under them",
     by_skidding=True,
+    limits=_WITH_GRIP_OF_BOTH_SIDES,
 )
 LATERAL_FORCE_LAW = Cause(
     "lateral_force_law",
