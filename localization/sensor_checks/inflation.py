@@ -52,6 +52,8 @@ class CovarianceInflation:
         """(3,) the same while that is not decided: no fault yet."""
         self.late_s = 0.0
         """By how much the clock of the poses may be off [s]."""
+        self.scale = 0.0
+        """Share by which the path may be too long or too short."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -78,7 +80,7 @@ class CovarianceInflation:
     @property
     def is_acting(self) -> bool:
         """Whether estimates get another covariance."""
-        return self.is_inflating or self.possible is not None or self._turned_about_m is not None
+        return self.is_inflating or self.possible is not None or self._turned_about_m is not None or self.scale > 0.0
 
     @property
     def is_inflating(self) -> bool:
@@ -109,6 +111,8 @@ class CovarianceInflation:
             self._pending = np.zeros((3, 3))
         if self._turned_about_m is not None:
             estimate = estimate.widened(_turned_about(self._pose, self._turned_about_m))
+        if self.scale:
+            estimate = estimate.widened(_scaled_by(self._pose, self.scale))
         if estimate.covariance is not None and self.possible is not None:
             estimate = estimate.widened(np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
@@ -126,6 +130,9 @@ class CovarianceInflation:
         if self._turned_about_m is not None and smoothed.covariances is not None:
             turned = np.array([_turned_about(se2.between(smoothed.poses[0], pose), self._turned_about_m) for pose in smoothed.poses])
             smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + turned)
+        if self.scale and smoothed.covariances is not None:
+            scaled = np.array([_scaled_by(se2.between(smoothed.poses[0], pose), self.scale) for pose in smoothed.poses])
+            smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + scaled)
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
@@ -150,6 +157,13 @@ def _turned_about(pose: Pose2, ahead_m: float) -> Cov3:
     difference = np.array([2.0 * x, 2.0 * y, 0.0])
     lever = (2.0 * ahead_m) ** 2
     return np.asarray(np.outer(difference, difference) + np.diag([lever, lever, 0.0]))
+
+
+def _scaled_by(pose: Pose2, scale: float) -> Cov3:
+    """Covariance (3, 3) of a ``pose`` since the start whose path is too long by the share ``scale``, or too short."""
+    x, y, _ = se2.inverse(pose)
+    difference = np.array([scale * x, scale * y, 0.0])
+    return np.asarray(np.outer(difference, difference))
 
 
 def _widen_by_way(trajectory: Trajectory, late_s: float) -> Trajectory:

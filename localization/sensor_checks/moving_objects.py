@@ -318,14 +318,13 @@ class _Report:
 
 @kernel
 def _compare_motions(since: FloatArray, now: FloatArray) -> tuple[bool, float]:
-    """Whether a scan at the poses ``now`` by wheels and estimate, (2, 3), is compared with one at ``since``, for both are near; and the
-    distance of the motion by the estimate from that by the wheels [m]."""
+    """Whether a scan at the poses ``now`` by wheels and estimate, (2, 3), is compared with one at ``since``, for the wheels' motion is
+    short; and the distance of the motion by the estimate from that by the wheels [m]."""
     by_wheels = se2.scalar_between(triple(since[0]), triple(now[0]))
     by_estimate = se2.scalar_between(triple(since[1]), triple(now[1]))
     off = se2.scalar_log(se2.scalar_between(by_estimate, by_wheels))
-    way = max(math.hypot(by_wheels[0], by_wheels[1]), math.hypot(by_estimate[0], by_estimate[1]))
-    turn = max(abs(by_wheels[2]), abs(by_estimate[2]))
-    return way < _MAX_WAY_M and turn < _MAX_TURN_RAD, math.hypot(off[0], off[1])
+    is_near = math.hypot(by_wheels[0], by_wheels[1]) < _MAX_WAY_M and abs(by_wheels[2]) < _MAX_TURN_RAD
+    return is_near, math.hypot(off[0], off[1])
 
 
 def _distance_since_oldest(views: Iterable[_View], now: FloatArray) -> float:

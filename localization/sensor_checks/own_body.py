@@ -17,6 +17,7 @@ LIDAR_OWN_BODY = SensorFault(
     "{percent:.0f} % of the LiDAR's points are the robot itself (same ranges while it drives and turns). They are left out"
     " from then on. Remove what covers the LiDAR, or filter these beams in its driver (laser_filters).",
     reference="wheels and gyro",
+    is_of_scans=True,
     draws_map=True,
 )
 

@@ -16,6 +16,7 @@ from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFau
 from localization.sensor_checks.innovations import TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
 from localization.sensor_checks.reckoning import FILE, FILE_GYRO
+from localization.sensor_checks.scales import RADIUS, ScaleCheck
 from motion_models.se2 import FloatArray
 
 DIFFERENCES: Mapping[Pair, SensorFault] = {
@@ -79,7 +80,7 @@ class SensorConsistency:
     takes it back. Where scans are matched, and it is not their stamps that explain the difference, they decide."""
 
     def __init__(self, faults: FaultLog) -> None:
-        self._faults, self._clipping = faults, _Clipping()
+        self._faults, self._clipping, self._scales = faults, _Clipping(), ScaleCheck(faults)
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._reckoning = faults.inflation.reckoning
         self._totals: Regressors = (0.0, 0.0, 0.0, 0.0)  # what causes are proportional to, since the first step
@@ -165,7 +166,10 @@ class SensorConsistency:
         self._report(fault, episode, worst.sigmas, numbers)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
-        """Report the learned parameter that is farthest from the robot file, where it is too far."""
+        """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""
+        if learned and learned[0].name == RADIUS:
+            self._scales.compare(learned[0])
+            learned = learned[1:]
         off = _farthest(learned)
         if off is None or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
             self._end(PARAMETER_FAR)

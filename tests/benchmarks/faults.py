@@ -1,6 +1,7 @@
-"""A campaign of mutated logs: faults of sensors and of files, all drives, formats and models, by seed. Prints what was survived.
+"""A campaign of mutated logs: faults of sensors and of files, all drives, formats and models, by seed. Prints what was survived,
+and the cases that were not, or in which wheels or KISS-ICP alone end within 0.3 m and the estimate does not.
 
-python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs] [--checks] [--scenes] [--seeds 1]
+python -m tests.benchmarks.faults [--count 300] [--seed 0] [--only TEXT] [--verbose] [--pairs] [--checks] [--scenes] [--changes] [--seeds 1]
 
 `--pairs` prints faults that no check knows by name instead, without the test of pairs of sensors and with it: the largest error of the
 position at its sigma [m], what wheels and scans alone make of the drive, and what is reported.
@@ -11,6 +12,9 @@ without a LiDAR.
 `--scenes` prints drives among people, vehicles, dust, glass and mirrors, and along a bare corridor (`tests.helpers.moving_scenes`): the
 error of the position that is most sigmas large, of those above 10 cm (else the largest), the error at the end, the largest of wheels and
 of KISS-ICP alone [m], and what is reported. "wrong": over 5 sigma and 10 cm, or over 1 m and 3 sigma, whatever is reported.
+
+`--changes` prints faults of scale, of stamps and on the way likewise, in a room with a gyro and in another one without, with the number of
+poses that are wrong; and named faults there. "peer": wheels or KISS-ICP alone stay within 0.3 m, and the EKF does not.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ from localization.events import ImuSample, Step
 from localization.sensor_checks import checks, contradictions
 from localization.sensor_checks.faults import SensorFault
 from tests.helpers import fault_drives, moving_scenes
-from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, named_faults, without_gyro
+from tests.helpers.event_faults import EventFault, faults_of_stamps, faults_of_turns, faults_on_the_way, named_faults, without_gyro
 from tests.helpers.hostile_logs import BAD, Case, cases, run_guarded, write_case
 
 
@@ -42,12 +46,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--pairs", action="store_true", help="faults without a name, instead of the campaign")
     parser.add_argument("--checks", action="store_true", help="faults with a check of their own, instead of the campaign")
     parser.add_argument("--scenes", action="store_true", help="scenes that move, instead of the campaign")
-    parser.add_argument("--seeds", type=int, default=1, help="of each scene")
+    parser.add_argument("--changes", action="store_true", help="faults of scale, of stamps and on the way, instead of the campaign")
+    parser.add_argument("--seeds", type=int, default=1, help="of each scene, and of the drives with --changes")
     options = parser.parse_args([] if arguments is None else arguments)
     tables = {
         "pairs": lambda: _table_of_pairs(options.only),
         "checks": lambda: _table_of_checks(options.only),
         "scenes": lambda: _table_of_scenes(options.only, options.seeds),
+        "changes": lambda: _table_of_changes(options.only, options.seeds),
     }
     chosen = [table for name, table in tables.items() if getattr(options, name)]
     if chosen:
@@ -73,8 +79,8 @@ def _campaign(folder: Path, chosen: list[Case], seed: int, verbose: bool) -> Non
         counts[outcome.kind] += 1
         seconds.append(took)
         line = f"{outcome.kind}: {case} ({outcome.error_m:.3f} m, {outcome.sigmas:.1f} sigma, {took:.1f} s) {outcome.message[:300]}"
-        if outcome.kind in BAD:
-            bad.append(line)
+        if outcome.kind in BAD or outcome.peers:
+            bad.append(f"{line} PEERS: {outcome.peers}" if outcome.peers else line)
         if verbose:
             print(line, flush=True)
         shutil.rmtree(folder / str(case.number), ignore_errors=True)
@@ -178,16 +184,37 @@ def _table_of_checks(only: str) -> Iterator[str]:
 
 
 def _table_of_scenes(only: str, seeds: int) -> Iterator[str]:
-    yield "| scene | seed | EKF, worst | at the end | wheels alone | KISS-ICP alone | | reported |"
+    yield _HEADER.format(first="scene")
     yield "|---|---|---|---|---|---|---|---|"
     for name, make in moving_scenes.SCENES.items():
         for seed in range(seeds if only in name else 0):
-            drive = make(seed)
-            ekf, wheels, lidar = (fault_drives.run(drive, estimator=e) for e in ("ekf", "odometry", "lidar"))
-            cells = [f"{error:.3f} at {sigma:.3f}" for error, sigma in (ekf.least_consistent, ekf.last)]
-            cells += [f"{peer.worst[0]:.3f}" for peer in (wheels, lidar)] + ["wrong" if ekf.is_wrong else ""]
-            known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in ekf.warnings)
-            yield f"| {name} | {seed} | {' | '.join(cells)} | {known} |"
+            yield _row(name, seed, make(seed), None)
+
+
+def _table_of_changes(only: str, seeds: int) -> Iterator[str]:
+    yield _HEADER.format(first="drive, fault")
+    yield "|---|---|---|---|---|---|---|---|"
+    for name, fault in (faults_on_the_way() | named_faults()).items():
+        for seed in range(seeds if only in name else 0):
+            yield _row(f"room, {name}", seed, fault_drives.in_room(0, seed), fault)
+            if "gyro" not in name:
+                yield _row(f"room, no gyro, {name}", seed, fault_drives.in_room(1, seed), without_gyro(fault))
+
+
+_HEADER = "| {first} | seed | EKF, worst | at the end | wheels alone | KISS-ICP alone | | reported |"
+_NEAR_M = 0.3
+"""A peer that stays so near is right [m]."""
+
+
+def _row(name: str, seed: int, drive: fault_drives.FaultDrive, fault: EventFault | None) -> str:
+    """What the EKF makes of a drive, and wheels and scans alone."""
+    ekf, wheels, lidar = (fault_drives.run(drive, fault, estimator=e) for e in ("ekf", "odometry", "lidar"))
+    cells = [f"{error:.3f} at {sigma:.3f}" for error, sigma in (ekf.least_consistent, ekf.last)]
+    peers = [peer.worst[0] for peer in (wheels, lidar)]
+    marks = [f"wrong ({ekf.is_wrong_at.sum()} of {len(ekf.errors)})"] if ekf.is_wrong else []
+    marks += ["peer"] if min(peers) < _NEAR_M <= ekf.worst[0] else []
+    known = "; ".join(warning.split(": ", 1)[-1][:110] for warning in ekf.warnings)
+    return f"| {name} | {seed} | {' | '.join(cells)} | {' | '.join(f'{peer:.3f}' for peer in peers)} | {', '.join(marks)} | {known} |"
 
 
 if __name__ == "__main__":

@@ -138,6 +138,57 @@ def named_faults(axis: int = 2) -> dict[str, EventFault]:
     }
 
 
+def scale_ranges(factor: float) -> EventFault:
+    """Ranges ``factor`` times as long."""
+    return change_scans(lambda scan, begin_ns: replace(scan, points=scan.points * factor))
+
+
+def jitter_scan_stamps(sigma_s: float, seed: int = 0) -> EventFault:
+    """Stamps of scans with a normal error of ``sigma_s`` [s] each, as of a driver that takes the time at which it has read a scan."""
+    rng = np.random.default_rng(seed)
+    return change_scans(lambda scan, begin_ns: replace(scan, stamp_ns=scan.stamp_ns + round(1e9 * sigma_s * float(rng.normal()))))
+
+
+def bump_lidar(degrees: float, part: float = 0.5) -> EventFault:
+    """The LiDAR is turned about its axis at the ``part`` of the drive."""
+
+    def apply(events: list[Event]) -> Iterable[Event]:
+        first_ns, last_ns = events[0].stamp_ns, events[-1].stamp_ns
+        later = [e for e in events if e.stamp_ns >= first_ns + part * (last_ns - first_ns)]
+        return [*events[: len(events) - len(later)], *turn_scans(degrees)(later)]
+
+    return apply
+
+
+def _repeat_scans(events: list[Event], begin: float = 0.4, end: float = 0.6) -> Iterator[Event]:
+    """The LiDAR's driver publishes its last scan again and again."""
+    first_ns, last_ns, last = events[0].stamp_ns, events[-1].stamp_ns, None
+    for event in events:
+        if isinstance(event, Scan):
+            is_repeated = last is not None and begin <= (event.stamp_ns - first_ns) / (last_ns - first_ns) < end
+            last = replace(last, stamp_ns=event.stamp_ns) if is_repeated and last is not None else event
+            event = last
+        yield event
+
+
+def faults_on_the_way() -> dict[str, EventFault]:
+    """Scales, stamps, and changes during a drive, by name."""
+    return {
+        "ranges 10 % long": scale_ranges(1.1),
+        "ranges 10 % short": scale_ranges(0.9),
+        "ranges 3 % long": scale_ranges(1.03),
+        "wheels 10 % large": change_wheels(lambda step, part: step * 0.9),
+        "scan stamps jitter by 30 ms": jitter_scan_stamps(0.03),
+        "LiDAR bumped by 30 deg": bump_lidar(30.0),
+        "LiDAR bumped by 90 deg": bump_lidar(90.0),
+        "scans repeat for 8 s": lambda events: _repeat_scans(events),
+        "wheels 10 % large from half on": change_wheels(lambda step, part: step * (0.9 if part > 0.5 else 1.0)),
+        "sides swapped from half on": change_wheels(lambda step, part: step[::-1] if part > 0.5 else step),
+        "left side counts half from half on": change_wheels(lambda step, part: step * ((0.5, 1.0) if part > 0.5 else (1.0, 1.0))),
+        "wheels backwards for 12 s": change_wheels(lambda step, part: step * (-1.0 if 0.3 < part < 0.6 else 1.0)),
+    }
+
+
 def without_gyro(fault: EventFault | None = None) -> EventFault:
     """``fault`` of a robot without an IMU."""
     return lambda events: [e for e in (events if fault is None else fault(events)) if not isinstance(e, ImuSample)]

@@ -121,10 +121,15 @@ class Outcome:
         return float(self.errors[i]), float(self.sigmas[i])
 
     @property
-    def is_wrong(self) -> bool:
-        """Whether an error is beyond 5 sigma and 10 cm, or beyond a metre at less than its third as sigma."""
+    def is_wrong_at(self) -> np.ndarray:
+        """(n,) whether the error is beyond 5 sigma and 10 cm, or beyond a metre at less than its third as sigma."""
         is_wrong = (self.errors > _SILENT_SIGMAS * self.sigmas) & (self.errors > _SILENT_M)
-        return bool((is_wrong | ((self.errors > _SILENT_FAR_M) & (self.errors > 3.0 * self.sigmas))).any())
+        return np.asarray(is_wrong | ((self.errors > _SILENT_FAR_M) & (self.errors > 3.0 * self.sigmas)))
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether any pose is."""
+        return bool(self.is_wrong_at.any())
 
     @property
     def is_silent(self) -> bool:

@@ -40,6 +40,8 @@ MODELS, ESTIMATORS = ("skid_steer", "diff_drive", "icr"), ("ekf", "ekf", "graph"
 """That replay the mutated logs."""
 FAR_M, MOST_SIGMA = 1.0, 5.0
 """An end error beyond either, without a warning, is silently wrong."""
+NEAR_M = 0.3
+"""A peer (wheels alone, KISS-ICP alone) that ends so near to the truth is right."""
 _MOST_SECONDS = 120.0
 _MOST_BYTES = 4 << 30  # of address space: numba, gtsam and the log itself take 2 GB of it, and a fault may take 2 GB more
 
@@ -260,6 +262,8 @@ class Outcome(NamedTuple):
     sigmas: float
     message: str
     """Warnings that the drive without the fault does not give, or the error."""
+    peers: str = ""
+    """Peers that end within `NEAR_M` where the estimate does not."""
 
 
 BAD = ("wrong", "traceback", "hang", "memory")
@@ -311,11 +315,23 @@ def run_case(case: Case, log: Path, truths: Path, out: Path) -> Outcome:
         return Outcome("refused" if is_input_error else "traceback", math.nan, math.nan, complaints.getvalue().strip())
     usual = _notes_of(_replay_without_fault(case.source, case.model, case.estimator, truths))
     warnings = [n for n in json.loads((out / "metrics.json").read_text())["notes"] if _without_numbers(n) not in usual]
-    error_m, sigmas = _end_error(out, f"{case.model}_{case.estimator}", _reference_of(case.source, truths))
-    is_right = error_m <= FAR_M and sigmas <= MOST_SIGMA
-    if warnings:
-        return Outcome("survived" if is_right else "reported", error_m, sigmas, " | ".join(warnings))
-    return Outcome("survived" if is_right else "wrong", error_m, sigmas, " | ".join(warnings))
+    reference = _reference_of(case.source, truths)
+    error_m, sigmas = _end_error(out, f"{case.model}_{case.estimator}", reference)
+    kind = "survived" if error_m <= FAR_M and sigmas <= MOST_SIGMA else "reported" if warnings else "wrong"
+    peers = "" if case.file_fault or error_m <= NEAR_M else _peers_that_are_near(case, log, out, reference)
+    return Outcome(kind, error_m, sigmas, " | ".join(warnings), peers)
+
+
+def _peers_that_are_near(case: Case, log: Path, out: Path, reference: Path) -> str:
+    """Wheels and KISS-ICP alone that end within `NEAR_M` of the truth, with their errors."""
+    robot, found = _source_named(case.source).robot, []
+    for peer in ("odometry", "lidar"):
+        arguments = ["replay", str(log), "--robot", robot, "--out", str(out / peer), "--reference", "none"]
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            code = main([*arguments, "--model", case.model, "--estimator", peer])
+        errors = [] if code else [_distance_at_end(track, reference) for track in (out / peer).glob(f"*{peer}.tum")]
+        found += [f"{peer} {error_m:.3f} m" for error_m in errors if error_m < NEAR_M]
+    return ", ".join(found)
 
 
 def _notes_of(out: Path) -> list[str]:
@@ -330,17 +346,21 @@ def _without_numbers(note: str) -> str:
 
 def _end_error(out: Path, name: str, truth: Path) -> tuple[float, float]:
     """Distance [m] of the last pose from the truth, both from where the estimate begins, and the same in standard deviations."""
-    found, reference = read_tum(out / f"{name}.tum"), read_reference_file(truth)
+    error_m = _distance_at_end(out / f"{name}.tum", truth)
+    return error_m, error_m / max(_end_sigma_m(out, name), 1e-3)
+
+
+def _distance_at_end(track: Path, truth: Path) -> float:
+    """Distance [m] of the last pose of ``track`` from the ``truth``, both from where it begins."""
+    found, reference = read_tum(track), read_reference_file(truth)
     stamps = np.array(reference.stamps_ns)  # type: ignore[union-attr]
     true = np.column_stack([reference.positions, reference.yaws])  # type: ignore[union-attr]
     inside = np.flatnonzero((found.stamps_ns >= stamps[0]) & (found.stamps_ns <= stamps[-1]))
     if len(inside) < 2:
-        return 0.0, 0.0  # nothing to hold it against: clocks of the log's own
+        return 0.0  # nothing to hold it against: clocks of the log's own
     i, j = inside[0], inside[-1]
     at = [np.array([np.interp(found.stamps_ns[k], stamps, c) for c in (true[:, 0], true[:, 1], np.unwrap(true[:, 2]))]) for k in (i, j)]
-    moved, ought = _relative(found.poses[i], found.poses[j]), _relative(at[0], at[1])
-    error = moved - ought
-    return float(np.linalg.norm(error)), float(np.linalg.norm(error)) / max(_end_sigma_m(out, name), 1e-3)
+    return float(np.linalg.norm(_relative(found.poses[i], found.poses[j]) - _relative(at[0], at[1])))
 
 
 def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:

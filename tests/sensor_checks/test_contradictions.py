@@ -19,7 +19,7 @@ from localization.sensor_checks.contradictions import (
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from tests.helpers.checked_drive import CheckedDrive, turned
-from tests.helpers.event_faults import turn_scans, without_gyro
+from tests.helpers.event_faults import bump_lidar, turn_scans, without_gyro
 from tests.helpers.fault_drives import in_room, run
 
 
@@ -137,3 +137,13 @@ def test_lidar_whose_mount_is_turned_is_found_on_a_drive_of_curves() -> None:
     assert any("the robot travels 2" in warning and "to the left" in warning for warning in outcome.warnings)
     error, sigma = outcome.last
     assert error < 3.0 * sigma
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("has_gyro", [True, False])
+def test_lidar_bumped_at_rest_is_in_the_covariance_of_the_place_it_jumps_to(has_gyro: bool) -> None:
+    """By 90 deg in a room where scans fit .57 and 1.95 m away, too."""
+    fault = bump_lidar(90.0)
+    outcome = run(in_room(0 if has_gyro else 1, 1), fault if has_gyro else without_gyro(fault))
+    assert outcome.worst[0] > 0.5
+    assert not outcome.is_wrong, outcome.least_consistent

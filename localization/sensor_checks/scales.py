@@ -1,0 +1,54 @@
+"""Ways by the LiDAR and by the wheels of another scale, where no third sensor shows which is off.
+
+The filter learns the wheels' radius from scans. Ranges that are all too long by a factor look the same: no turn shows it, and the submap
+has the factor as well. Then the whole path is too long by it, from the start on.
+"""
+
+from __future__ import annotations
+
+import math
+
+from localization.estimators import LearnedParameter
+from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
+from localization.sensor_checks.pairs import LIDAR_WHEELS_WAYS, NAMED
+
+SCALES_APART = SensorFault(
+    "ways by the LiDAR are {percent:.0f} % {longer} than those by the wheels with this robot file's radius: its ranges are that much too"
+    " {long}, or the wheels that much {larger}, and no third sensor shows which. The covariance has the difference from the start on."
+    " Compare a range with a tape measure, and correct the LiDAR's driver or geometry.wheel_radius_m."
+)
+RADIUS = "wheel_radius_scale"
+_MIN_PRIOR_SIGMAS, _MIN_SIGMAS, _MIN_REPORTED_SIGMAS = 2.0, 2.0, 4.0
+"""Radius by scans alone, in sigmas of its prior (3 %) and of its own, from which on the covariance has the difference, and is reported.
+MIT-CSAIL's is 2.5 %, the others' 1 % and less: ranges that are off by less cannot be distinguished from such wheels."""
+_MAX_SCALE = 0.3
+"""Beyond it the wheels have another unit, or spin: ranges that are 3 % off are those of the cheapest LiDARs (URG-04LX)."""
+
+
+class ScaleCheck:
+    """`compare` the radius as it is learned. The error of ranges lasts all along: it is at most the least that was possible so far, so that
+    wheels that begin to spin, or lose counts, on the way leave the scale of the ranges as it was."""
+
+    def __init__(self, faults: FaultLog) -> None:
+        self._faults, self._most, self._reported = faults, math.inf, 0.0
+
+    def compare(self, radius: LearnedParameter) -> None:
+        """Take the wheels' ``radius`` as it is learned."""
+        if self._faults.declared and any(fault in self._faults.declared for fault in NAMED[LIDAR_WHEELS_WAYS]):
+            self._faults.inflation.scale = 0.0
+            self._faults.retract(SCALES_APART)
+            return
+        share = 1.0 - (radius.sigma / radius.prior_sigma) ** 2  # of its information, by scans
+        if share <= 0.0:
+            return
+        off, sigma = (radius.value - radius.file_value) / share, radius.sigma / math.sqrt(share)
+        self._most = min(self._most, abs(off) + 2.0 * sigma)
+        scale = min(abs(off), self._most)
+        is_off = max(_MIN_PRIOR_SIGMAS * radius.prior_sigma, _MIN_SIGMAS * sigma) < scale < _MAX_SCALE
+        self._faults.inflation.scale = scale if is_off else 0.0
+        if is_off and scale > _MIN_REPORTED_SIGMAS * sigma and round(scale, 2) != self._reported:
+            self._reported = round(scale, 2)
+            words = ("longer", "long", "larger") if off > 0.0 else ("shorter", "short", "smaller")
+            numbers = dict(zip(("longer", "long", "larger"), words, strict=True))
+            message = SCALES_APART.message.format(percent=100.0 * scale, **numbers)
+            self._faults.revise(DetectedFault(SCALES_APART, 0.0, message))

@@ -1,0 +1,88 @@
+"""Ranges or wheels of another scale: nothing shows which, and the covariance has the difference from the start on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from localization.estimators import LearnedParameter
+from localization.sensor_checks.contradictions import LIDAR_DIRECTION
+from localization.sensor_checks.faults import FaultLog
+from localization.sensor_checks.inflation import CovarianceInflation
+from localization.sensor_checks.scales import SCALES_APART, ScaleCheck
+from localization.trajectory import Trajectory
+from tests.helpers.event_faults import change_wheels, scale_ranges
+from tests.helpers.extended import cases
+from tests.helpers.fault_drives import in_room, run
+
+PRIOR = 0.03
+
+
+def learn(check: ScaleCheck, truth: float, sigma: float) -> None:
+    """A radius measured as ``truth`` with ``sigma``, and the prior."""
+    variance = 1.0 / (1.0 / PRIOR**2 + 1.0 / sigma**2)
+    check.compare(LearnedParameter("wheel_radius_scale", truth * variance / sigma**2, float(np.sqrt(variance)), 0.0, PRIOR))
+
+
+@pytest.fixture
+def faults() -> FaultLog:
+    return FaultLog(CovarianceInflation())
+
+
+@pytest.mark.parametrize(("truth", "expected"), [(0.1, 0.1), (-0.1, 0.1), (0.025, 0.0), (8.5, 0.0)])
+def test_scale_of_the_drive_is_that_of_the_radius_without_its_prior(faults: FaultLog, truth: float, expected: float) -> None:
+    """2.5 % is MIT-CSAIL's; angles in rpm are no scale of ranges."""
+    check = ScaleCheck(faults)
+    for sigma in (0.1, 0.03, 0.01):
+        learn(check, truth, sigma)
+    assert faults.inflation.scale == pytest.approx(expected)
+    assert (SCALES_APART in faults.found) == (expected > 0.0)
+
+
+def test_radius_that_changes_on_the_way_is_no_scale_of_ranges(faults: FaultLog) -> None:
+    check = ScaleCheck(faults)
+    for truth in (0.0, 0.0, 0.1, 0.1):
+        learn(check, truth, 0.01)
+    assert faults.inflation.scale == 0.0
+    assert SCALES_APART not in faults.found
+
+
+def test_scale_that_a_named_fault_explains_is_reported_no_more(faults: FaultLog) -> None:
+    check = ScaleCheck(faults)
+    learn(check, -0.2, 0.01)
+    assert SCALES_APART in faults.found
+    faults.declare(LIDAR_DIRECTION, 0.0, {"degrees": 25.0, "side": "left", "correction": -25.0})
+    learn(check, -0.2, 0.01)
+    assert SCALES_APART not in faults.found
+    assert faults.inflation.scale == 0.0
+
+
+def test_smoothed_trajectory_has_the_scale_of_the_way_from_its_start() -> None:
+    inflation = CovarianceInflation()
+    inflation.scale = 0.1
+    poses = np.array([[1.0, 2.0, 0.0], [4.0, 2.0, 0.0], [4.0, 6.0, np.pi / 2]])
+    found = inflation.inflate_trajectory(Trajectory(np.arange(3), poses, np.zeros((3, 3, 3)))).covariances
+    assert found is not None
+    np.testing.assert_allclose(found[:, 0, 0], [0.0, 0.09, 0.16], atol=1e-12)
+    np.testing.assert_allclose(found[:, 1, 1], [0.0, 0.0, 0.09], atol=1e-12)
+
+
+@pytest.mark.parametrize("factor", cases([1.1, 0.9], usual=["1.1"]))
+def test_ranges_of_another_scale_are_in_the_covariance(factor: float) -> None:
+    outcome = run(in_room(), scale_ranges(factor))
+    assert outcome.last[0] > 0.3
+    assert not outcome.is_wrong, outcome.least_consistent
+    assert outcome.last[1] < 1.5 * outcome.last[0]
+    assert SCALES_APART in outcome.pipeline.checks.found
+
+
+@pytest.mark.extended
+def test_wheels_of_another_radius_leave_the_pose_of_a_lidar() -> None:
+    """The same measurements as of ranges that are too long, and the other one is right; half way on, the ranges cannot be it."""
+    outcome = run(in_room(), change_wheels(lambda step, part: 0.9 * step))
+    assert outcome.worst[0] < 0.05
+    assert SCALES_APART in outcome.pipeline.checks.found
+    outcome = run(in_room(), change_wheels(lambda step, part: step * (0.9 if part > 0.5 else 1.0)))
+    assert outcome.worst[0] < 0.05
+    assert outcome.last[1] < 0.05
+    assert SCALES_APART not in outcome.pipeline.checks.found
