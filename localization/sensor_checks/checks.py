@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from localization.estimators import Estimate, Estimator, Residuals
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
@@ -17,16 +19,17 @@ from localization.sensor_checks.gyro_rate import GyroRate, rate_off
 from localization.sensor_checks.inflation import CovarianceInflation, lever_of_unknown_front
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
-from localization.sensor_checks.moving_objects import MAX_NIS, MovingObjects
+from localization.sensor_checks.moving_objects import MAX_NIS, MIN_OFF_M, MovingObjects
 from localization.sensor_checks.own_body import OwnBody
-from localization.sensor_checks.reckoning import ESTIMATE, ReckonedStep
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.window import Window
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
+from motion_models import se2
 from motion_models.robot import Mount, Robot
+from motion_models.se2 import Pose2
 
 _TOGETHER_S = 0.5
 """Steps of this time are examined together while no check acts [s]. Faults are found by windows of 2.5 s and more."""
@@ -37,15 +40,19 @@ class _Record(NamedTuple):
 
     step: Step
     estimate: Estimate
+    pose: Pose2
+    """(3,) of the estimate, by sensors alone: without what loops have moved it by."""
     residuals: Residuals | None
-    reckoned: ReckonedStep
+    is_compared: bool
+    """Its sensors were compared before the estimator had it."""
 
 
 class SensorChecks:
     """`apply` to each step before the estimator, `inflate` its estimate, and `examine` the steps that were published.
 
-    While the sensors agree, steps and estimates are as they came: they are recorded, and examined together afterwards. Where a check
-    changes them, or the wheels stand, each step is examined as it comes.
+    Steps are recorded with their estimates, and the records examined in their order. While the sensors agree, steps and estimates are as
+    they came, and half a second of them is examined together afterwards. Where a check changes them, or the wheels stand, a step's sensors
+    are compared before the estimator has it, and its record is examined before it is published.
     """
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, robot: Robot | None = None) -> None:
@@ -61,6 +68,8 @@ class SensorChecks:
         self._mounts, self._is_lidar_placed = mounts, True
         self._reckoning = self._inflation.reckoning
         self._records: list[_Record] = []
+        self._by_wheels = np.zeros(3)
+        self._examined = np.zeros((2, 3)), np.zeros((2, 3))  # poses by wheels and estimate at the last examination but one, and at the last
         self._is_acting = True
 
     def insert_imu(self, sample: ImuSample) -> None:
@@ -77,14 +86,13 @@ class SensorChecks:
         if not math.isfinite(step.predicted.delta.sum()):
             return step  # the estimator refuses it
         step = self._own_body.remove(step)
-        if not self._is_acting and not step.is_standing and (step.turn is None or not rate_off(step)):
-            self._reckoning.predict(step)
+        if not (self._is_acting or step.is_standing or (step.turn is not None and rate_off(step))):
             return step
         self._examine_records(estimator)
         self._is_acting = True
-        step = self._compare_sensors(step, is_to_come=True)
-        self._reckoning.predict(step)
-        step = self._moving.apply(step, is_to_come=True)
+        step = self._compare(step, is_to_come=True)
+        if self._moving.is_led_away:
+            step = self._moving.lead_back(step)
         if self._faults.is_map_wrong:
             self._faults.is_map_wrong = False
             step = replace(step, restarts_map=True)  # without the scans that had the fault
@@ -96,19 +104,14 @@ class SensorChecks:
     def inflate(self, step: Step, estimate: Estimate, estimator: Estimator) -> Estimate:
         """``estimate`` of ``estimator`` after ``step`` with the covariance of what faulty sensors have done to it; unchanged without one
         (LiDAR alone)."""
-        residuals = estimator.residuals
-        pose = estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]  # by sensors alone
-        self._reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
-        record = _Record(step, estimate, residuals, self._reckoning.step)
-        if self._is_acting:
-            self._add(record, estimator)
-        else:
-            self._records.append(record)
-            self._is_acting = self._moving.is_off() or not (estimate.nis is None or estimate.nis < MAX_NIS)
-            if self._is_acting:
-                self._examine_records(estimator)
-        if self._is_acting:
-            estimate, self._is_acting = self._inflate(record, estimator), self._has_to_act()
+        pose = estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]
+        self._records.append(_Record(step, estimate, pose, estimator.residuals, self._is_acting))
+        by_wheels = self._by_wheels = se2.compose(self._by_wheels, step.predicted.delta)
+        before, _ = self._examined
+        x, y, _ = np.subtract(*se2.between(before, (by_wheels, pose)))
+        contradicts = math.hypot(x, y) > MIN_OFF_M or not (estimate.nis is None or estimate.nis < MAX_NIS)
+        if self._is_acting or contradicts:
+            estimate = self._examine_records(estimator) or estimate
         late_s, twist = self._inflation.late_s, estimate.twist  # the way in the time by which the clock of the poses may be off
         return estimate if not late_s or twist is None else estimate.widened(twist[:, None] * twist * late_s**2)
 
@@ -116,30 +119,27 @@ class SensorChecks:
         """Examine the steps that ``estimator`` has published, once there are enough, or none ``is_last``."""
         records = self._records
         if records and (is_last or (records[-1].step.end_ns - records[0].step.start_ns) * 1e-9 >= _TOGETHER_S):
-            last = records[-1]
             self._examine_records(estimator)
-            self._inflate(last, estimator)
-            self._is_acting = self._has_to_act()
 
-    def _has_to_act(self) -> bool:
-        """Whether a check changes the next step, or its estimate."""
+    def _examine_records(self, estimator: Estimator) -> Estimate | None:
+        """Examine the records, and decide whether a check has to act from here on; the last estimate with its covariance."""
+        if not self._records:
+            return None
+        records, self._records = self._records, []
+        self._examined = self._examined[1], np.array([self._by_wheels, records[-1].pose])
+        for record in records:
+            if not record.is_compared:
+                self._compare(record.step, is_to_come=False)
+            self._compare_estimate(record, estimator)
+        self._own_body.report()  # of steps up to here, whose sensors are compared
+        inflated = self._inflate(records[-1], estimator)
         is_led_away = self._faults.is_map_wrong or self._faults.have_scans_led_away
         is_step_changed = self._gyro_rate.is_acting or self._contradictions.is_acting or self._moving.is_acting
-        return is_led_away or is_step_changed or self._inflation.is_acting
+        self._is_acting = is_led_away or is_step_changed or self._inflation.is_acting
+        return inflated
 
-    def _examine_records(self, estimator: Estimator) -> None:
-        records, self._records = self._records, []
-        for record in records:
-            self._reckoning.poses = record.reckoned.before
-            self._compare_sensors(record.step, is_to_come=False)
-            self._reckoning.poses = record.reckoned.predicted
-            self._moving.apply(record.step, is_to_come=False)
-            self._reckoning.poses = record.reckoned.after
-            self._add(record, estimator)
-        self._own_body.report()  # of steps up to here, whose sensors are compared
-
-    def _compare_sensors(self, step: Step, *, is_to_come: bool) -> Step:
-        """``step`` without sensors that contradict the others, for the estimator, for which it ``is_to_come``, or was."""
+    def _compare(self, step: Step, *, is_to_come: bool) -> Step:
+        """``step`` without what contradicts the other sensors, for the estimator, for which it ``is_to_come``, or was."""
         self._faults.start_step(step)
         if step.scan is not None and not step.scan.is_planar:
             self._tilt.add(step.scan)
@@ -151,14 +151,17 @@ class SensorChecks:
         step = self._gyro_rate.apply(step)
         step = replace(step, turn=None) if "gyro" in excluded else step
         step = step.without_scan() if "LiDAR" in excluded else step
-        return self._standstill.apply(step, is_contradicted="wheels" in excluded)
+        step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
+        self._reckoning.predict(step)
+        return self._moving.apply(step)
 
-    def _add(self, record: _Record, estimator: Estimator) -> None:
+    def _compare_estimate(self, record: _Record, estimator: Estimator) -> None:
         """Compare innovations and learned parameters with their covariances.
 
         Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
         """
-        step, estimate, residuals, _ = record
+        step, estimate, pose, residuals, _ = record
+        self._reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
         self._moving.keep_view()
         if estimate.nis is not None:
             self._standstill.restart()
@@ -177,8 +180,7 @@ class SensorChecks:
             return estimate
         self._clocks.add(estimator)
         inflated = self._inflation.inflate(estimate)
-        pose = self._reckoning.poses[ESTIMATE]
-        if scan is not None and self._places.update(lambda: self._window.profile(scan), pose):
+        if scan is not None and self._places.update(lambda: self._window.profile(scan), record.pose):
             self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on
         return inflated
 

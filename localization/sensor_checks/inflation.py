@@ -62,7 +62,7 @@ class CovarianceInflation:
     def lead_back(self, step: Step) -> Step:
         """``step`` at whose end the estimate is where wheels and gyro lead, with the distance to there as its covariance; what was learned
         until then is dropped."""
-        estimated = se2.compose(se2.between(self._agreed[ESTIMATE], self.reckoning.step.before[ESTIMATE]), step.predicted.delta)
+        estimated = se2.compose(se2.between(self._agreed[ESTIMATE], self.reckoning.before[ESTIMATE]), step.predicted.delta)
         off = se2.local(estimated, se2.between(self._agreed[GYRO], self.reckoning.poses[GYRO]))
         motion = replace(step.predicted, delta=se2.retract(step.predicted.delta, off), cov=step.predicted.cov + np.outer(off, off))
         return replace(step, predicted=motion, turn=None, restarts_calibration=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -41,7 +40,7 @@ _MIN_MOVED_WITHOUT_GYRO = 0.2
 """`_MIN_MOVED` for robots without a gyro."""
 _MIN_UNSURE = 0.06
 """Share of a scan on objects that move, from where on it is not sure that the scene is still."""
-_MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
+MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
 """Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
 more than labels can show that they do [m]: of points that move along, wheels explain as few as they do by chance in a still scene."""
 _MAX_SLIP_M, _MAX_TURN_SLIP_RAD = 0.15, 0.2
@@ -111,7 +110,7 @@ class MovingObjects:
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
         self._is_by_scans = False
         """The estimate is by scans, too: one by wheels alone is where they lead."""
-        self._is_led_away = False
+        self.is_led_away = False
         """Scans have led the estimate away from where wheels lead since `_since`."""
         self._explained: tuple[SensorFault, ...] = ()
         """Named faults so far that explain what was taken for moving objects."""
@@ -122,9 +121,8 @@ class MovingObjects:
         """Objects move: scans have the still world alone."""
         return any(lidar.is_active for lidar in self._lidars.values())
 
-    def apply(self, step: Step, *, is_to_come: bool) -> Step:
-        """``step`` whose scan has the still world alone, while more than a few objects move; ``is_to_come``: the estimator will have it,
-        so that it can lead the estimate back."""
+    def apply(self, step: Step) -> Step:
+        """``step`` whose scan has the still world alone, while more than a few objects move."""
         declared = self._faults.declared
         if declared and any(fault in declared for fault in _EXPLAINING if fault not in self._explained):
             self._explained = tuple(fault for fault in _EXPLAINING if fault in declared)
@@ -152,7 +150,6 @@ class MovingObjects:
             found = self._label(references[0], profile, points, _MIN_UNSURE if is_quiet else 0.0)
             self._update(step, lidar, references[0], found)
             if lidar.is_active:
-                step = self._lead_back(step) if self._is_led_away and is_to_come else step
                 labels = [found.scene.labels, *(self._label(view, profile, points).scene.labels for view in references[1:])]
                 step = _with_still(step, np.all(np.array(labels) == STILL, axis=0))
         elif lidar.is_active:
@@ -187,15 +184,9 @@ class MovingObjects:
         if self._since is not None or begin is None:
             return
         is_near, distance = _compare_motions(begin, self._poses)
-        is_off = distance > _MIN_OFF_M or (nis is not None and nis > MAX_NIS)
+        is_off = distance > MIN_OFF_M or (nis is not None and nis > MAX_NIS)
         if self._is_unsure or (is_near and is_off):
             inflation.possible = self._distance(begin)
-
-    def is_off(self) -> bool:
-        """Whether the estimate is off the motion by the wheels since the oldest view that a scan would be compared with."""
-        now = self._poses
-        distances = [_distance_since_oldest(lidar.views, now) for lidar in self._lidars.values()]
-        return max(distances, default=0.0) > _MIN_OFF_M
 
     def _distance(self, since: FloatArray) -> FloatArray:
         """(3,) of the motion by the wheels since the poses ``since`` (2, 3) from that by the estimate."""
@@ -212,14 +203,14 @@ class MovingObjects:
         if not self._agree(poses):
             self._faults.inflation.add(self._distance(poses))
 
-    def _lead_back(self, step: Step) -> Step:
+    def lead_back(self, step: Step) -> Step:
         """``step`` at whose end the estimate is where the wheels lead from `_since`, with the distance to there as its covariance."""
         assert self._since is not None
-        self._is_led_away = False
+        self.is_led_away = False
         motion, by_wheels = step.predicted, se2.between(self._since[0], self._poses[0])
-        before = self._faults.inflation.reckoning.step.before[ESTIMATE]
+        before = self._faults.inflation.reckoning.before[ESTIMATE]
         off = se2.local(se2.compose(se2.between(self._since[1], before), motion.delta), by_wheels)
-        if math.hypot(off[0], off[1]) >= _MIN_OFF_M:
+        if math.hypot(off[0], off[1]) >= MIN_OFF_M:
             motion = replace(motion, delta=se2.retract(motion.delta, off), cov=motion.cov + np.outer(off, off))
             step = replace(step, predicted=motion, turn=None)
         self._since = np.array([self._poses[0], se2.compose(before, motion.delta)])
@@ -273,13 +264,13 @@ class MovingObjects:
         lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
         if now_s - self._suspected_s >= _CALM_S:
             self._suspected = None
-        self._is_unsure = self._suspected is not None or distance > _MIN_OFF_M
+        self._is_unsure = self._suspected is not None or distance > MIN_OFF_M
         self._window.is_scene_moving = now_s - self._shown_s < _CALM_S or lidar.is_active
         if lidar.is_active:
             self.report.add(moved_share)
             if self._since is None:
                 self._since = view.poses if self._suspected is None else self._suspected
-                self._is_led_away = self._is_by_scans
+                self.is_led_away = self._is_by_scans
         elif self._since is not None and not any(other.is_active for other in self._lidars.values()):
             self._end()
 
@@ -288,7 +279,7 @@ class MovingObjects:
         if self._since is not None:
             self._settle(self._since)
             self._since = self._suspected = None
-        self._is_led_away = False
+        self.is_led_away = False
 
     def _restart(self) -> None:
         """The wheels' motion is not known: scans are compared from here on."""
@@ -325,15 +316,6 @@ def _compare_motions(since: FloatArray, now: FloatArray) -> tuple[bool, float]:
     off = se2.scalar_log(se2.scalar_between(by_estimate, by_wheels))
     is_near = math.hypot(by_wheels[0], by_wheels[1]) < _MAX_WAY_M and abs(by_wheels[2]) < _MAX_TURN_RAD
     return is_near, math.hypot(off[0], off[1])
-
-
-def _distance_since_oldest(views: Iterable[_View], now: FloatArray) -> float:
-    """Of the motion by the estimate from that by the wheels since the oldest of the ``views`` that is near [m]; 0 without one."""
-    for view in views:
-        is_near, distance = _compare_motions(view.poses, now)
-        if is_near:
-            return distance
-    return 0.0
 
 
 def _with_still(step: Step, is_still: BoolArray) -> Step:

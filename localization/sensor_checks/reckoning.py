@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from localization.events import Step
@@ -16,30 +14,21 @@ with the robot file's parameters, and by these with the gyro's turns."""
 _NONE = np.zeros(3)
 
 
-class ReckonedStep(NamedTuple):
-    """`Reckoning.poses`, (5, 3) each, before a step, predicted for its end, and after that is estimated."""
-
-    before: FloatArray
-    predicted: FloatArray
-    after: FloatArray
-
-
 class Reckoning:
     """`predict` each step by its sensors, then `correct` it by its estimate."""
 
     def __init__(self) -> None:
         self.poses = np.zeros((5, 3))
         """(5, 3) now. The array is replaced and never changed, so that it can be kept as a moment to measure from."""
-        self.step = ReckonedStep(self.poses, self.poses, self.poses)
-        """The last one."""
+        self.before = self.poses
+        """(5, 3) before the last step."""
 
     def predict(self, step: Step) -> None:
         """Until its end is estimated, ``step`` moves the estimate as wheels and gyro do."""
         delta = step.predicted.delta
         by_gyro = delta if step.turn is None or step.is_standing else np.array([delta[0], delta[1], step.turn.angle])
-        predicted = se2.compose(self.poses, np.array([delta, by_gyro, by_gyro, _NONE, _NONE]))
-        self.step = ReckonedStep(self.poses, predicted, predicted)
-        self.poses = predicted
+        self.before = self.poses
+        self.poses = se2.compose(self.poses, np.array([delta, by_gyro, by_gyro, _NONE, _NONE]))
 
     def correct(self, step: Step, pose: Pose2, file_delta: Pose2 | None) -> None:
         """``pose`` (3,) by the estimate at the end of ``step``; ``file_delta`` (3,) by the wheels with the robot file's parameters."""
@@ -48,7 +37,6 @@ class Reckoning:
         if file_delta is not None:
             by_gyro = file_delta if step.turn is None else np.array([file_delta[0], file_delta[1], step.turn.angle])
             poses[FILE:] = se2.compose(poses[FILE:], np.array([file_delta, by_gyro]))
-        self.step = ReckonedStep(*self.step[:2], poses)
 
     def distance(self, since: FloatArray, row: int) -> FloatArray:
         """(3,) of the ``row`` from the estimate, for their motions since the moment of the poses ``since`` (5, 3)."""

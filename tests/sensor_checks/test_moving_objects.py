@@ -7,18 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.events import Scan, Step
-from localization.lidar import LidarConfig
 from localization.ros.state_serialization import deserialize, serialize
-from localization.sensor_checks.faults import FaultLog
-from localization.sensor_checks.inflation import CovarianceInflation
-from localization.sensor_checks.moving_objects import MOVING_OBJECTS, MovingObjects
+from localization.sensor_checks.moving_objects import MOVING_OBJECTS
 from localization.sensor_checks.scan_motion import make_profile
 from localization.sensor_checks.scene_motion import MOVED, STILL, align_rest, explain
-from localization.sensor_checks.window import Window
 from localization.simulation import world
 from motion_models import se2
-from motion_models.base import Motion
 from tests.helpers import rooms
 from tests.helpers.corridors import KINDS, in_corridor
 from tests.helpers.event_faults import EventFault, multiply_wheels, named_faults, without_gyro
@@ -65,36 +59,6 @@ def test_people_who_walk_along_have_another_motion_than_the_room() -> None:
     rest = align_rest(reference, now, scene)
     assert rest is not None
     assert np.hypot(*rest[:2]) < 0.15  # as if the robot stood
-
-
-def _estimates_off(offs: np.ndarray) -> list[bool]:
-    """`MovingObjects.is_off` after each step of .09 m by the wheels, at whose end the estimate is ``offs`` (n, 2) from there. The first
-    three have scans."""
-    faults, window = FaultLog(CovarianceInflation()), Window({}, LidarConfig())
-    moving, reckoning, found = MovingObjects(faults, window), faults.inflation.reckoning, []
-    points = rooms.scan_from(world.box(-4, -3, 5, 4), np.zeros(3), np.random.default_rng(0), 0.01)
-    for k, off in enumerate(offs):
-        scan = Scan(k * S // 2, np.column_stack([points - [0.09 * k, 0.0], np.zeros(len(points))])) if k < 3 else None
-        motion = Motion(np.array([0.09, 0.0, 0.0]), np.eye(3))
-        step = Step(k * S // 2, (k + 1) * S // 2, motion, np.zeros(3), np.zeros(3), False, True, None, scan)
-        faults.start_step(step)
-        window.add(step, faults.now_s)
-        reckoning.predict(step)
-        moving.apply(step, is_to_come=False)
-        reckoning.correct(step, np.array([0.09 * (k + 1) + off[0], off[1], 0.0]), None)
-        moving.keep_view()
-        found.append(moving.is_off())
-    return found
-
-
-def test_estimate_off_the_wheels_is_found_without_a_scan() -> None:
-    """From 6 cm on since the oldest view within 0.6 m: the first one until the seventh step, the third one until the ninth."""
-    offs = np.zeros((11, 2))
-    assert not any(_estimates_off(offs))
-    offs[4:, 1] = [0.05, 0.07, 0.05, 0.05, 0.09, 0.09, 0.09]
-    assert np.flatnonzero(_estimates_off(offs)).tolist() == [5, 8]  # at 9 no view is near
-    offs[7:, 0] = -0.09
-    assert np.flatnonzero(_estimates_off(offs)).tolist() == [5, 7, 8]
 
 
 _USUAL = ("12 people walk off", "lift")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from localization.estimators import Estimate
 from localization.events import Scan, Step
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
@@ -87,7 +88,9 @@ def test_beams_of_two_lidars_on_the_robot_are_left_out() -> None:
         motion = Motion(np.array([0.1, 0.0, 0.05]), 1e-6 * np.eye(3))
         stamps = k * checked_drive.S // 10, (k + 1) * checked_drive.S // 10
         one = Step(*stamps, motion, np.zeros(3), np.zeros(3), False, True, None, Scan(stamps[1], points, frame_id=frame))
-        applied = robot.checks.apply(one, robot.estimator).scan
+        step = robot.checks.apply(one, robot.estimator)
+        robot.checks.inflate(step, Estimate(stamps[1], np.zeros(3), None, np.zeros(3), None), robot.estimator)
+        applied = step.scan
         assert applied is not None
         is_own.append((np.hypot(applied.points[:, 0], applied.points[:, 1]) < 1.0).mean())
     assert is_own[0] == is_own[1] == 100 / 360

@@ -90,7 +90,7 @@ class Driven:
             reckoning = self.faults.inflation.reckoning
             reckoning.predict(step)
             moved = se2.exp(np.array([speed, 0.0, rate + innovation]) * 0.1)
-            reckoning.correct(step, se2.compose(reckoning.step.before[ESTIMATE], moved), delta)
+            reckoning.correct(step, se2.compose(reckoning.before[ESTIMATE], moved), delta)
             self.check.add(step, Residuals((0.1 * innovation, 1e-5), delta), lambda: [LearnedParameter("k_0", learned, 0.01, 1.0, 0.15)])
             self.check.compare_estimate(nis)
 
