@@ -85,7 +85,8 @@ class SensorChecks:
         the estimates so far."""
         if not math.isfinite(step.predicted.delta.sum()):
             return step  # the estimator refuses it
-        step = self._own_body.remove(step)
+        if self._own_body.is_found:
+            step = self._own_body.remove(step)
         if not (self._is_acting or step.is_standing or (step.turn is not None and rate_off(step))):
             return step
         self._examine_records(estimator)
@@ -141,6 +142,8 @@ class SensorChecks:
     def _compare(self, step: Step, *, is_to_come: bool) -> Step:
         """``step`` without what contradicts the other sensors, for the estimator, for which it ``is_to_come``, or was."""
         self._faults.start_step(step)
+        if not self._own_body.is_found:
+            step = self._own_body.remove(step)
         if step.scan is not None and not step.scan.is_planar:
             self._tilt.add(step.scan)
         if self._window.add(step, self._faults.now_s):

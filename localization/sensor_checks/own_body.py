@@ -35,13 +35,18 @@ that is hit at a right angle; 0.4 rad change these by 8 %."""
 
 
 class OwnBody:
-    """Leaves out the points of the robot itself: their beams have the same range while the robot drives and turns."""
+    """Leaves out the points of the robot itself: their beams have the same range while the robot drives and turns.
+
+    Until some are found, `remove` is called to find them, of steps that the estimator has had; from then on before it has them.
+    """
 
     def __init__(self, faults: FaultLog) -> None:
         self._faults = faults
         self._way = self._heading = 0.0  # since the first step [m, rad]
         self._lidars: dict[str, tuple[FloatArray, float]] = {}  # by frame: bearings as `_find_own` has them, and the way at the last scan
         self._share = 0.0  # largest of a scan since the last report
+        self.is_found = False
+        """Points of the robot itself were found in a scan: `remove` them from all that come."""
 
     def remove(self, step: Step) -> Step:
         """``step`` without these points. Only planar scans are examined."""
@@ -57,7 +62,10 @@ class OwnBody:
         is_own = np.zeros(len(scan.points), dtype=bool)
         share = _find_own(scan.points, self._way - way, self._heading, bearings, is_own) / len(scan.points)
         self._share = max(self._share, share)
-        return step if share < _MIN_BODY_SHARE else replace(step, scan=scan.select(~is_own))
+        if share < _MIN_BODY_SHARE:
+            return step
+        self.is_found = True
+        return replace(step, scan=scan.select(~is_own))
 
     def report(self) -> None:
         """Declare what was left out, if it is more than a few points."""
