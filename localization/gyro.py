@@ -107,7 +107,7 @@ class GyroBuffer:
 
         None where the gyro has no sample from before the start to (nearly) the end, or while its axis is not known.
         """
-        turn = None if self.newest_ns is None else self._series.turn(start_ns, end_ns)
+        turn = self._series.turn(start_ns, end_ns)
         if turn is None:
             return None
         self._axis.compare(turn.angle, by_wheels)

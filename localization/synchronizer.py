@@ -267,7 +267,8 @@ class Synchronizer:
             rates, last = self.wheels.twist_at(end_ns + shift)
         is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
-        turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if end_ns > start_ns else None
+        has_turn = end_ns > start_ns and self._gyro.newest_ns is not None
+        turn = self._gyro.turn(start_ns, end_ns, float(motion.delta[2])) if has_turn else None
         if missing:
             self._no_wheel_data_s += missing
             motion = replace(motion, cov=motion.cov + self._velocity.increment(missing, has_turn=turn is not None))

@@ -41,8 +41,21 @@ class FilterConfig(Settings):
     """Variance of the yaw while no wheel moves, per second: a push, a slope [rad^2/s]."""
 
 
-def initial_state(gyro: GyroNoise, corrections: Corrections, config: FilterConfig) -> State:
-    """State at the origin of the odometry frame: zero covariance of pose and submap, which define it, and priors of the others."""
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Priors and process noise of all variables."""
+
+    gyro: GyroNoise
+    corrections: Corrections
+    config: FilterConfig
+
+
+def initial_state(noise: NoiseModel, has_lidar: bool = True) -> State:
+    """State at the origin of the odometry frame: zero covariance of pose and submap, which define it, and priors of the others.
+
+    Without a LiDAR nothing measures ways, and there is no second clock until the gyro's first reading.
+    """
+    gyro, corrections, config = noise.gyro, noise.corrections, noise.config
     one, unknown = Vector(1), np.zeros((1, 1))
     priors: dict[str, tuple[Group, FloatArray]] = {
         "pose": (SE2, np.zeros((3, 3))),
@@ -51,8 +64,8 @@ def initial_state(gyro: GyroNoise, corrections: Corrections, config: FilterConfi
         "key": (SE2, np.zeros((3, 3))),
         "gyro_bias": (one, unknown + gyro.bias_sigma_rad_per_s**2),
         "gyro_scale": (one, unknown + gyro.scale_sigma**2),
-        "clock": (one, unknown + config.clock_sigma_s**2),
-        "radius": (one, unknown + config.wheel_radius_sigma**2),
+        "clock": (one, unknown + has_lidar * config.clock_sigma_s**2),
+        "radius": (one, unknown + has_lidar * config.wheel_radius_sigma**2),
         "corrections": (Vector(len(corrections.names)), corrections.cov),
     }
     layout = Layout({name: group for name, (group, _) in priors.items()})
@@ -62,15 +75,14 @@ def initial_state(gyro: GyroNoise, corrections: Corrections, config: FilterConfi
     return State(layout, {name: np.zeros(group.dim) for name, group in layout.groups.items()}, P)
 
 
-def wheel_transition(
-    state: State, step: Step, motion: Motion, gyro: GyroNoise, corrections: Corrections, config: FilterConfig
-) -> Transition:
+def wheel_transition(state: State, step: Step, motion: Motion, noise: NoiseModel) -> Transition:
     """The wheels' ``motion`` in ``step``, and process noise of what changes meanwhile:
 
     e_pose' = Ad(delta^-1) e_pose + (d delta / d clock) e_clock + (d delta / d radius) e_radius + (d delta / d params) e_corrections + slip.
 
     Ways scale with the wheels' radius; turns have a scale of their own among the parameters.
     """
+    gyro, corrections, config = noise.gyro, noise.corrections, noise.config
     dt, radius = step.duration, 1.0 + state.number("radius")
     delta = motion.delta * [radius, radius, 1.0]
     A = se2.adjoint(se2.inverse(delta))
@@ -81,14 +93,15 @@ def wheel_transition(
         ("pose", "corrections"): motion.d_params @ corrections.directions,
         ("map", "map"): A,  # the same error of the submap, as a perturbation of the present pose
     }
-    noise = {"pose": motion.cov, "gyro_bias": np.array([[gyro.bias_walk_rad_per_s_sqrt_s**2 * dt]])}
+    Q = {"pose": motion.cov, "gyro_bias": np.array([[gyro.bias_walk_rad_per_s_sqrt_s**2 * dt]])}
     if state.variance("clock"):  # else there is one clock
-        noise["clock"] = np.array([[config.clock_walk_s_per_sqrt_s**2 * dt]])
+        Q["clock"] = np.array([[config.clock_walk_s_per_sqrt_s**2 * dt]])
     if step.is_standing:
         rates = config.standstill_m2_per_s, config.standstill_m2_per_s, config.standstill_rad2_per_s
-        noise["pose"] = motion.cov + np.diag(rates) * dt
+        Q["pose"] = motion.cov + np.diag(rates) * dt
     else:
-        noise["corrections"] = corrections.process_noise * dt
-        noise["radius"] = np.array([[config.wheel_radius_sigma**2 / PRIOR_RETURNS_AFTER_S * dt]])
+        Q["corrections"] = corrections.process_noise * dt
+        if state.variance("radius"):
+            Q["radius"] = np.array([[config.wheel_radius_sigma**2 / PRIOR_RETURNS_AFTER_S * dt]])
     what = f"the motion of the wheels until stamp {step.end_ns} ns"
-    return Transition({"pose": se2.compose(state["pose"], delta)}, jacobians, noise, what)
+    return Transition({"pose": se2.compose(state["pose"], delta)}, jacobians, Q, what)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from localization.core.filter import Innovation, clone, inflate, inflate_both, propagate, set_marginal, update
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.turn import measure_turn
-from localization.core.motion import FilterConfig, initial_state, wheel_transition
+from localization.core.motion import FilterConfig, NoiseModel, initial_state, wheel_transition
 from localization.core.policies.continuous_pose import ContinuousPose
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
@@ -48,62 +48,73 @@ _MAX_LATENCY_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class WheelPrediction:
-    """Prediction by the wheels in the last step."""
+class LastStep:
+    """What wheels, gyro and scan have measured in the last step."""
 
     motion: Motion
-    """Predicted motion; its covariance includes the noise scale and outliers."""
+    """Predicted by the wheels; its covariance includes the noise scale and outliers."""
     corrections: FloatArray
     """(k,) of the motion model, with which it was predicted."""
     is_turning: bool
     """Whether it excites the corrections."""
+    turn: Innovation | None = None
+    """Of the gyro."""
+    scan: Innovation | None = None
+    """Of the matched scan, as if the prior were no outlier."""
+
+
+@dataclass(eq=False)
+class Policies:
+    """What is not nominal about a step, one object each."""
+
+    excitation: Excitation
+    continuous: ContinuousPose | None
+    """None where scans hold the pose."""
+    wheel_noise: WheelNoiseScale = field(default_factory=WheelNoiseScale)
+    slip: SweepSlip = field(default_factory=SweepSlip)
+    outlier: PriorOutlier = field(default_factory=PriorOutlier)
+    open_way: OpenWay = field(default_factory=OpenWay)
 
 
 class EkfFusion(Estimator):
     """`step` after `step`: predict by the wheels, update by the gyro, match the scan, update by it; the submap grows afterwards."""
 
     def __init__(self, model: MotionModel, corrections: Corrections, robot: Robot, sensor: ScanMatchingSensor | None, config: FilterConfig):
-        """``sensor``: None without a LiDAR; then there is no second clock until the gyro's first reading."""
-        self._clock_sigma_s = config.clock_sigma_s if sensor is None else 0.0
-        self.wheel_radius_sigma = 0.0 if "wheel_radius_scale" in corrections.names else config.wheel_radius_sigma
-        """Prior sigma of the wheels' radius, which positions show to a graph without a LiDAR too; 0 where it is one of the corrections."""
-        config = replace(config, wheel_radius_sigma=self.wheel_radius_sigma)
-        if sensor is None:  # nothing measures ways
-            config = replace(config, clock_sigma_s=0.0, wheel_radius_sigma=0.0)
-        self.state = initial_state(robot.gyro_noise, corrections, config)
+        """``sensor``: None without a LiDAR."""
+        if "wheel_radius_scale" in corrections.names:  # one variable for it
+            config = replace(config, wheel_radius_sigma=0.0)
+        self.model, self.noise, self._sensor = model, NoiseModel(robot.gyro_noise, corrections, config), sensor
+        self.state = initial_state(self.noise, has_lidar=sensor is not None)
         """Means and covariance at the end of the last step."""
-        self._config, self._gyro, self.model, self.corrections, self._sensor = config, robot.gyro_noise, model, corrections, sensor
-        self._wheel_noise, self._slip, self._outlier, self._open_way = WheelNoiseScale(), SweepSlip(), PriorOutlier(), OpenWay()
-        self._continuous = ContinuousPose() if sensor is None else None  # scans hold the pose
-        self._excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
-        self.wheels = WheelPrediction(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
-        self._turn: Innovation | None = None  # of the gyro, in the last step
-        self._scan: Innovation | None = None  # of its scan, as if the prior were no outlier
+        excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
+        self._policies = Policies(excitation, ContinuousPose() if sensor is None else None)
+        self.last = LastStep(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
         self._has_gyro = self._is_scan_pending = False
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing"), 0)
 
     def step(self, step: Step) -> Estimate:
         """Predict, update by the gyro, update by the scan."""
         self.run_deferred()
-        motion, unseen = replace(step.predicted, cov=self._wheel_noise.start_step(self.state, step)), self._open_way.cov(step)
-        self._excitation.start_step(motion)
+        policies = self._policies
+        motion, unseen = replace(step.predicted, cov=policies.wheel_noise.start_step(self.state, step)), policies.open_way.cov(step)
+        policies.excitation.start_step(motion)
         if step.restarts_calibration:
             self._restart_calibration()
         if step.restarts_map and self._sensor is not None:
             self._sensor.begin_submap()
         state = clone(self.state, "pose", "start")
-        state = propagate(state, wheel_transition(state, step, motion, self._gyro, self.corrections, self._config))
+        state = propagate(state, wheel_transition(state, step, motion, self.noise))
         if unseen.any():  # the submap moves along
             state = inflate_both(state, ("pose", "map"), unseen)
-        state, self._turn = self._update_turn(state, step)
+        state, turn = self._update_turn(state, step)
         state, scan, missed = self._update_scan(state, step)
-        self._scan = None if scan is None else replace(scan, S=scan.S - missed)
         motion = replace(motion, cov=motion.cov + unseen + missed)
-        self.wheels = WheelPrediction(motion, self.state["corrections"], self._excitation.is_turning)
+        innovation = None if scan is None else replace(scan, S=scan.S - missed)
+        self.last = LastStep(motion, self.state["corrections"], policies.excitation.is_turning, turn, innovation)
         self.state = state
         self.counts_by_name["standing"] += step.is_standing
         twist, twist_cov = self._estimate_twist(step, is_measured=scan is not None)
-        odometry = None if self._continuous is None else self._continuous.add(state)
+        odometry = None if policies.continuous is None else policies.continuous.add(state)
         return Estimate(step.end_ns, state["pose"], state.cov("pose"), twist, twist_cov, None if scan is None else scan.nis, odometry)
 
     def run_deferred(self) -> bool:
@@ -124,7 +135,7 @@ class EkfFusion(Estimator):
 
     def _restart_calibration(self) -> None:
         """Reset all calibration variables and the wheel noise to their priors; the pose is kept."""
-        prior, self._wheel_noise = initial_state(self._gyro, self.corrections, self._config), WheelNoiseScale()
+        prior, self._policies.wheel_noise = initial_state(self.noise, has_lidar=self._sensor is not None), WheelNoiseScale()
         for name in ("gyro_bias", "gyro_scale", "clock", "radius", "corrections"):
             self.state = set_marginal(self.state, name, prior[name], prior.cov(name))
 
@@ -134,9 +145,10 @@ class EkfFusion(Estimator):
             return state, None
         if not self._has_gyro:
             self._has_gyro = True
-            state = inflate(state, "clock", np.array([[self._clock_sigma_s**2]]))
-        state, innovation = update(state, measure_turn(state, step.turn), self._excitation.considered())
-        self._wheel_noise.learn(innovation)
+            if self._sensor is None:
+                state = inflate(state, "clock", np.array([[self.noise.config.clock_sigma_s**2]]))
+        state, innovation = update(state, measure_turn(state, step.turn), self._policies.excitation.considered())
+        self._policies.wheel_noise.learn(innovation)
         return state, innovation
 
     def _update_scan(self, state: State, step: Step) -> tuple[State, Innovation | None, Cov3]:
@@ -150,21 +162,21 @@ class EkfFusion(Estimator):
             return state, None, NOTHING_MISSED
         self.counts_by_name["scans"] += 1
         self._is_scan_pending = True
-        if self._outlier.has_scene_moved and not step.rested_s:
+        if self._policies.outlier.has_scene_moved and not step.rested_s:
             sensor.begin_submap()
-            self._outlier.has_scene_moved = False
-        swept, offset = self._slip.start_step(step)
+            self._policies.outlier.has_scene_moved = False
+        swept, offset = self._policies.slip.start_step(step)
         match = sensor.measure(swept, state["pose"], state.difference_cov("pose", "map"), offset)
-        match, missed = self._outlier.apply(step, match, None if match is not None else sensor.moved.cov(step))
+        match, missed = self._policies.outlier.apply(step, match, None if match is not None else sensor.moved.cov(step))
         state = inflate(state, "pose", missed) if missed.any() else state
         if match is None:
             return state, None, missed
-        match, R = self._slip.refine(sensor, step, state["start"], match)
+        match, R = self._policies.slip.refine(sensor, step, state["start"], match)
         R = R * (1.0 + step.rested_s / _REPEATED_S) ** 4
         self.counts_by_name["matched"] += 1
-        self._open_way.add_scan(R, step)
-        state, innovation = update(state, measure_scan(state, match.measured, R), self._excitation.considered_by_scan(state, R))
-        self._wheel_noise.learn(innovation)
+        self._policies.open_way.add_scan(R, step)
+        state, innovation = update(state, measure_scan(state, match.measured, R), self._policies.excitation.considered_by_scan(state, R))
+        self._policies.wheel_noise.learn(innovation)
         return state, innovation, missed
 
     def _estimate_twist(self, step: Step, *, is_measured: bool) -> tuple[Twist2, Cov3 | None]:
@@ -172,7 +184,7 @@ class EkfFusion(Estimator):
         if step.duration == 0.0:
             return step.twist, None
         mean, cov = mean_twist(*self.state.between("start", "pose"), step.duration)
-        self._slip.end_step(step, mean, is_measured)
+        self._policies.slip.end_step(step, mean, is_measured)
         twist, cov = twist_at_end(mean, cov, step.twist_change, math.inf if is_measured or not step.has_wheels else step.duration)
         if step.turn is None or step.is_standing:
             return twist, cov
@@ -198,7 +210,7 @@ class EkfFusion(Estimator):
     @property
     def params(self) -> FloatArray:
         """Parameters of the motion model with their corrections."""
-        return np.asarray(self.model.nominal + self.corrections.directions @ self.state["corrections"])
+        return np.asarray(self.model.nominal + self.noise.corrections.directions @ self.state["corrections"])
 
     @property
     def scan_points(self) -> Points2:
@@ -224,7 +236,7 @@ class EkfFusion(Estimator):
     def gyro_calibration(self) -> GyroCalibration | None:
         """Bias and scale of the gyro by the filter; None where it was not used in the last step."""
         state = self.state
-        if self._turn is None:
+        if self.last.turn is None:
             return None
         variances = state.variance("gyro_bias"), state.variance("gyro_scale")
         return GyroCalibration(state.number("gyro_bias"), state.number("gyro_scale"), *variances)
@@ -232,20 +244,20 @@ class EkfFusion(Estimator):
     @property
     def residuals(self) -> Residuals:
         """Residuals of the last step."""
-        motion, scan = self.wheels.motion, self._scan
-        by_corrections = motion.d_params @ self.corrections.directions @ self.wheels.corrections
-        file_delta = se2.retract(motion.delta, -by_corrections)
-        turn = None if self._turn is None else self._turn.component(0)
+        last = self.last
+        by_corrections = last.motion.d_params @ self.noise.corrections.directions @ last.corrections
+        file_delta = se2.retract(last.motion.delta, -by_corrections)
+        turn, scan = None if last.turn is None else last.turn.component(0), last.scan
         return Residuals(turn, file_delta, *((None, None) if scan is None else (scan.component(2), scan.component(0))))
 
     def learned_parameters(self) -> Sequence[LearnedParameter]:
         """The motion model's parameters that are corrected, and the wheels' radius where scans measure it, against the robot file."""
         state, nominal = self.state, dict(zip(self.model.param_names, self.model.nominal, strict=True))
         changes, sigmas = state["corrections"], np.sqrt(np.diagonal(state.cov("corrections")))
-        radius = state.number("radius"), math.sqrt(state.variance("radius")), 0.0, self.wheel_radius_sigma
+        radius = state.number("radius"), math.sqrt(state.variance("radius")), 0.0, self.noise.config.wheel_radius_sigma
         found = [LearnedParameter("wheel_radius_scale", *radius)] if state.variance("radius") else []
         for name, change, sigma, prior in zip(
-            self.corrections.names, changes.tolist(), sigmas.tolist(), self.corrections.sigmas.tolist(), strict=True
+            self.noise.corrections.names, changes.tolist(), sigmas.tolist(), self.noise.corrections.sigmas.tolist(), strict=True
         ):
             value = nominal.get(name, 0.0)
             found.append(LearnedParameter(name, float(value + change), sigma, value, prior, self.model.name))
@@ -261,7 +273,7 @@ class EkfFusion(Estimator):
 
     def counts(self) -> Mapping[str, int]:
         """Number of occurrences by name: scans, matched, searched, and those of lost scans by cause."""
-        found = {**self.counts_by_name, "prior_outliers": self._outlier.count}
+        found = {**self.counts_by_name, "prior_outliers": self._policies.outlier.count}
         return found if self._sensor is None else {**found, **self._sensor.lost.causes}
 
     def warnings(self) -> list[str]:
@@ -269,11 +281,11 @@ class EkfFusion(Estimator):
         reported by `sensor_checks.clocks`."""
         apart = self.clocks_apart
         if apart is None or not apart.is_latency:
-            return self._open_way.warnings()
+            return self._policies.open_way.warnings()
         others = "LiDAR" if not self._has_gyro else "gyro" if self._sensor is None else "LiDAR or gyro"
         direction = "later" if apart.late_s > 0.0 else "earlier"
         return [
-            *self._open_way.warnings(),
+            *self._policies.open_way.warnings(),
             f"the wheels' stamps are {abs(apart.late_s):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize"
             " the clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each.",
         ]

@@ -80,43 +80,60 @@ class LastKeyframe:
     """Of the position in the odometry's frame, if it had no matched scan [m^2]."""
 
 
+@dataclass(eq=False)
+class SinceKeyframe:
+    """What was measured since the newest keyframe."""
+
+    wheels: MotionPreintegration
+    moved: tuple[Pose2, Cov3] = field(default_factory=lambda: (np.zeros(3), np.zeros((3, 3))))
+    """Motion (3,) and its covariance (3, 3), by all sensors."""
+    due_ns: int | None = None
+    """Stamp of the last step, if a keyframe is to follow."""
+
+
+@dataclass(eq=False)
+class Smoothing:
+    """What smoothing takes, and has found."""
+
+    path: RecordedPath | None
+    """None where the trajectory is not to be smoothed."""
+    filter_covs: list[Cov3] = field(default_factory=list)
+    """(3, 3) of each keyframe, by the filter."""
+    covs: FloatArray | None = None
+    """(K, 3, 3) of the smoothed keyframes."""
+    failure: str = ""
+    """Why the trajectory could not be smoothed."""
+
+
 class GraphFusion(FilteredOdometry[EkfFusion]):
     """`EkfFusion` with a `PoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive (`RecordedPath`)."""
         self.odometry, self._config = odometry, config
-        corrections = odometry.corrections
-        radius_sigma = max(odometry.wheel_radius_sigma, _NO_SIGMA)
+        corrections = odometry.noise.corrections
+        radius_sigma = max(odometry.noise.config.wheel_radius_sigma, _NO_SIGMA)
         self.graph = PoseGraph(block_diag(corrections.cov, radius_sigma**2), np.array([config.antenna_x_m, config.antenna_y_m]))
         self._loops = LoopDetector(lidar)
         self._positions = GraphPositions(self.graph)
-        self._path = RecordedPath(SE2) if is_smoothing else None
-        self._last, self._filter_covs = LastKeyframe(), list[Cov3]()  # covariances (3, 3) of all keyframes by the filter
-        self._moved, self._wheels = (np.zeros(3), np.zeros((3, 3))), MotionPreintegration(len(corrections.names))  # since then
-        self._is_matched = False  # a scan of the last step
-        self._due_ns: int | None = None
-        """Stamp of the last step, if a keyframe is to follow."""
+        self._smoothing = Smoothing(RecordedPath(SE2) if is_smoothing else None)
+        self._last, self._since = LastKeyframe(), SinceKeyframe(MotionPreintegration(len(corrections.names)))
         self._moving_s = 0.0  # in this epoch of the corrections
-        self._smoothed_covs: FloatArray | None = None
         self._grid = GrowingGrid(_CELL_M, _MAX_CELLS)
-        self._failure = ""
-        self.n_loops = 0
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map."""
         self.run_deferred()
-        estimate, wheels = self.odometry.step(step), self.odometry.wheels
-        self._is_matched = estimate.nis is not None
-        self._wheels.add(wheels.motion, self.odometry.corrections, wheels.is_turning, wheels.corrections)
+        estimate, last = self.odometry.step(step), self.odometry.last
+        self._since.wheels.add(last.motion, self.odometry.noise.corrections, last.is_turning, last.corrections)
         self._moving_s += 0.0 if step.is_standing else step.duration
-        delta, cov = self._moved = self._motion_since_keyframe()
-        if self._path is not None:
-            self._path.add(step.end_ns, estimate.pose, cov)
+        delta, cov = self._since.moved = self._motion_since_keyframe()
+        if self._smoothing.path is not None:
+            self._smoothing.path.add(step.end_ns, estimate.pose, cov)
         moved = max(math.hypot(delta[0], delta[1]) / self._config.keyframe_distance_m, abs(delta[2]) / self._config.keyframe_angle_rad)
         waits_for_scan = step.scan is None and self.lost is not None and moved < _LONGEST_WAIT
         is_due = not self.graph.count or (moved >= 1.0 and not waits_for_scan) or self._is_found_again()
-        self._due_ns = step.end_ns if is_due else None
+        self._since.due_ns = step.end_ns if is_due else None
         keyframes = self._loops.keyframes
         self._positions.place(step, self.odometry.state, keyframes[-1].odometry if keyframes else None, cov)
         A = se2.adjoint(se2.inverse(delta))
@@ -140,7 +157,7 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         """Do what was deferred until the estimate was published: update the submap, add a keyframe, close loops, add positions. Whether a
         keyframe has changed the corrections."""
         self.odometry.run_deferred()
-        due_ns, self._due_ns = self._due_ns, None
+        due_ns, self._since.due_ns = self._since.due_ns, None
         if due_ns is not None:
             self._add_keyframe(due_ns)
         return due_ns is not None
@@ -156,7 +173,12 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
             return state.between("key", "pose")
         step, step_cov = state.between("start", "pose")
         A = se2.adjoint(se2.inverse(step))
-        return se2.between(self._loops.keyframes[-1].odometry, state["pose"]), A @ self._moved[1] @ A.T + step_cov
+        return se2.between(self._loops.keyframes[-1].odometry, state["pose"]), A @ self._since.moved[1] @ A.T + step_cov
+
+    @property
+    def _is_matched(self) -> bool:
+        """Whether a scan of the last step was matched."""
+        return self.odometry.last.scan is not None
 
     def _is_found_again(self) -> bool:
         """Whether a scan has shown where the robot is on the map from before its LiDAR was lost."""
@@ -169,18 +191,18 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         odometry, pose, k = self.odometry, self.odometry.state["pose"], self.graph.count
         update = GraphUpdate(pose)
         if k:
-            wheels = self._wheels.with_corrections(odometry.state["corrections"])
+            wheels = self._since.wheels.with_corrections(odometry.state["corrections"])
             between = self._between(k, wheels)
             update = GraphUpdate(se2.compose(self.graph.pose(between.a), between.delta), wheels, self._epoch_cov(), (between,))
         self.graph.apply(update)
-        self._filter_covs.append(odometry.state.cov("pose"))
-        if self._path is not None:
-            self._path.add_node()
+        self._smoothing.filter_covs.append(odometry.state.cov("pose"))
+        if self._smoothing.path is not None:
+            self._smoothing.path.add_node()
         is_placed, lost_variance = self._is_matched or self.lost is None or not k, self._position_variance()
         if is_placed:
             odometry.start_key()
-        n = len(odometry.corrections.names)
-        self._moved, self._wheels = (np.zeros(3), np.zeros((3, 3))), MotionPreintegration(n)
+        n = len(odometry.noise.corrections.names)
+        self._since = SinceKeyframe(MotionPreintegration(n))
         self._close_loop(Keyframe(pose, odometry.scan_points, stamp_ns, odometry.lidar_position))
         self._positions.enter()
         if n and k:
@@ -196,7 +218,7 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         if self._is_found_again():
             delta, cov = state.between("key", "pose")
             return BetweenMeasurement(self._last.matched, k, delta, np.asarray(np.linalg.inv(cov)))
-        delta, cov = self._moved
+        delta, cov = self._since.moved
         D, radius = wheels.by_corrections, 1.0 + state.number("radius")
         by_wheels = wheels.delta * [radius, radius, 1.0]
         wheel_cov = wheels.cov + D @ state.cov("corrections", "radius") @ D.T
@@ -208,7 +230,7 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
         if self._moving_s < _CORRECTION_EPOCH_S:
             return None
-        cov = block_diag(self.odometry.corrections.process_noise * self._moving_s, 0.0)
+        cov = block_diag(self.odometry.noise.corrections.process_noise * self._moving_s, 0.0)
         self._moving_s = 0.0
         return np.asarray(cov + _CONSTANT_SHARE**2 * np.diag(np.diagonal(self.graph.prior_cov)))
 
@@ -216,7 +238,6 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         self._loops.add(keyframe)
         loop = self._loops.detect(self.odometry.cell, self.graph.poses, self.graph.marginal)
         if loop is not None:
-            self.n_loops += 1
             self.graph.apply(
                 GraphUpdate(betweens=(BetweenMeasurement(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True),))
             )
@@ -230,22 +251,22 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory at the stamps of ``filtered``; None unless smoothing, or with fewer than two keyframes."""
         self.run_deferred()
-        if self._path is None or filtered is None or self.graph.count < 2:
+        if self._smoothing.path is None or filtered is None or self.graph.count < 2:
             return None
-        if not self._path.ends_at_node:
-            self._add_keyframe(int(self._path.stamps_ns[-1]))
+        if not self._smoothing.path.ends_at_node:
+            self._add_keyframe(int(self._smoothing.path.stamps_ns[-1]))
         try:
             poses, covs = self.graph.smooth()
         except EstimatorError as error:
-            self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
+            self._smoothing.failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
-        covs = self._smoothed_covs = np.array([self._bound(*pair) for pair in zip(covs, self._filter_covs, strict=True)])
-        return Trajectory(filtered.stamps_ns, *self._path.through(poses, covs))
+        covs = self._smoothing.covs = np.array([self._bound(*pair) for pair in zip(covs, self._smoothing.filter_covs, strict=True)])
+        return Trajectory(filtered.stamps_ns, *self._smoothing.path.through(poses, covs))
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what was estimated besides the pose, by name: by the filter, and radius and lever arm by the graph."""
         found = dict(self.odometry.parameters())
-        if self.odometry.wheel_radius_sigma:
+        if self.odometry.noise.config.wheel_radius_sigma:
             mean, cov = self.graph.corrections()
             found["wheel_radius_scale"] = float(mean[-1]), math.sqrt(float(cov[-1, -1]))
         if self._positions.count:
@@ -257,20 +278,20 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         """Number of occurrences by name: those of the filter, keyframes, loops and positions."""
         found = {**self.odometry.counts(), "keyframes": self.graph.count}
         if self.lost is not None:
-            found["loops"] = self.n_loops
+            found["loops"] = sum(between.is_loop for update in self.graph.updates for between in update.betweens)
         return {**found, "positions": self._positions.count} if self._positions.count else found
 
     def warnings(self) -> list[str]:
         """Problems of the measurements so far: those of the filter, and positions that could not be used, or contradict the other
         sensors."""
-        return [*self.odometry.warnings(), *([self._failure] if self._failure else []), *self._positions.warnings()]
+        return [*self.odometry.warnings(), *([self._smoothing.failure] if self._smoothing.failure else []), *self._positions.warnings()]
 
     def keyframe_map(self) -> KeyframeMap | None:
         """Keyframes as they can be saved; None before the first. Poses are smoothed after `finish`."""
         keys, edges = self._loops.keyframes, [between for update in self.graph.updates for between in update.betweens]
         if not keys:
             return None
-        covs = self._smoothed_covs
+        covs = self._smoothing.covs
         return KeyframeMap(
             stamps_ns=np.array([key.stamp_ns for key in keys], dtype=np.int64),
             poses=self.graph.poses(),

@@ -118,7 +118,7 @@ class MapFusion(SavedMapFusion[EkfFusion]):
 
     def _add_step(self) -> None:
         """Add the motion of the step: the filter's, or that of the wheels where that is narrower."""
-        step, wheels = RecentMotion(*self.odometry.state.between("start", "pose")), self.odometry.wheels.motion
+        step, wheels = RecentMotion(*self.odometry.state.between("start", "pose")), self.odometry.last.motion
         if np.trace(wheels.cov) < np.trace(step.cov):
             step = RecentMotion(wheels.delta, wheels.cov)
         A = se2.adjoint(se2.inverse(step.delta))

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from localization.core.filter import clone, inflate, propagate, update
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.turn import measure_turn
-from localization.core.motion import FilterConfig, initial_state, wheel_transition
+from localization.core.motion import FilterConfig, NoiseModel, initial_state, wheel_transition
 from localization.core.policies import wheel_noise
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.wheel_noise import WheelNoiseScale
@@ -40,7 +40,7 @@ GYRO = ROBOT.gyro_noise
 MODEL = make_model("skid_steer", ROBOT)
 CORRECTED = make_corrections(MODEL, "constant")
 LIDAR = np.diag([0.004, 0.006, 0.002]) ** 2
-ROWS = initial_state(GYRO, CORRECTED, FilterConfig()).layout.rows
+ROWS = initial_state(NoiseModel(GYRO, CORRECTED, FilterConfig())).layout.rows
 POSE, START, MAP, KEY = (ROWS[name] for name in ("pose", "start", "map", "key"))
 BIAS, SCALE, CLOCK, RADIUS, PARAMS = (ROWS[name].start for name in ("gyro_bias", "gyro_scale", "clock", "radius", "corrections"))
 
@@ -50,7 +50,7 @@ class Chain:
 
     def __init__(self, config):
         self.config = config
-        self.state = initial_state(GYRO, CORRECTED, config)
+        self.state = initial_state(NoiseModel(GYRO, CORRECTED, config))
         self.noise, self.excitation = WheelNoiseScale(), Excitation(ROBOT.geometry.track_width_m, CORRECTED.min_track_over_radius)
         at_rest = Step(0, 1, Motion(np.zeros(3), NOTHING), np.zeros(3), np.zeros(3), True, True)
         self.noise.start_step(self.state, at_rest)
@@ -59,7 +59,7 @@ class Chain:
         motion = dataclasses.replace(step.predicted, cov=self.noise.start_step(self.state, step))
         self.excitation.is_turning = is_turning
         state = clone(self.state, "pose", "start")
-        self.state = propagate(state, wheel_transition(state, step, motion, GYRO, CORRECTED, self.config))
+        self.state = propagate(state, wheel_transition(state, step, motion, NoiseModel(GYRO, CORRECTED, self.config)))
 
     def _update(self, measurement, considered):
         self.state, innovation = update(self.state, measurement, considered)

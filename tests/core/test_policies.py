@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.core.filter import inflate
-from localization.core.motion import FilterConfig, initial_state
+from localization.core.motion import FilterConfig, NoiseModel, initial_state
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import PriorOutlier
@@ -22,7 +22,7 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
-STATE = initial_state(ROBOT.gyro_noise, make_corrections(make_model("skid_steer", ROBOT), "constant"), FilterConfig())
+STATE = initial_state(NoiseModel(ROBOT.gyro_noise, make_corrections(make_model("skid_steer", ROBOT), "constant"), FilterConfig()))
 
 
 def step_of(delta, is_standing=False, has_wheels=True):

@@ -181,7 +181,7 @@ def learned(form, hidden, seed, wheels=weave, steps=150):
         pass
     slow, P = slow_states(estimator)
     k = len(hidden)
-    return world.correction - slow[-k:], P[-k:, -k:], estimator.corrections.sigmas
+    return world.correction - slow[-k:], P[-k:, -k:], estimator.noise.corrections.sigmas
 
 
 @pytest.mark.extended
@@ -221,7 +221,7 @@ def test_corrections_with_wheel_noise_alone_keep_their_prior():
         sensor.next = match_at(pose, np.diag([0.005, 0.005, 0.001]) ** 2)
         estimator.step(step)
     slow, P = slow_states(estimator)
-    first = estimator.corrections.sigmas
+    first = estimator.noise.corrections.sigmas
     assert (np.sqrt(np.diag(P)[-6:]) > 0.99 * first).all()
     assert (np.abs(slow[-6:]) < 0.1 * first).all()
 
@@ -255,7 +255,7 @@ def test_corrections_of_every_model_and_form_reduce_error(name, form):
     """What a drive both ways shows is known better than at first, and is where the truth is."""
     sensor = PoseSensor()
     estimator = make_filter(sensor, name, form)
-    names, sigmas = estimator.corrections.names, estimator.corrections.sigmas
+    names, sigmas = estimator.noise.corrections.names, estimator.noise.corrections.sigmas
     assert names
     run(estimator, sensor, 3, 100)
     found = estimator.parameters()
@@ -271,7 +271,7 @@ def test_corrections_on_gentle_arcs_keep_what_turns_gave():
         sensor = PoseSensor()
         estimator = make_filter(sensor)
         run(estimator, sensor, 2, 60, wheels=lambda t: (5.0 - turning, 5.0 + turning))  # noqa: B023
-        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator.corrections.sigmas[0]
+        sigmas[turning] = estimator.parameters()["k_0"][1] / estimator.noise.corrections.sigmas[0]
     assert sigmas[0.2] > 0.99
     assert sigmas[2.5] < 0.7
 

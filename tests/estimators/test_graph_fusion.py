@@ -186,7 +186,7 @@ def test_graph_with_wrong_wheels_estimates_radius_scale() -> None:
 
 def test_graph_corrections_hold_for_next_prediction() -> None:
     _, pipeline = estimated()
-    names = pipeline.estimator.odometry.corrections.names
+    names = pipeline.estimator.odometry.noise.corrections.names
     learned = pipeline.estimator.graph.corrections()[0][: len(names)]
     assert np.abs(learned).min() > 0.0
     assert pipeline.synchronizer.wheels.params == pytest.approx(pipeline.estimator.params)

@@ -205,7 +205,7 @@ def make_filter(
 def make_world(estimator, seed, noise=None, has_lidar=True, wheels=weave, **more) -> World:
     """A robot whose parameters and noise are drawn from the priors of ``estimator``."""
     rng = np.random.default_rng(seed)
-    return World(estimator.model, estimator.corrections, noise or Noise(), rng, has_lidar, FilterConfig(), wheels, **more)
+    return World(estimator.model, estimator.noise.corrections, noise or Noise(), rng, has_lidar, FilterConfig(), wheels, **more)
 
 
 def run(estimator, sensor, seed=0, steps=60, **world):

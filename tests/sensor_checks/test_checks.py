@@ -9,6 +9,8 @@ from localization.estimators import Estimate
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
 from tests.helpers.checked_drive import CheckedDrive, S
+from tests.helpers.event_faults import named_faults, without_gyro
+from tests.helpers.fault_drives import in_room, run
 
 
 @pytest.mark.parametrize("has_scans", [True, False])
@@ -36,3 +38,9 @@ def test_checks_are_restored_from_a_checkpoint_during_and_after_a_fault() -> Non
         last = robot.estimates[-1]
         ahead = Estimate(last.stamp_ns + S, se2.compose(last.pose, np.array([0.1, 0.0, 0.0])), last.covariance, np.zeros(3), None)
         assert np.array_equal(*(found.inflate(robot.applied[-1], ahead, robot.estimator).covariance for found in (restored, checks)))
+
+
+def test_estimate_that_leaves_the_wheels_is_examined_before_it_is_published() -> None:
+    """A LiDAR that is upside down, without a gyro: half a second later, poses would be .16 m off at a sigma of 6 mm until then."""
+    outcome = run(in_room(1), without_gyro(named_faults()["LiDAR upside down"]))
+    assert not outcome.is_wrong, outcome.least_consistent
