@@ -36,7 +36,7 @@ from localization.logs.decode import (
 from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
 from motion_models.center_of_gravity.cg_model import CgModel, CgTracker
-from motion_models.center_of_gravity.parts import support_margin
+from motion_models.center_of_gravity.parts import CgEstimate, support_margin
 from motion_models.robot import Clock, Driver, Geometry, Lidar, Robot
 from motion_models.se2 import FloatArray
 
@@ -63,6 +63,8 @@ _VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
 brake at up to 3 m/s^2."""
 _FROZEN_AFTER_RAD = 0.5
 """Turned by another wheel of the same side; these are coupled by a chain or by the ground."""
+_SAME_CG_NS = 1_000_000_000
+"""A centre of gravity that stays is an event no more often than this [ns]; drivers of arms publish at 50 to 500 Hz."""
 _NO_ANGLES_AFTER_RAD = 0.1
 """Turned by the rates alone, from where on angles that never changed are none: above encoders' steps and the rates' noise at standstill."""
 
@@ -199,15 +201,21 @@ def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: Topic
 def make_arm_cg_converter(
     model: CgModel, geometry: Geometry, topic: str, stats: MessageStats
 ) -> Callable[[ArmReading], Iterator[CgSample]]:
-    """Converter of readings in order of time. It yields nothing until each joint of ``model`` was received once."""
+    """Converter of readings in order of time. It yields nothing until each joint of ``model`` was received once, and while the joints rest
+    one sample each `_SAME_CG_NS`."""
     tracker = CgTracker(model)
+    last: CgEstimate | None = None
+    last_ns = 0
 
     def convert(reading: ArmReading) -> Iterator[CgSample]:
+        nonlocal last, last_ns
         estimate = tracker.update(reading.names, reading.position)
-        if estimate is None:
+        if estimate is None or (estimate is last and reading.stamp_ns - last_ns < _SAME_CG_NS):
             return
         sample = CgSample(reading.stamp_ns, estimate.position, estimate.covariance)
-        yield from check_tipping(sample, geometry, topic, Oddity.TIPPING, stats)
+        for supported in check_tipping(sample, geometry, topic, Oddity.TIPPING, stats):
+            last, last_ns = estimate, reading.stamp_ns
+            yield supported
 
     return convert
 

@@ -354,9 +354,11 @@ class FusedWriter:
 
     def odometry(self, estimate: FusedEstimate) -> bytes:
         """The bytes of `odometry_message`."""
-        twist = estimate.twist
-        parts = (*estimate.place(), estimate.pose_covariance(), twist[:2], twist[2:], six_by_six(estimate.twist_covariance))
-        return self._odometry.fill(Message(self._odometry_form, estimate.stamp_ns, estimate.stamp_ns, parts))
+        numbers = np.zeros(_ODOMETRY_NUMBERS)
+        numbers[_PLACE], numbers[_TURNED] = estimate.place()
+        numbers[_POSE_COV], numbers[_TWIST_COV] = estimate.pose_covariance(), six_by_six(estimate.twist_covariance)
+        numbers[_PLANAR_TWIST] = estimate.twist
+        return self._odometry.fill(Message(self._odometry_form, estimate.stamp_ns, estimate.stamp_ns, (numbers,)))
 
     def transform(self, estimate: FusedEstimate) -> bytes:
         """The bytes of `transform_message`."""
@@ -378,14 +380,21 @@ def _named(layout: MessageLayout, parent: str, body: str) -> MessageLayout:
 _NOWHERE = FusedEstimate(0, np.zeros(3), np.zeros(3))
 
 
-def _build_odometry(
-    stamp: Any, place: FloatArray, turned: FloatArray, cov: FloatArray, speed: FloatArray, turn: FloatArray, twist_cov: FloatArray
-) -> Any:
+_ODOMETRY_NUMBERS = 85
+"""nav_msgs/Odometry ends with so many doubles: pose, its covariance, twist, its covariance."""
+_PLACE, _TURNED, _POSE_COV, _TWIST, _TWIST_COV = slice(0, 3), slice(3, 7), slice(7, 43), slice(43, 49), slice(49, 85)
+_PLANAR_TWIST = [43, 44, 48]
+"""vx, vy and wz among them."""
+
+
+def _build_odometry(stamp: Any, numbers: FloatArray) -> Any:
     made = odometry_message(_NOWHERE)
     pose, twist = made.pose.pose, made.twist.twist
-    made.header.stamp, made.pose.covariance, made.twist.covariance = stamp, cov, twist_cov
-    _set_place(pose.position, pose.orientation, place, turned)
-    (twist.linear.x, twist.linear.y), twist.angular.z = speed.tolist(), float(turn[0])
+    made.header.stamp, made.pose.covariance, made.twist.covariance = stamp, numbers[_POSE_COV], numbers[_TWIST_COV]
+    _set_place(pose.position, pose.orientation, numbers[_PLACE], numbers[_TURNED])
+    linear, angular = np.split(numbers[_TWIST], 2)
+    twist.linear.x, twist.linear.y, twist.linear.z = linear.tolist()
+    twist.angular.x, twist.angular.y, twist.angular.z = angular.tolist()
     return made
 
 
@@ -401,7 +410,5 @@ def _build_transform(stamp: Any, place: FloatArray, turned: FloatArray) -> Any:
     return made
 
 
-_ODOMETRY = MessageLayout(
-    "", "nav_msgs/msg/Odometry", (("f8", 3), ("f8", 4), ("f8", 36), ("f8", 2), ("f8", 1), ("f8", 36)), _build_odometry
-)
+_ODOMETRY = MessageLayout("", "nav_msgs/msg/Odometry", (("f8", _ODOMETRY_NUMBERS),), _build_odometry)
 _TRANSFORM = MessageLayout("", "tf2_msgs/msg/TFMessage", (("f8", 3), ("f8", 4)), _build_transform)

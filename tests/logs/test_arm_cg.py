@@ -76,6 +76,18 @@ def test_arm_cg_moving_joints_move_the_cg(tmp_path: Path, format_: str) -> None:
     assert info.parts["center_of_gravity"] == {"topic": "/joint_states", "kind": "joint_states", "chosen_by": "arms"}
 
 
+def test_arm_cg_of_resting_joints_comes_once_a_second(tmp_path: Path) -> None:
+    """Encoders' noise of 10 urad is no motion; a joint that moves by 1 mrad is."""
+    names, rng = list(POSTURES["ready"]), np.random.default_rng(0)
+    records: list[Record] = []
+    for i in range(100):  # 5 s
+        at = {name: q + 1e-5 * rng.uniform(-1.0, 1.0) + 1e-3 * (i >= 50) for name, q in posture(39).items()}
+        records.append(("/joint_states", wheels(START + i * STEP, i), START + i * STEP))
+        records.append(("/arms", arm(START + i * STEP, names, at), START + i * STEP))
+    samples = cgs(open_log(bags.FORMATS["mcap"](tmp_path / "run", records), ROBOT))
+    assert [(sample.stamp_ns - START) / S for sample in samples] == [0.0, 1.0, 2.0, 2.5, 3.5, 4.5]
+
+
 def test_arm_cg_joints_of_arms_and_wheels_are_separated(tmp_path: Path) -> None:
     """Left arm on its own topic, right arm on that of the wheels and even at their stamps; CGs begin once both arms were published."""
     records: list[Record] = []
