@@ -177,10 +177,15 @@ class CheckpointWriter:
     """
 
     def __init__(self, path: Path, made_by: Mapping[str, str], shared: Mapping[str, Any], every_s: float = 0.75) -> None:
-        self.path, self._made_by, self._shared, self._every_s = path, made_by, shared, every_s
+        self.path, self._made_by, self._shared, self._every_s = path, {**made_by}, {**shared}, every_s
         self._next = -float("inf")
         self._disk = ThreadPoolExecutor(1)
         self._writing: Future[None] | None = None
+
+    def change_identity(self, made_by: Mapping[str, str], shared: Mapping[str, Any]) -> None:
+        """Replace these fingerprints and shared objects in the states to come."""
+        self._made_by.update(made_by)
+        self._shared.update(shared)
 
     def is_due(self) -> bool:
         """Whether the last state is old enough, and on disk: `write` then does not wait."""

@@ -9,7 +9,7 @@ from localization.estimators import Estimate
 from localization.events import WheelSample
 from localization.ros.discovery import MAX_BACKLOG
 from localization.ros.live_stream import LiveStream
-from localization.ros.publisher import Predictor
+from localization.ros.predictor import Predictor
 from localization.ros.transports.transport import Received
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
-from localization.ros.publisher import Predictor
+from localization.ros.predictor import Predictor
 from localization.ros.settings import LiveRun
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.robot import Mount

@@ -4,15 +4,17 @@ messages are read, so that these are kept as they came, and read again from the 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from localization.calibration.lidar_check import LidarCheck, LidarFinding
 from localization.calibration.wheel_units import CORRECTED
 from localization.calibration.wheel_wiring import WiringReport
 from localization.events import Event
+from localization.ros.live_inputs import LiveInputs
 from localization.ros.live_wiring import LiveWiring
 from localization.ros.transports.transport import Received
+from motion_models.robot import Mount
 
 _STANDING_NS = 5_000_000_000
 """Kept of a robot that has not moved: the gyro's bias is learned from it."""
@@ -79,6 +81,43 @@ class LiveEntrance:
         self._lidar.add(event)
         if self._lidar.is_done:
             self.lidar, self._lidar = self._lidar.result(), None
+
+
+class EntranceChecks:
+    """`begin` what is to be checked from here on; `running` is None once nothing is."""
+
+    def __init__(self, inputs: LiveInputs) -> None:
+        self._inputs = inputs
+        self.running: LiveEntrance | None = None
+        self.notes: list[str] = []
+        """Sentences on what was found."""
+
+    def begin(
+        self,
+        mounts: Mapping[str, Mount],
+        *,
+        wiring: bool = True,
+        lidar: bool = True,
+        is_gyro_clock_known: bool = False,
+        is_lidar_clock_known: bool = False,
+    ) -> None:
+        """Compare the sensors from here on, with the LiDAR at ``mounts``: the ``wiring`` of wheels and gyro, the mount of the ``lidar``,
+        and the clocks that are not known."""
+        wheels = self._inputs.wiring_check(mounts, is_clock_known=is_gyro_clock_known) if wiring else None
+        scans = self._inputs.lidar_check(mounts, is_clock_known=is_lidar_clock_known) if lidar else None
+        source = self._inputs.sources.lidar
+        has_checks = wheels is not None or scans is not None
+        self.running = LiveEntrance(wheels, scans, "" if source is None else source.topic) if has_checks else None
+        self._inputs.stream.on_reading = None if self.running is None else self.running.add
+
+    def end(self, report: Callable[[str], None]) -> None:
+        """The running checks have ended: what they have found is noted and reported."""
+        if self.running is None:
+            return
+        for text in self.running.texts:
+            self.notes.append(text)
+            report(text)
+        self.running = self._inputs.stream.on_reading = None
 
 
 class KeptMessages:

@@ -216,6 +216,16 @@ class Session:
         self.state.pipeline, self.state.start = pipeline, start
         self.health.reset()
 
+    def change_map(self, trial: Trial) -> None:
+        """The saved map of ``trial`` is the one that checkpoints are of from now on."""
+        if self._checkpoints is not None and trial.prior is not None:
+            self._checkpoints.change_identity(fingerprints(map=trial.prior.places.fingerprint), shared_of(trial))
+
+    def change_mounts(self, mounts: Mapping[str, Mount]) -> None:
+        """Checkpoints are of a robot with ``mounts`` from now on."""
+        if self._checkpoints is not None:
+            self._checkpoints.change_identity(fingerprints(mounts=mounts), {})
+
     def process(self, event: Event, publish: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
         """``publish`` is called with each estimate before anything else is done with it. Raises `EstimatorError`."""
         self.count += 1

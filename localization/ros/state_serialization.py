@@ -34,6 +34,7 @@ PACKAGES = ("localization.", "motion_models.")
 KINDS = "biufc"
 """Kinds of numpy's types that are numbers."""
 _PACKED_AT_LEAST = 8
+_NUMBERS = {float, int, bool, np.float64, np.ndarray}
 
 Json = Any
 
@@ -114,7 +115,7 @@ class _Writer:
             return ["c", kind.__module__, kind.__qualname__, self.put(_state(value))]
         raise CheckpointError(f"the state holds a {kind.__module__}.{kind.__qualname__}, which cannot be written down")
 
-    def _packed(self, values: list[Any] | deque[Any]) -> list[Json] | None:
+    def _packed(self, values: Sequence[Any]) -> list[Json] | None:
         """A long sequence of numbers, of equal rows of numbers, or of frozen dataclasses or named tuples: the last seconds of wheels are
         thousands."""
         if len(values) < _PACKED_AT_LEAST:
@@ -132,7 +133,7 @@ class _Writer:
                 return None
             columns = [self._column(column) for column in zip(*values, strict=True)]
             return None if None in columns else ["rows", *columns]
-        column = self._column(values)
+        column = self._column(values) if len(kinds) == 1 and kinds <= _NUMBERS else None
         return None if column is None else ["column", column]
 
     def _column(self, values: Sequence[Any]) -> Json:
@@ -141,14 +142,15 @@ class _Writer:
             alike = {(v.dtype, v.shape, v.flags.c_contiguous, v.base is None) for v in values}
             dtype, _, is_contiguous, is_own = next(iter(alike))
             is_plain = len(alike) == 1 and is_contiguous and is_own and dtype.kind in KINDS
-            return ["ndarray", self._array(np.stack(values))] if is_plain else None
+            return ["ndarray", self._array(np.stack(values))] if is_plain else ["arrays", list(map(self.put, values))]
         for kind, dtype in ((float, "<f8"), (int, "<i8"), (bool, "|b1"), (np.float64, "<f8")):
             if kinds == {kind}:
                 try:
                     return [kind.__name__, self._array(np.array(values, dtype=dtype))]
                 except OverflowError:
                     return None
-        return None
+        packed = self._packed(values)  # rows within rows
+        return None if packed is None else ["packed", packed]
 
     def _ndarray(self, value: NDArray[Any]) -> Json:
         if value.dtype.kind not in KINDS:
@@ -280,7 +282,11 @@ class _Reader:
             for key, value in content.items():
                 object.__setattr__(made, key, value)
 
-    def _column(self, kind: str, place: int) -> list[Any]:
+    def _column(self, kind: str, place: Json) -> list[Any]:
+        if kind == "packed":
+            return self._list(*place)
+        if kind == "arrays":
+            return list(map(self.get, place))
         values = self._array(place)
         if kind == "ndarray":
             return [row.copy() for row in values]

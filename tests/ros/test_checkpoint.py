@@ -26,6 +26,7 @@ from localization.lidar.scan_matcher import ScanMatcher
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
 from localization.ros.state_serialization import deserialize, serialize, serialize_parts
+from localization.sensor_checks.innovations import Bin
 from localization.synchronizer import StepConfig
 from localization.wheel_buffer import WheelInterval
 from motion_models.registry import make_model
@@ -250,6 +251,20 @@ def test_serialize_of_named_tuples_writes_columns():
     found = deserialize(text, blob)
     assert found == values
     assert {type(value) for value in found} == {WheelInterval}
+
+
+def test_serialize_of_rows_within_rows_writes_columns():
+    """Named tuples that hold tuples and arrays of different lengths; of an array in two places there is one afterwards."""
+    poses = [np.arange(float(i)) for i in range(40)]
+    values = [Bin(0.5 * i, 0.1, 0.2, 0.3, (0.1 * i, 1.0, 2.0, 3.0), poses[i % 40]) for i in range(200)]
+    text, blob = serialize(values)
+    assert text.count(b"Bin") == 1
+    assert len(blob) < 200 * 9 * 8 + sum(pose.nbytes for pose in poses)
+    found = deserialize(text, blob)
+    assert [value[:5] for value in found] == [value[:5] for value in values]
+    assert {type(value) for value in found} == {Bin}
+    assert all(np.array_equal(a.poses, b.poses) for a, b in zip(found, values, strict=True))
+    assert found[0].poses is found[40].poses
 
 
 @given(st.binary(max_size=60), st.binary(max_size=20))

@@ -351,6 +351,29 @@ def test_take_of_a_batch_returns_at_once_for_urgent_topics(chatter, transport):
     assert [received.topic for received in transport.take(_DEADLINE_S)] == ["/a"]
 
 
+def test_has_readers_follows_those_who_come_and_go(transport):
+    transport.advertise("/spoken", "std_msgs/msg/String")
+    assert not transport.has_readers("/spoken")
+    code = (
+        "import sys\n"
+        "from localization.ros.transports.dds import DdsTransport\n"
+        "transport = DdsTransport(int(sys.argv[1]))\n"
+        "transport.subscribe('/spoken', 'std_msgs/msg/String', is_latched=False)\n"
+        "sys.stdin.read()\n"
+        "transport.close()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(DOMAIN)], stdin=subprocess.PIPE, cwd=Path(__file__).parents[2]):
+        wait_for(lambda: transport.has_readers("/spoken"))  # then its input ends
+    wait_for(lambda: not transport.has_readers("/spoken"))
+
+
+def wait_for(condition):
+    end = time.monotonic() + _DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 def test_receive_times_lie_between_two_calls_of_take():
     receive_times = importlib.import_module("localization.ros.transports.dds").receive_times
     assert receive_times([], 0, 100) == []

@@ -237,10 +237,10 @@ def test_node_with_doctor_publishes_the_same_estimates(monkeypatch: pytest.Monke
     for minutes in (0.0, 1e-6):
         transports.append(LogTransport(drive_log(), lambda messages: messages[: len(messages) // 2]))
         node, _ = run_node(transports[-1], config=NodeConfig(wait_s=0.0, predict=False, diagnose_every_min=minutes))
-        node._publish_status()
-        assert node._doctor.is_running == (minutes > 0.0)
+        node.publish_status(0.0)
+        assert node.status.doctor.is_running == (minutes > 0.0)
         node.finish()
-        assert not node._doctor.is_running
+        assert not node.status.doctor.is_running
     plain, watched = transports
     topic = Names().resolve(ODOMETRY)
     assert len(plain.published[topic]) > 50

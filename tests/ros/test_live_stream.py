@@ -255,7 +255,7 @@ def test_sensor_that_vanishes_and_returns_is_used_again(topic, calm):
 
 def test_batch_s_ends_shortly_before_the_next_scan(calm):
     """They are looked at once before it is due; at once when it is late, or if there is no LiDAR."""
-    stream = calm[1]._stream
+    stream = calm[1].inputs.stream
     scans = stream._rates["/scan"]
     period, last = scans._period_s, scans._last_ns
     assert period == pytest.approx(0.16, rel=0.1)
@@ -267,27 +267,28 @@ def test_batch_s_ends_shortly_before_the_next_scan(calm):
     alone = LogTransport(drive_log(scans_hz=6.25), silenced("/scan", 0.0, 99.0))
     alone.types.pop("/scan")
     node, _ = run_node(alone)
-    assert node._stream.batch_s(node._stream._rates["/joint_states"]._last_ns) == 0.0
+    assert node.inputs.stream.batch_s(node.inputs.stream._rates["/joint_states"]._last_ns) == 0.0
 
 
 def test_batch_s_is_zero_while_a_scan_waits_for_the_wheels():
     """A scan that is ahead of the wheels is used with the very next message that they send."""
     node, _ = run_node(LogTransport(drive_log(scans_hz=6.25)))
-    scan, newest_ns = node.session.health._scan, node._newest_ns
-    node._stream._rates["/scan"]._last_ns = time.monotonic_ns()
-    assert node._batch_s() > 0.0
+    scan = node.session.health._scan
+    newest_ns = scan.stamp_ns + S // 10
+    node.inputs.stream._rates["/scan"]._last_ns = time.monotonic_ns()
+    assert node.batch_s() > 0.0
     assert node.session.process(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
-    assert node._batch_s() == 0.0
+    assert node.batch_s() == 0.0
     assert node.session.process(WheelSample(newest_ns + S + S // 10, np.zeros(2), np.full(2, np.nan)))
-    node._stream._rates["/scan"]._last_ns = time.monotonic_ns()
-    assert node._batch_s() > 0.0
+    node.inputs.stream._rates["/scan"]._last_ns = time.monotonic_ns()
+    assert node.batch_s() > 0.0
 
 
 def test_silent_topic_is_an_error_that_names_it(calm):
     _, node, _ = calm
-    watches = node._stream._rates
-    assert node._stream.silent(max(w._last_ns for w in watches.values())) == {}
-    later = node._stream.silent(max(w._last_ns for w in watches.values()) + 3 * S)
+    watches = node.inputs.stream._rates
+    assert node.inputs.stream.silent(max(w._last_ns for w in watches.values())) == {}
+    later = node.inputs.stream.silent(max(w._last_ns for w in watches.values()) + 3 * S)
     assert set(later) == {"/joint_states", "/scan", "/imu/data"}
     status = node.session.health.statuses(node.session.pipeline, [], later)[-1]
     assert status.level == ERROR
@@ -442,7 +443,7 @@ def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):
 
     first = LogTransport(drive_log(scans_hz=6.25), part(0.0, 10.0))
     node, _ = run_node(first, files=files)
-    node.session.save_state(node._head, now=True)
+    node.save_state(now=True)
     node.session._checkpoints.wait()  # kill -9 from here: no finish, no close
     second = LogTransport(drive_log(scans_hz=6.25), part(10.5, 17.0))
     node, reports = run_node(second, files=files)
@@ -467,7 +468,7 @@ def test_files_of_a_killed_run_do_not_stop_a_live_node(tmp_path, left):
     """State and estimates that do not fit each other, as after a power cut, and hidden files of any kind."""
     files = Files(tmp_path / "run.tum", tmp_path / "state")
     node, _ = run_node(LogTransport(drive_log(scans_hz=6.25), lambda messages: messages[:1200]), files=files)
-    node.session.save_state(node._head, now=True)
+    node.save_state(now=True)
     log = files.estimate_log
     if left == "nothing":
         log.unlink()
@@ -503,7 +504,7 @@ def test_full_disk_does_not_stop_a_live_node(tmp_path, monkeypatch, calm):
         f"an estimate cannot be written to '{files.estimate_log}': No space left on device. "
         "Estimates made meanwhile are missing from the output; it is tried again.",
     ]
-    node._publish_status()
+    node.publish_status(0.0)
     files_status = next(s for s in published(full, DIAGNOSTICS)[-1].status if s.name == "skidloc: files")
     assert files_status.level == WARN
     assert files_status.message.count("No space left on device") == 2
@@ -547,7 +548,7 @@ def test_second_publisher_of_the_transform_is_reported():
     sentences = [text for text in reports if "another node publishes 'odom' -> 'base_link' on /tf" in text]
     assert len(sentences) == 1
     assert "--node.no-tf" in sentences[0]
-    node._publish_status()
+    node.publish_status(0.0)
     status = next(s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: transforms")
     assert status.level == ERROR
     assert "enable_odom_tf" in status.message

@@ -139,7 +139,7 @@ def test_pause_publishes_nothing_until_it_is_continued():
 @pytest.mark.extended
 def test_diagnostics_of_a_paused_node_name_the_service():
     transport, node, _, _ = serviced("/skidloc/pause", True)
-    node._publish_status()
+    node.publish_status(0.0)
     (status,) = [s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: pause"]
     assert "~/pause with data: false" in status.message
 
@@ -166,7 +166,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     alone, loaded = node.payloads._unloaded.position, node.payloads.sample(0).position
     assert np.hypot(*(loaded - alone)) > 0.01
     assert node.session.pipeline.synchronizer.wheels.buffer.cg == pytest.approx(loaded)
-    node._publish_status()
+    node.publish_status(0.0)
     (status,) = [s for s in published(transport, DIAGNOSTICS)[-1].status if s.name == "skidloc: payload"]
     assert status.message == "20 kg at 'left_gripper'"
     node.finish()
@@ -206,14 +206,14 @@ def test_commands_by_topics_do_what_the_services_do():
     assert "reset: begins anew at the origin." in reports
     _, node, reports = commanded("odometry", "/skidloc/pause", encode(on))
     assert node.is_paused
-    assert node._commands.execute(Received("/skidloc/pause", 0, encode(off)))
+    assert node.commands.execute(Received("/skidloc/pause", 0, encode(off)))
     assert not node.is_paused
 
 
 @pytest.mark.extended
 def test_path_and_map_are_published_in_the_frame_of_the_estimates():
     transport = LogTransport(drive_log())
-    node, _ = run_node(transport, "graph", config=NodeConfig(wait_s=0.0, map_period_s=0.001))
+    run_node(transport, "graph", config=NodeConfig(wait_s=0.0, map_period_s=0.001))
     path, grid = published(transport, PATH)[-1], published(transport, MAP)[-1]
     assert path.header.frame_id == grid.header.frame_id == "map"
     assert 1 < len(path.poses) <= 500
@@ -221,7 +221,8 @@ def test_path_and_map_are_published_in_the_frame_of_the_estimates():
     assert set(np.unique(cells)) == {-1, 0, 100}
     assert (cells == 0).mean() > 0.15
     assert grid.info.resolution == pytest.approx(0.1)
-    assert node._publisher._path.poses[0][1] == pytest.approx(np.zeros(3), abs=0.1)
+    begin = path.poses[0].pose.position
+    assert (begin.x, begin.y) == pytest.approx((0.0, 0.0), abs=0.1)
 
 
 def test_occupancy_grid_marks_the_cells_of_points():

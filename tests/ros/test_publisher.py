@@ -12,7 +12,8 @@ from localization.estimators import Estimate
 from localization.events import WheelSample
 from localization.logs.reader import open_source
 from localization.ros.discovery import TF
-from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY, Predictor
+from localization.ros.predictor import Predictor
+from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files
 from localization.ros.settings import NodeConfig
 from localization.trajectory import read_tum
@@ -195,6 +196,27 @@ def test_predict_after_stop_gives_none():
     insert_wheels(predictor, S, 6)
     predictor.stop()
     assert predictor.predict() is None
+
+
+def test_predictions_that_nobody_receives_are_not_written():
+    """By a transport that knows: neither predicted odometry nor more transforms than estimates; estimates are as with readers."""
+    transport = LogTransport(drive_log())
+    transport.has_readers = lambda topic: False
+    run_node(transport, config=NodeConfig(wait_s=0.0, predict=True))
+    late = 3 * S + stamp_of(published(transport, ODOMETRY)[0])
+    assert not [m for m in published(transport, PREDICTED_ODOMETRY) if stamp_of(m) > late]
+    transforms = [t for message in published(transport, TF) for t in message.transforms if stamp_of(t) > late]
+    assert len(transforms) == len([m for m in published(transport, ODOMETRY) if stamp_of(m) > late]) > 100
+
+
+def test_predicted_odometry_without_readers_is_left_out_beside_transforms(driven):
+    transport = LogTransport(drive_log())
+    transport.has_readers = lambda topic: topic == TF
+    run_node(transport, config=NodeConfig(wait_s=0.0, predict=True))
+    late = 3 * S + stamp_of(published(transport, ODOMETRY)[0])
+    assert not [m for m in published(transport, PREDICTED_ODOMETRY) if stamp_of(m) > late]
+    assert published(transport, TF)[-1] == published(driven("ekf", True)[0], TF)[-1]
+    assert len(published(transport, TF)) == len(published(driven("ekf", True)[0], TF))
 
 
 @pytest.mark.parametrize(("wheels_hz", "predicted_hz"), [(500.0, 50.0), (100.0, 50.0), (50.0, 50.0), (40.0, 40.0), (120.0, 50.0)])

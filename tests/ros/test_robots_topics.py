@@ -108,16 +108,18 @@ def test_live_fixes_give_the_map_its_heading_and_place_in_utm(outdoor_log, monke
     """The map begins at the start of the drive: its pose east and north of the datum is that of the start, about the antenna's arm."""
     datum = np.array([GpsConfig().latitude_deg, GpsConfig().longitude_deg])
     utm_T_enu = np.array([413080.0, 5318357.0, -0.015])
-    monkeypatch.setattr("localization.ros.node.utm_pose", lambda given: utm_T_enu if np.array_equal(given, datum) else None)
+    for module in ("live_inputs", "live_outputs"):
+        monkeypatch.setattr(f"localization.ros.{module}.utm_pose", lambda given: utm_T_enu if np.array_equal(given, datum) else None)
     config = NodeConfig(
         wait_s=0.0, predict=False, positions="fix", datum=",".join(map(str, datum)), utm_frame="utm", path_period_s=0.0, map_period_s=0.0
     )
-    node, _ = run_node(LogTransport(outdoor_log), "graph", config=config)
+    transport = LogTransport(outdoor_log)
+    node, _ = run_node(transport, "graph", config=config)
     assert node.session.pipeline.estimator.counts()["positions"] > 10
     x, y, yaw = node.session.pipeline.estimator.enu_T_map
     assert abs(yaw - 0.5) < 0.06
     assert np.hypot(x, y) < 0.4
-    transforms = [t.transforms[0] for t in published(node._transport, TF)]
+    transforms = [t.transforms[0] for t in published(transport, TF)]
     in_utm = [t for t in transforms if t.header.frame_id == "utm"]
     assert in_utm[-1].child_frame_id == "map"
     expected = se2.compose(utm_T_enu, np.array([x, y, yaw]))

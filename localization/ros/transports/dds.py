@@ -20,7 +20,7 @@ import socket
 import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -84,8 +84,8 @@ class DdsTransport(MonotonicTime):
                 self._participant = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
         except dds.DDSException as error:
             raise TransportError(f"DDS cannot be used on interface '{interface}', domain {domain}: {error}.") from error
-        self._waiting, self._urgent = dds.WaitSet(self._participant), dds.WaitSet(self._participant)
-        self._readers: list[tuple[str, DataReader[Any], dds.ReadCondition]] = []
+        self._waiting, self._urgent, self._rare = (dds.WaitSet(self._participant) for _ in range(3))
+        self._readers: list[_Reader] = []
         self._writers: dict[str, _Writer] = {}
         self._topics: dict[str, Topic[Any]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
@@ -100,18 +100,21 @@ class DdsTransport(MonotonicTime):
         reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
         self._waiting.attach(is_new)
-        self._readers.append((topic, reader, is_new))
+        if is_rare := is_latched or is_command:
+            self._rare.attach(is_new)
+        self._readers.append(_Reader(topic, reader, is_new, is_rare))
         self._publish_graph()
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         """Receive only these of the topics subscribed to, from now on; `take` returns at once for those that are ``urgent``."""
-        for topic, _, is_new in self._readers:
-            if topic not in topics:
-                self._waiting.detach(is_new)
-            elif topic in urgent:
-                self._urgent.attach(is_new)
-        self._readers = [entry for entry in self._readers if entry[0] in topics]
-        kept = {_GRAPH_TOPIC, *map(_dds_name, self._writers), *(_dds_name(topic) for topic, _, _ in self._readers)}
+        for reader in self._readers:
+            if reader.topic not in topics:
+                self._waiting.detach(reader.is_new)
+                self._rare.detach(reader.is_new)
+            elif reader.topic in urgent:
+                self._urgent.attach(reader.is_new)
+        self._readers = [reader for reader in self._readers if reader.topic in topics]
+        kept = {_GRAPH_TOPIC, *map(_dds_name, self._writers), *(_dds_name(reader.topic) for reader in self._readers)}
         self._topics = {name: topic for name, topic in self._topics.items() if name in kept}  # another type may follow
         self._publish_graph()
 
@@ -124,6 +127,10 @@ class DdsTransport(MonotonicTime):
         """Send a message on a topic that was advertised; a reader that is too slow loses it."""
         _write(self._writers[topic], data)
 
+    def has_readers(self, topic: str) -> bool:
+        """Whether somebody receives ``topic``, which was advertised."""
+        return bool(self._writers[topic][0].get_matched_subscriptions())
+
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """In the order of sending: after a pause, the messages of one topic must not all come before another's."""
         is_urgent = batch_s > 0.0 and self._urgent.wait(round(batch_s * 1e9))
@@ -132,13 +139,14 @@ class DdsTransport(MonotonicTime):
         if not is_there:
             return []
         found: list[tuple[int, Received]] = []
-        for topic, reader, is_new in self._readers:
-            if is_new.triggered:  # `take` costs ten times as much, and mostly one of them has messages
+        has_rare = bool(self._rare.wait(0))
+        for topic, reader, is_new, is_rare in self._readers:
+            if (has_rare or not is_rare) and is_new.triggered:  # `take` costs more, and mostly one of them has messages
                 samples = [sample for sample in reader.take(1000) if isinstance(sample, _Bytes)]
                 sent = [int(sample.sample_info.source_timestamp) for sample in samples]
                 newest = self._clocks.setdefault(topic, SenderClock()).receive_time_ns(max(sent, default=0), since, self._last_take_ns)
                 came = receive_times(sent, since, newest)
-                found += [(at, Received(topic, ns, bytes(sample))) for at, ns, sample in zip(sent, came, samples, strict=True)]
+                found += [(at, Received(topic, ns, sample)) for at, ns, sample in zip(sent, came, samples, strict=True)]
         found.sort(key=lambda entry: entry[0])
         return [received for _, received in found]
 
@@ -158,7 +166,7 @@ class DdsTransport(MonotonicTime):
         self._readers.clear()
         self._writers.clear()
         self._topics.clear()
-        del self._graph, self._waiting, self._urgent, self._found, self._participant, self._domain
+        del self._graph, self._waiting, self._urgent, self._rare, self._found, self._participant, self._domain
 
     def _topic(self, dds_name: str, kind: str) -> Topic[Any]:
         """One for a reader and a writer, whose qualities differ: a second one with another quality is refused."""
@@ -177,7 +185,7 @@ class DdsTransport(MonotonicTime):
             "rmw_dds_common/msg/NodeEntitiesInfo",
             node_namespace=self._namespace,
             node_name=self._name,
-            reader_gid_seq=[_gid(reader) for _, reader, _ in self._readers],
+            reader_gid_seq=[_gid(reader.reader) for reader in self._readers],
             writer_gid_seq=[_gid(writer) for writer, _ in self._writers.values()],
         )
         _write(self._graph, encode(make(_GRAPH_TYPE, gid=_gid(self._participant), node_entities_info_seq=[node])))
@@ -211,6 +219,15 @@ def receive_times(sent_ns: Sequence[int], since_ns: int, newest_ns: int) -> list
 
 
 _Writer = tuple["DataWriter[Any]", type[Any]]
+
+
+class _Reader(NamedTuple):
+    topic: str
+    reader: DataReader[Any]
+    is_new: dds.ReadCondition
+    """Triggered while there are messages that were not taken."""
+    is_rare: bool
+    """Of a topic with few messages: it is only asked when one of these has some."""
 
 
 def _write(writer: _Writer, data: bytes) -> None:

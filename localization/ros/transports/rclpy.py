@@ -110,6 +110,10 @@ class RclpyTransport(MonotonicTime):
         """Send a message on a topic that was advertised."""
         self._writers[topic].publish(data)
 
+    def has_readers(self, topic: str) -> bool:
+        """Whether somebody receives ``topic``, which was advertised."""
+        return bool(self._writers[topic].get_subscription_count())
+
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """In the order in which the executor has them; ``batch_s`` is not used."""
         self._executor.spin_once(timeout_sec=timeout_s)

@@ -82,6 +82,10 @@ class RospyTransport(MonotonicTime):
         message._buff = data
         writer.publish(message)
 
+    def has_readers(self, topic: str) -> bool:
+        """Whether somebody receives ``topic``, which was advertised."""
+        return bool(self._writers[topic][0].get_num_connections())
+
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """In the order of arrival; ``batch_s`` is not used."""
         found = []

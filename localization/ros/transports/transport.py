@@ -61,6 +61,9 @@ class Transport(Protocol):
     def publish(self, topic: str, data: bytes) -> None:
         """Send a message on a topic that was advertised; it never waits for those who receive it."""
 
+    def has_readers(self, topic: str) -> bool:
+        """Whether somebody receives ``topic``, which was advertised; true where the transport does not know it."""
+
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         """Answer requests of ``kind`` (`std_srvs/srv/Trigger`) by ``handler``, inside `take`; False where the transport has no services."""
 
@@ -85,7 +88,7 @@ class Transport(Protocol):
 
 
 class MonotonicTime:
-    """The clock of transports whose time is that of the operating system: it never jumps. No services."""
+    """The clock of transports whose time is that of the operating system: it never jumps. No services; who receives is not known."""
 
     _epoch_ns: int | None = None
 
@@ -103,6 +106,10 @@ class MonotonicTime:
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         """Never: there are no services."""
         return False
+
+    def has_readers(self, topic: str) -> bool:
+        """True."""
+        return True
 
 
 def default_domain(environment: Mapping[str, str] = os.environ) -> int:
@@ -139,6 +146,10 @@ class SimTimeTransport:
     def publish(self, topic: str, data: bytes) -> None:
         """Send a message by the wrapped transport."""
         self._transport.publish(topic, data)
+
+    def has_readers(self, topic: str) -> bool:
+        """Whether somebody receives ``topic`` on the wrapped transport."""
+        return self._transport.has_readers(topic)
 
     def offer_service(self, name: str, kind: str, handler: ServiceHandler) -> bool:
         """Answer requests of ``kind`` by ``handler``, by the wrapped transport; False where it has no services."""

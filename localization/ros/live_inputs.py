@@ -1,0 +1,123 @@
+"""The robot's topics that a node uses, and how their messages become events: as the robot file and /tf_static have it, or as the sensors
+were found to be wired."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from localization.calibration.lidar_check import LidarCheck
+from localization.calibration.wheel_wiring import LiveSensors
+from localization.logs.decode import MessageStats
+from localization.logs.topic_roles import Sources
+from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TransformConflicts
+from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
+from localization.ros.live_stream import LiveStream
+from localization.ros.live_wiring import LiveWiring
+from localization.ros.payloads import Payloads
+from localization.ros.session import LiveRobot
+from localization.ros.settings import LiveRun
+from localization.ros.transports.transport import Transport
+from motion_models.robot import Mount
+
+
+class LiveInputs:
+    """`subscribe`, then give messages to `stream`, `gnss`, `transforms` and `conflicts`, by topic. `rewire` begins another stream."""
+
+    def __init__(self, transport: Transport, run: LiveRun, discovered: DiscoveredTopics) -> None:
+        """``run`` with resolved topics. Raises `SettingError` for a datum that is none, and for UTM without pyproj."""
+        self._transport, self.robot = transport, run.robot
+        self.discovered = replace(discovered, backlog=())
+        """Topics in use, as they are read now."""
+        self.tf_static, self.tf = run.node.names.resolve(TF_STATIC), run.node.names.resolve(TF)
+        self.transforms = discovered.transforms
+        self.conflicts = TransformConflicts(run.node.frames.base_link_frame, is_ros1=transport.is_ros1)
+        """Other publishers of the node's own transform."""
+        self.stats = MessageStats()
+        self.stream = self.open_stream(self.stats)
+        self.gnss = _gnss(run, transport, self.stats)
+        """None without a topic of positions."""
+
+    @property
+    def sources(self) -> Sources:
+        """Topics in use, by what they are used for."""
+        return self.discovered.parts.sources
+
+    @property
+    def has_lidar(self) -> bool:
+        """Whether scans or clouds are among the topics in use."""
+        return self.sources.lidar is not None
+
+    @property
+    def topics(self) -> list[str]:
+        """Names of the topics in use."""
+        return [source.topic for source in self.sources.used()]
+
+    @property
+    def payloads(self) -> Payloads:
+        """Loads that the robot holds."""
+        return self.stream.payloads
+
+    def open_stream(self, stats: MessageStats) -> LiveStream:
+        """A stream that begins now, of the topics and the robot as they are known now; it counts in ``stats``."""
+        return LiveStream(self.discovered, self.robot, stats, self._transport.epoch_ns, is_ros1=self._transport.is_ros1)
+
+    def subscribe(self, commands: Iterable[str], *, with_tf: bool, is_predicting: bool) -> None:
+        """Receive what is used from here on, and the topics of ``commands``. Wheels are urgent where messages of them make predictions;
+        /tf shows another publisher of the transform, if ``with_tf``."""
+        others = [self.tf_static]
+        if with_tf:
+            self._transport.subscribe(self.tf, TF_TYPE, is_latched=False)
+            others.append(self.tf)
+        if self.gnss is not None:
+            self._transport.subscribe(self.gnss.topic, FIX_TYPE, is_latched=False)
+            others.append(self.gnss.topic)
+        sources = self.sources
+        urgent = [source.topic for source in (sources.lidar, sources.wheels if is_predicting else None) if source is not None]
+        self._transport.restrict([*others, *self.topics, *commands], [*urgent, *commands])
+
+    def rewire(self, wiring: LiveRobot, mounts: Mapping[str, Mount]) -> None:
+        """Read messages from here on as of the robot of ``wiring``."""
+        self.robot = wiring.robot
+        parts, joints = self.discovered.parts, wiring.robot.joints
+        if {*parts.joints[0]} != {*joints.left} and {*parts.joints[0], *parts.joints[1]} == {*joints.left, *joints.right}:
+            parts = replace(parts, joints=(joints.left, joints.right))
+        if not wiring.uses_gyro:
+            parts = replace(parts, sources=replace(parts.sources, imu=None))
+        self.discovered = replace(self.discovered, parts=parts)
+        self.reopen(mounts)
+
+    def reopen(self, mounts: Mapping[str, Mount]) -> None:
+        """Begin another stream, with nothing counted; the loads stay."""
+        loads = self.payloads.loads
+        self.stats.clear()
+        self.stream = self.open_stream(self.stats)
+        self.payloads.loads, self.payloads.mounts = loads, mounts
+
+    def wiring_check(self, mounts: Mapping[str, Mount], *, is_clock_known: bool) -> LiveWiring | None:
+        """Of wheels against gyro and LiDAR; None where nothing can contradict the wheels: neither each other, nor a gyro their driver's
+        odometry."""
+        wheels = self.sources.wheels
+        if wheels is None or (wheels.kind != "joint_states" and self.sources.imu is None):
+            return None
+        return LiveWiring(LiveSensors(self.robot, self.sources, mounts), self.discovered.parts.joints, is_clock_known)
+
+    def lidar_check(self, mounts: Mapping[str, Mount], *, is_clock_known: bool) -> LidarCheck | None:
+        """Of the LiDAR's mount and clock against wheels and gyro on the first metres; None without wheels or LiDAR."""
+        lidar, has_gyro = self.sources.lidar, self.sources.imu is not None
+        if lidar is None or self.sources.wheels is None:
+            return None
+        return LidarCheck(mounts, self.robot, lidar.topic, has_gyro, is_clock_known)
+
+
+def _gnss(run: LiveRun, transport: Transport, stats: MessageStats) -> GnssReceiver | None:
+    """Raises `SettingError` for a datum that is none, and for UTM without pyproj."""
+    node = run.node
+    if not node.positions:
+        return None
+    datum = parse_datum(node.datum)
+    if node.utm_frame:
+        utm_pose(np.zeros(2) if datum is None else datum)  # what is missing is reported now
+    return GnssReceiver(node.names.resolve(node.positions), datum, stats, transport.epoch_ns, is_ros1=transport.is_ros1)
