@@ -38,6 +38,9 @@ _THINNING = 0.4
 """Edge of the cubes with one point each, in voxels: 3,300 of the 5,200 points of 16 rings on hills."""
 _INLIER_WEIGHT = 0.25
 """Weight by Geman-McClure's loss at `_KERNEL` sigmas, over that at none."""
+_REACH = math.sqrt(0.5)
+"""Distance along a surface from its mean, up to which it holds, in voxels: half the diagonal of a voxel's face. Farther points are beyond
+the end of the map, where a plane misses ground that bends by h = .08 1/m by h d^2 / 2 = 10 mm at d = .5 m."""
 _BLOCK = 2
 """Voxels along each side of a block, whose residuals err together."""
 _BLOCKS = 1 << 13
@@ -361,17 +364,26 @@ def _linearize(grid: CloudGrid, points: FloatArray, pose: Transform3, blocks: Fl
             first[2] * second[0] - first[0] * second[2],
             first[0] * second[1] - first[1] * second[0],
         )
+        across = (_dot(first, off), _dot(second, off), _dot(third, off))
+        is_line = s[10] < math.inf
+        along = math.sqrt((0.0 if is_line else across[1] ** 2) + across[2] ** 2)
+        share = 1.0 if along < _REACH * grid.cell else 0.0
         J = _by_pose(pose, (a, b, c), first)
-        weight = _add_residual(H, gradient, block, J, first[0] * off[0] + first[1] * off[1] + first[2] * off[2], s[9])
-        _add_outer(spurious, _by_pose(pose, (a, b, c), second), weight * min(s[11], 1.0))
-        _add_outer(spurious, _by_pose(pose, (a, b, c), third), weight * min(s[12], 1.0))
+        weight = _add_residual(H, gradient, block, J, across[0], s[9], share)
+        _add_outer(spurious, _by_pose(pose, (a, b, c), second), share * weight * min(s[11], 1.0))
+        _add_outer(spurious, _by_pose(pose, (a, b, c), third), share * weight * min(s[12], 1.0))
         least = weight * s[9]
-        if s[10] < math.inf:
-            J, r = _by_pose(pose, (a, b, c), second), second[0] * off[0] + second[1] * off[1] + second[2] * off[2]
-            least = min(least, _add_residual(H, gradient, block, J, r, s[10]) * s[10])
+        if is_line:
+            J = _by_pose(pose, (a, b, c), second)
+            least = min(least, _add_residual(H, gradient, block, J, across[1], s[10], share) * s[10])
         counts[0] += 1.0
         counts[1] += least > _INLIER_WEIGHT
     return H, spurious, gradient, counts
+
+
+@subroutine
+def _dot(a: Point, b: Point) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @subroutine
@@ -385,13 +397,13 @@ def _by_pose(pose: Transform3, point: Point, direction: Point) -> Six:
 
 
 @subroutine
-def _add_residual(H: FloatArray, gradient: FloatArray, block: FloatArray, J: Six, r: float, variance: float) -> float:
-    """Add a residual ``r`` with derivative ``J``; its weight."""
+def _add_residual(H: FloatArray, gradient: FloatArray, block: FloatArray, J: Six, r: float, variance: float, share: float) -> float:
+    """Add the ``share`` of a residual ``r`` with derivative ``J`` that counts; its whole weight."""
     weight = 1.0 / ((1.0 + r * r / (variance * _KERNEL * _KERNEL)) ** 2 * variance)
-    _add_outer(H, J, weight)
+    _add_outer(H, J, share * weight)
     for d in range(6):
-        gradient[d] += weight * r * J[d]
-        block[d] += weight * r * J[d]
+        gradient[d] += share * weight * r * J[d]
+        block[d] += share * weight * r * J[d]
     return weight
 
 

@@ -17,7 +17,7 @@ from localization.ros.state_serialization import deserialize, serialize
 from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from tests.helpers.hill_scans import MOUNT, make_scene, scans
-from tests.helpers.hills import rolling_drive, with_accelerometer_bias
+from tests.helpers.hills import rolling_drive, with_accelerometer_bias, with_gyro_bias
 from tests.helpers.in_space import IN_SPACE, aligned_rms, in_order, run_in_space, true_poses
 
 pytestmark = pytest.mark.xdist_group("among_trees")
@@ -56,14 +56,15 @@ def test_space_fusion_without_matches_is_by_wheels_gyro_and_gravity(rolled, amon
 
 @pytest.mark.slow
 def test_space_fusion_over_seeds_has_the_nees_of_its_six_dimensions():
-    """Biases of accelerometer and gyro, noise, scene and way differ. At the end of eight drives: chi-square with 48 degrees of freedom is
-    between 26 and 79 in 99 %."""
+    """Biases of accelerometer and gyro drawn from their priors; noise, scene and way differ. At the end of 16 drives: chi-square with 96
+    degrees of freedom is below 134 in 99.5 %. Wheels that roll without slip, which the filter expects, make it less, but not by half."""
     nees = []
-    for seed in range(11, 19):
-        drive = with_accelerometer_bias(rolling_drive(6.0, turn_rate=0.5 - 0.1 * (seed - 11), seed=seed), seed)
+    for seed in (*range(11, 19), *range(31, 39)):
+        rolled = rolling_drive(6.0, turn_rate=0.5 - 0.1 * (seed % 10 - 1), seed=seed)
+        drive = with_gyro_bias(with_accelerometer_bias(rolled, seed), seed)
         found, _ = run_in_space(drive, list(scans(drive, make_scene(drive, seed), seed=seed)), "diff_drive")
         nees.append(found.nees[-1])
-    assert 26.0 < sum(nees) < 79.0
+    assert 48.0 < sum(nees) < 134.0
 
 
 @pytest.mark.extended

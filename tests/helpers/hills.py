@@ -43,6 +43,13 @@ def with_accelerometer_bias(drive: HillDrive, seed: int, sigma: float = 0.2) -> 
     return replace(drive, events=events)
 
 
+def with_gyro_bias(drive: HillDrive, seed: int, sigmas: tuple[float, float, float] = (0.01, 0.01, 0.001)) -> HillDrive:
+    """``drive`` whose gyro has a further constant bias by chance, with ``sigmas`` about its axes [rad/s]: the filter's priors."""
+    bias = np.random.default_rng(2000 + seed).normal(0.0, sigmas)
+    events = [replace(e, angular_velocity=e.angular_velocity + bias) if isinstance(e, ImuSample) else e for e in drive.events]
+    return replace(drive, events=events)
+
+
 def terrain(x: FloatArray, y: FloatArray) -> FloatArray:
     """Height of the hills [m]."""
     total = np.zeros(np.broadcast(x, y).shape)

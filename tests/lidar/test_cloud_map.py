@@ -100,3 +100,20 @@ def test_cloud_map_grows_beyond_its_first_size():
 def test_thin_keeps_one_point_per_cube():
     points = np.array([[0.01, 0.0, 0.0], [0.02, 0.0, 0.0], [1.0, 0.0, 0.0], [-0.01, 0.0, 0.0]])
     np.testing.assert_array_equal(thin(points, CELL_M), points[[0, 2, 3]])
+
+
+def test_cloud_match_counts_no_point_beyond_the_end_of_a_surface():
+    """Where ground bends, the plane at the map's edge does not go on: points that are beyond it by half a voxel and more pull nowhere."""
+
+    def valley(rng, low, high, n):
+        x, y = rng.uniform([low, -8.0], [high, 8.0], (n, 2)).T
+        return np.column_stack([x, y, 0.04 * (x * x + y * y)])
+
+    def within(rng):
+        return np.concatenate([valley(rng, -8.0, 3.2, 4000), yard(rng)[-600:]])
+
+    rng, surfaces = np.random.default_rng(7), mapped(within)
+    inside, beyond = seen(within(rng), np.eye(4), rng), seen(valley(rng, 3.4, 3.6, 300), np.eye(4), rng)
+    alone, both = (surfaces.match(points, np.eye(4), WIDE) for points in (inside, np.concatenate([inside, beyond])))
+    assert both.mapped > alone.mapped + 250
+    np.testing.assert_allclose(both.measured, alone.measured, atol=1e-12)
