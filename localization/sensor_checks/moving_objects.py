@@ -11,22 +11,18 @@ import numpy as np
 
 from localization.events import Step
 from localization.sensor_checks.contradictions import LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE
-from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
+from localization.sensor_checks.faults import FaultLog, SensorFault
+from localization.sensor_checks.moving_report import MOVING_OBJECTS, MovingReport
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY
 from localization.sensor_checks.reckoning import ESTIMATE, GYRO
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.scene_motion import STILL, SceneComparison, explain
 from localization.sensor_checks.standstill import WHEELS_STANDING
-from localization.sensor_checks.window import BIN_S, Window
+from localization.sensor_checks.window import Window
 from localization.trajectory import BoolArray
 from motion_models import se2
 from motion_models.compiled import kernel
 from motion_models.se2 import FloatArray, Points2, triple
-
-MOVING_OBJECTS = SensorFault(
-    "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
-    " the wheels are matched meanwhile. Without people and vehicles about the robot, check the wheels' radius and what covers the LiDAR."
-)
 
 _EXPLAINING = (LIDAR_OWN_BODY, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_STANDING)
 """Named faults of which parts of a scan, or the wheels, move otherwise."""
@@ -108,13 +104,17 @@ class MovingObjects:
         """Time of the last ones that showed it, and of the last labels that showed moving objects [s]."""
         self._since: FloatArray | None = None
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
+        self._last = np.zeros((2, 3))
+        """Poses at the end of the last step."""
+        self._jumped: FloatArray | None = None
+        """(2, 3) poses before the estimate went elsewhere at once."""
         self._is_by_scans = False
         """The estimate is by scans, too: one by wheels alone is where they lead."""
         self.is_led_away = False
         """Scans have led the estimate away from where wheels lead since `_since`."""
         self._explained: tuple[SensorFault, ...] = ()
         """Named faults so far that explain what was taken for moving objects."""
-        self.report = _Report(faults)
+        self.report = MovingReport(faults)
 
     @property
     def is_acting(self) -> bool:
@@ -127,7 +127,7 @@ class MovingObjects:
         if declared and any(fault in declared for fault in _EXPLAINING if fault not in self._explained):
             self._explained = tuple(fault for fault in _EXPLAINING if fault in declared)
             self._faults.retract(MOVING_OBJECTS)
-            self._since, self.report = None, _Report(self._faults)
+            self._since, self.report = None, MovingReport(self._faults)
             self._restart()
         scan, now_s = step.scan, self._faults.now_s
         if not step.has_wheels:
@@ -175,18 +175,31 @@ class MovingObjects:
         """How far the estimate is from the motion by the wheels while the scene may move; ``nis`` of the last scan, if one was matched."""
         self._is_by_scans |= nis is not None
         inflation, view = self._faults.inflation, self._compared
+        before, self._last = self._last, self._poses
         if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
             self._settle(self._since)
-            self._since = self._poses
+            self._since = self._last
         inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
         inflation.possible = None
         begin = self._suspected if view is None or self._suspected is not None else view.poses
         if self._since is not None or begin is None:
             return
-        is_near, distance = _compare_motions(begin, self._poses)
+        is_near, distance = _compare_motions(begin, self._last)
         is_off = distance > MIN_OFF_M or (nis is not None and nis > MAX_NIS)
-        if self._is_unsure or (is_near and is_off):
-            inflation.possible = self._distance(begin)
+        if self._jumped is not None or (not is_near and distance > _MAX_OFF_M):
+            self._update_jump(before)
+        if self._jumped is not None or self._is_unsure or (is_near and is_off):
+            inflation.possible = self._distance(begin if self._jumped is None else self._jumped)
+
+    def _update_jump(self, before: FloatArray) -> None:
+        """Keep the poses ``before`` the step (2, 3) in which the estimate went elsewhere at once: the robot was carried, or the LiDAR was
+        turned. Once the robot has driven on by the wheels, and scans agree, it was carried."""
+        if self._jumped is None:
+            self._jumped = None if _compare_motions(before, self._last)[0] else before
+        elif self._suspected is None:
+            x, y, yaw = se2.between(self._jumped[0], self._last[0])
+            if math.hypot(x, y) >= _MAX_WAY_M or abs(yaw) >= _MAX_TURN_RAD:
+                self._jumped = None
 
     def _distance(self, since: FloatArray) -> FloatArray:
         """(3,) of the motion by the wheels since the poses ``since`` (2, 3) from that by the estimate."""
@@ -288,34 +301,16 @@ class MovingObjects:
         self._compared = self._suspected = None
 
 
-class _Report:
-    """What is reported of all times in which objects moved."""
-
-    def __init__(self, faults: FaultLog) -> None:
-        self._faults, self._seconds, self._largest = faults, 0.0, 0.0
-        self._begin_s, self._last_s = math.nan, -math.inf
-        self.scans = 0
-        """Scans in which objects moved."""
-
-    def add(self, share: float) -> None:
-        """Objects move in this ``share`` of the beams now."""
-        now_s = self._faults.now_s
-        self._begin_s = now_s if math.isnan(self._begin_s) else self._begin_s
-        self._seconds += min(now_s - self._last_s, BIN_S)
-        self.scans, self._last_s, self._largest = self.scans + 1, now_s, max(self._largest, share)
-        message = MOVING_OBJECTS.message.format(percent=100.0 * self._largest, seconds=self._seconds)
-        self._faults.revise(DetectedFault(MOVING_OBJECTS, self._begin_s, message))
-
-
 @kernel
 def _compare_motions(since: FloatArray, now: FloatArray) -> tuple[bool, float]:
-    """Whether a scan at the poses ``now`` by wheels and estimate, (2, 3), is compared with one at ``since``, for the wheels' motion is
-    short; and the distance of the motion by the estimate from that by the wheels [m]."""
+    """Whether a scan at the poses ``now`` by wheels and estimate, (2, 3), is compared with one at ``since``, for both are near; and the
+    distance of the motion by the estimate from that by the wheels [m]."""
     by_wheels = se2.scalar_between(triple(since[0]), triple(now[0]))
     by_estimate = se2.scalar_between(triple(since[1]), triple(now[1]))
     off = se2.scalar_log(se2.scalar_between(by_estimate, by_wheels))
-    is_near = math.hypot(by_wheels[0], by_wheels[1]) < _MAX_WAY_M and abs(by_wheels[2]) < _MAX_TURN_RAD
-    return is_near, math.hypot(off[0], off[1])
+    way = max(math.hypot(by_wheels[0], by_wheels[1]), math.hypot(by_estimate[0], by_estimate[1]))
+    turn = max(abs(by_wheels[2]), abs(by_estimate[2]))
+    return way < _MAX_WAY_M and turn < _MAX_TURN_RAD, math.hypot(off[0], off[1])
 
 
 def _with_still(step: Step, is_still: BoolArray) -> Step:

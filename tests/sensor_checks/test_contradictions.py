@@ -19,7 +19,7 @@ from localization.sensor_checks.contradictions import (
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from tests.helpers.checked_drive import CheckedDrive, turned
-from tests.helpers.event_faults import bump_lidar, turn_scans, without_gyro
+from tests.helpers.event_faults import bump_lidar, named_faults, turn_scans, without_gyro
 from tests.helpers.fault_drives import in_room, run
 
 
@@ -147,3 +147,9 @@ def test_lidar_bumped_at_rest_is_in_the_covariance_of_the_place_it_jumps_to(has_
     outcome = run(in_room(0 if has_gyro else 1, 1), fault if has_gyro else without_gyro(fault))
     assert outcome.worst[0] > 0.5
     assert not outcome.is_wrong, outcome.least_consistent
+
+
+@pytest.mark.extended
+def test_gyro_that_repeats_zero_is_no_scene_that_moves() -> None:
+    outcome = run(in_room(), named_faults()["gyro stuck at 0"])
+    assert outcome.worst[0] < 0.05

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.ros.state_serialization import deserialize, serialize
-from localization.sensor_checks.moving_objects import MOVING_OBJECTS
+from localization.sensor_checks.moving_report import MOVING_OBJECTS
 from localization.sensor_checks.scan_motion import make_profile
 from localization.sensor_checks.scene_motion import MOVED, STILL, align_rest, explain
 from localization.simulation import world

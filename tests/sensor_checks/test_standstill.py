@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.events import ImuSample
-from localization.sensor_checks.moving_objects import MOVING_OBJECTS
+from localization.sensor_checks.moving_report import MOVING_OBJECTS
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.simulation import world
 from tests.helpers import rooms
