@@ -1,0 +1,139 @@
+"""A node without a LiDAR over DDS: what it publishes never jumps, though the gyro's bias, found at rest, corrects the way before."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+
+import numpy as np
+import pytest
+
+from localization.log_replay import replay
+from localization.logs import open_log
+from localization.logs.reader import open_source
+from localization.logs.serialization import decoder
+from localization.pipeline import Trial
+from localization.simulation.experiments import Experiment, OpenLoop, Rest, constant
+from localization.simulation.sensors import EncoderConfig, ImuConfig, SensorConfig
+from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
+from motion_models import se2
+from motion_models.registry import make_model
+from tests.helpers.online import ROBOT
+
+pytest.importorskip("cyclonedds")
+from localization.ros.transports.dds import DdsTransport
+
+S = 1_000_000_000
+DOMAIN = 100 + (os.getpid() + 50) % 100
+_DEADLINE_S = 60.0
+_ODOMETRY, _PREDICTED, _TF = "/skidloc/odometry", "/skidloc/odometry_predicted", "/tf"
+_TYPES = {_ODOMETRY: "nav_msgs/msg/Odometry", _PREDICTED: "nav_msgs/msg/Odometry", _TF: "tf2_msgs/msg/TFMessage"}
+_CONTINUOUS_M, _CONTINUOUS_RAD = 2e-3, 2e-3
+"""Largest step of a pose that its twist does not explain: wheels that stop from .4 m/s within 20 ms move by up to 2 mm more or less than by
+the mean of both twists."""
+pytestmark = [pytest.mark.xdist_group("online"), pytest.mark.extended]
+
+
+def _phases(robot, config):
+    """Off at once, and at rest at the end."""
+    yield OpenLoop("ahead", constant(0.4, 0.2), 5.0)
+    yield OpenLoop("back", constant(0.4, -0.2), 4.0)
+    yield Rest(3.0)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("without_lidar") / "drive.mcap"
+    sensors = SensorConfig(lidar="none", encoders=EncoderConfig(), imu=ImuConfig(gyro_bias_sigma=0.02))
+    experiment = Experiment("weave", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
+    write_simulation(path, Simulation(experiment, ROBOT, 0, {}, SimulationConfig(sensors=sensors)))
+    return path
+
+
+@pytest.fixture(scope="module")
+def heard(drive):
+    """Decoded messages that a node published, by topic, while the log's wheels and IMU were played in real time."""
+    transport = DdsTransport(DOMAIN)
+    source = open_source(drive)
+    sent = {channel.topic: channel.type for channel in source.channels if channel.topic in ("/joint_states", "/imu/data", "/tf_static")}
+    for topic, kind in sent.items():
+        transport.advertise(topic, kind, is_latched=topic == "/tf_static")
+    for topic, kind in _TYPES.items():
+        transport.subscribe(topic, kind, is_latched=False, is_command=True)  # all of them, not the newest only
+    decoders = {topic: decoder(kind) for topic, kind in _TYPES.items()}
+    command = [sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds", "--node.wait-s", "0.5"]
+    node = subprocess.Popen([*command, "--domain", str(DOMAIN)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    found = defaultdict(list)
+    try:
+        assert "listening" in node.stdout.readline()
+        assert "waiting" in node.stdout.readline()  # with everything compiled
+        begin = time.monotonic()
+        for message in source.messages(list(sent)):
+            due = begin + (message.log_ns - source.start_ns) / S
+            while (left := due - time.monotonic()) > 0.0:
+                _take(transport, decoders, found, min(left, 0.01))
+            transport.publish(message.topic, message.data)
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            _take(transport, decoders, found, 0.05)
+    finally:
+        node.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            node.communicate(timeout=_DEADLINE_S)
+        node.kill()
+        transport.close()
+    return found
+
+
+def _take(transport, decoders, found, seconds):
+    for received in transport.take(seconds):
+        found[received.topic].append(decoders[received.topic](received.data))
+
+
+def path_of(messages):
+    """Stamps (n,) [s], poses (n, 3) and twists (n, 3)."""
+    rows = []
+    for m in messages:
+        q, p, v = m.pose.pose.orientation, m.pose.pose.position, m.twist.twist
+        rows.append(
+            (m.header.stamp.sec + m.header.stamp.nanosec * 1e-9, p.x, p.y, 2.0 * np.arctan2(q.z, q.w), v.linear.x, v.linear.y, v.angular.z)
+        )
+    table = np.array(rows)
+    return table[:, 0], table[:, 1:4], table[:, 4:]
+
+
+def unexplained(stamps, poses, twists):
+    """(n - 1, 2) by how much each pose is off where the mean twist leads from the one before [m, rad]."""
+    way = 0.5 * (twists[1:] + twists[:-1]) * np.diff(stamps)[:, None]
+    off = se2.local(se2.retract(poses[:-1], way), poses[1:])
+    return np.stack([np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])], axis=1)
+
+
+@pytest.mark.parametrize("topic", [_ODOMETRY, _PREDICTED])
+def test_published_pose_without_a_lidar_never_jumps(topic, heard):
+    stamps, poses, twists = path_of(heard[topic])
+    assert (np.diff(stamps) > 0.0).all()
+    assert stamps[-1] - stamps[0] > 10.0
+    assert np.diff(stamps).max() < 0.3
+    assert (unexplained(stamps, poses, twists) < [_CONTINUOUS_M, _CONTINUOUS_RAD]).all()
+
+
+def test_transforms_without_a_lidar_are_those_of_predicted_odometry(heard):
+    transforms = {t.header.stamp.sec * S + t.header.stamp.nanosec: t.transform for m in heard[_TF] for t in m.transforms}
+    for message in heard[_PREDICTED]:
+        at = transforms[message.header.stamp.sec * S + message.header.stamp.nanosec]
+        assert (at.translation.x, at.translation.y) == (message.pose.pose.position.x, message.pose.pose.position.y)
+        assert at.rotation.z == message.pose.pose.orientation.z
+
+
+def test_corrected_pose_of_the_same_drive_jumps(drive):
+    """Else the other tests could not fail: the filter's own pose moves by a centimetre and more when the robot stops."""
+    log = open_log(drive, ROBOT)
+    run = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "ekf")], ROBOT, log.mounts, False)[0]
+    moved = unexplained(run.trajectory.stamps_ns / S, run.trajectory.poses, run.twists)
+    assert moved[:, 0].max() > 5.0 * _CONTINUOUS_M
