@@ -76,6 +76,8 @@ class Driver:
     """Its wheel separation."""
     wheel_separation_multiplier: float = 1.0
     """The one hand-tuned number of a diff-drive driver; 1.875 on a stock Husky."""
+    length_unit_m: float = 1.0
+    """Metres per unit of the positions and speeds that it publishes: 0.001 for millimetres, 0.277778 for a speed in km/h."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from localization.logs.decode import JointReading, OdometryReading, decode_imu, 
 from localization.logs.event_decoder import TopicDecoder, arc, late_ns
 from localization.logs.topic_names import is_other_estimate
 from localization.logs.topic_roles import TYPES
-from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
+from localization.logs.wheel_messages import odometry_decoder, wheel_decoder
 from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -109,7 +109,7 @@ def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
         if source.kind == "joint_states":
             found[source.topic] = of_wheels
         else:
-            found[source.topic] = ODOMETRY_DECODERS[source.type]() if source.type else decode_odometry
+            found[source.topic] = odometry_decoder(source.type, log.robot.driver.length_unit_m)
     if log.sources.imu is not None:
         found[log.sources.imu.topic] = partial(_decode_fast_imu, unit=log.robot.imu.rate_unit_rad_s)
     reserved = {log.reference_topic, log.robot.topics.reference}

@@ -37,6 +37,16 @@ _SCALE_UNKNOWN_M2_PER_M = 0.2
 _MAX_SQUARES = 0.25
 """Part of the squared residuals of turns that is left with a factor for each side, at most: along one arc both sides are proportional, and
 any two factors fit."""
+_LENGTHS = {
+    "millimetres": 1e-3,
+    "centimetres": 1e-2,
+    "inches": 0.0254,
+    "miles per hour": 0.44704,
+    "km/h": 1.0 / 3.6,
+    "feet": 0.3048,
+    "kilometres": 1e3,
+}
+"""Metres, or metres per second, per unit of a driver's odometry."""
 _COUNTERS = (65536.0, 32768.0, 4294967296.0, 16777216.0)
 _SAME_JUMP = 0.02
 
@@ -92,6 +102,23 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
     for what, unit in wrong.items():
         report = _name_unit(report, signals, what, unit if right is None else _of_messages(signals, what) or unit)
     return _name_range(report, signals)
+
+
+def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot) -> UnitReport:
+    """Unit of the lengths of a driver's odometry, whose forward speed is ``speed`` (n,), by the speed (n,) of another sensor [m/s]."""
+    ratio = None if other is None else _ratio(speed, other)
+    if ratio is None or 1 / MAX_RATIO <= ratio <= MAX_RATIO:
+        return UnitReport(robot)
+    value = ratio * robot.driver.length_unit_m
+    name = min(_LENGTHS, key=lambda known: abs(math.log(value / _LENGTHS[known])))
+    is_named = abs(math.log(value / _LENGTHS[name])) <= _SIGMAS * _SIGMA_BY_SPEED
+    exact = float(f"{_LENGTHS[name] if is_named else value:.6g}")
+    text = (
+        f"its speeds are {1.0 / ratio:.3g} times those of the LiDAR: its driver publishes {name if is_named else 'another unit'}."
+        f" {CORRECTED} driver.length_unit_m = {exact:g}, or let it publish metres and metres per second."
+    )
+    robot = replace(robot, driver=replace(robot.driver, length_unit_m=exact))
+    return UnitReport(robot, (text,), {"driver.length_unit_m": f"{exact:g}"})
 
 
 def _check_side_units(signals: WheelSignals, robot: Robot) -> UnitReport | None:
@@ -290,9 +317,9 @@ def _name_range(report: UnitReport, signals: WheelSignals) -> UnitReport:
     is_one_size = float(np.abs(sizes / size - 1.0).max()) <= _SAME_JUMP and (counter is not None or len(set(signals.jumps[:, 0])) >= 2)
     if not is_one_size or abs(size * joints.angle_unit_rad / math.tau - 1.0) <= _SAME_JUMP:
         return report
-    value = float(f"{size if counter is None else counter:.6g}")
+    value = counter if counter is not None else float(f"{size:.6g}")
     what = f"a counter of {math.log2(counter):.0f} bits" if counter is not None else "a counter that wraps"
     times = f"{len(sizes)} time{'s' * (len(sizes) > 1)}"
-    text = f"positions of the wheels jump by {value:g} ({times}): {what}. {CORRECTED} joints.angle_range = {value:.0f}."
+    text = f"positions of the wheels jump by {value:.10g} ({times}): {what}. {CORRECTED} joints.angle_range = {value:.0f}."
     robot = replace(report.robot, joints=replace(joints, angle_range=value))
     return replace(report, robot=robot, findings=(*report.findings, text), keys={**report.keys, "joints.angle_range": f"{value:.10g}"})

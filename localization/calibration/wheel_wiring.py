@@ -17,7 +17,15 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.calibration.wheel_signals import STEP_S, WheelSignals, bias_at_rest, lidar_motion, read_signals
-from localization.calibration.wheel_units import CORRECTED, UnitReport, check_units, expected_scaling, gyro_in_degrees, is_in_degrees
+from localization.calibration.wheel_units import (
+    CORRECTED,
+    UnitReport,
+    check_length_unit,
+    check_units,
+    expected_scaling,
+    gyro_in_degrees,
+    is_in_degrees,
+)
 from localization.events import Scan
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.topic_roles import Sources
@@ -49,6 +57,8 @@ _MIN_TURN_PART = 1e-3
 """Least root mean square of the sides' difference, of the largest of all wirings'."""
 _FASTEST_M_S = 20.0
 """Of an odometry in metres."""
+_USUAL_M_S = (0.05, 1.2)
+"""Fast speeds (95 % of all are slower) of most drives; those of an odometry outside are compared with the LiDAR's."""
 _MIN_AHEAD_M, _MIN_TURNED_RAD, _SAME_END = 0.1, 1.5, 0.25
 """LiDAR ahead of the middle or behind it [m], turns in all, and share of the sideways motion of the other end, that decide at which end it
 is: robots turn about a point up to 5 cm from the middle of their wheels."""
@@ -127,8 +137,6 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     if not signals.joints:
         return _check_odometry(log, signals, is_clock_known)
     signals, found = _wiring_of(log, signals, is_clock_known)
-    if found.is_ambiguous:
-        return found
     # as the corrected robot has them
     if found.keys:
         log = open_log(log.path, found.robot, log.overrides)
@@ -138,8 +146,9 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     units = _units_of(log, signals, found.robot)
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     sentences = (*found.findings, *(text if text.startswith("the gyro") else f"{wheels}: {text}" for text in units.findings))
-    robot = _with_unknown_signs(units.robot) if units.is_ambiguous else units.robot
-    return WiringReport(robot, sentences, {**found.keys, **units.keys}, units.is_ambiguous, {**found.correlations}, units.ratios)
+    is_ambiguous = found.is_ambiguous or units.is_ambiguous
+    robot = _with_unknown_signs(units.robot) if is_ambiguous else units.robot
+    return WiringReport(robot, sentences, {**found.keys, **units.keys}, is_ambiguous, {**found.correlations}, units.ratios)
 
 
 @dataclass(frozen=True)
@@ -304,11 +313,12 @@ def _share_of_other_end(sensors: Log | LiveSensors, signals: WheelSignals) -> fl
 
 
 def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
-    """`_odometry_of` a log; what another clock hides is compared on the right one."""
+    """`_odometry_of` a log; what another clock or unit hides is compared on the right one."""
     found = _odometry_of(log, signals, is_clock_known)
-    if not any(key.startswith("clock.") for key in found.keys):
+    is_clock = any(key.startswith("clock.") for key in found.keys)
+    if not is_clock and "driver.length_unit_m" not in found.keys:
         return found
-    return _joined(found, check_wiring(open_log(log.path, found.robot, log.overrides), is_clock_known=True))
+    return _joined(found, check_wiring(open_log(log.path, found.robot, log.overrides), is_clock_known or is_clock))
 
 
 def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
@@ -316,10 +326,15 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     assert log.sources.wheels is not None
     topic = log.sources.wheels.topic
     fastest = float(np.nan_to_num(np.nanpercentile(np.abs(signals.speeds[topic]), 95.0))) if topic in signals.speeds else 0.0
+    if fastest > 0.0 and not _USUAL_M_S[0] <= fastest <= _USUAL_M_S[1]:
+        signals = with_lidar(log, signals)
+        units = check_length_unit(signals.speeds[topic], signals.speeds.get("LiDAR"), log.robot)
+        if units.findings:
+            return WiringReport(units.robot, tuple(f"{topic}: {text}" for text in units.findings), units.keys)
     if fastest > _FASTEST_M_S:
         text = (
             f"{topic}: its speeds reach {fastest:.0f} m/s, as no such robot's: its driver has another unit than metres (millimetres?), and"
-            " what wheels cannot reach is left out. Let it publish metres and metres per second."
+            " what wheels cannot reach is left out. Let it publish metres and metres per second, or write driver.length_unit_m."
         )
         return WiringReport(_with_unknown_signs(log.robot), (text,))
     gyro, turn = signals.turns.get("gyro"), signals.turns.get(topic)

@@ -112,6 +112,9 @@ def _log_stamps(log: Log) -> IntArray:
 
 
 def _read_tum(path: Path) -> ReferenceTrack:
+    _, table = _table(_text_lines(path))
+    if table and (word := table[0][0]).replace(".", "", 1).isdigit() and float(word) > _LARGEST_SECONDS:
+        return _of_poses(_read_stamped(table, path), path, None)
     rows = list(tum_rows(path))
     values = np.array([row[2] for row in rows])
     return _of_poses(_Poses(np.array([stamp for _, stamp, _ in rows], dtype=np.int64), values[:, :3], values[:, 3:]), path, None)
@@ -223,6 +226,8 @@ def _numbers(rows: Sequence[Sequence[str]], path: Path) -> FloatArray:
     return np.array([[parse_float(w or "nan", f"{path}, row {i}") for w in row] for i, row in enumerate(rows, start=1)])
 
 
+_LARGEST_SECONDS = 1e11
+"""Since 1970: the year 5138."""
 _UNIT_NS = {"ns": 1, "us": 1000, "ms": 1_000_000, "s": 1_000_000_000}
 
 
@@ -230,7 +235,7 @@ def _stamps(values: FloatArray, rows: Sequence[Sequence[str]], column: int, unit
     """(N,) [ns] of a column; an epoch's time is in nano-, micro- or milliseconds where in ``unit`` it would lie after the year 5000."""
     typical = float(np.nanmedian(np.abs(values)))
     if unit == "s":
-        unit = next((name for name, limit in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)) if typical > limit), "s")
+        unit = next((name for name, limit in (("ns", 1e17), ("us", 1e14), ("ms", _LARGEST_SECONDS)) if typical > limit), "s")
     scale = _UNIT_NS[unit]
     found = np.full(len(values), np.iinfo(np.int64).min, dtype=np.int64)
     for i in np.flatnonzero(np.isfinite(values)).tolist():

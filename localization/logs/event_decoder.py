@@ -29,12 +29,11 @@ from localization.logs.decode import (
     arm_decoder,
     decode_cg,
     decode_imu,
-    decode_odometry,
     scan_decoder,
     stamp_ns,
 )
 from localization.logs.topic_roles import Sources, TopicSource
-from localization.logs.wheel_messages import ODOMETRY_DECODERS, wheel_decoder
+from localization.logs.wheel_messages import ODOMETRY_DECODERS, odometry_decoder, wheel_decoder
 from motion_models.center_of_gravity.cg_model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import CgEstimate, support_margin
 from motion_models.robot import Clock, Driver, Geometry, Lidar, Robot
@@ -98,6 +97,7 @@ class EventDecoder:
         self._of_wheels = wheel_decoder((*joints[0], *joints[1]), robot.joints)
         self._period_s, self._imu_unit, self._lidar = period_s, robot.imu.rate_unit_rad_s, robot.lidar
         left, right = joints
+        self._length_unit_m = robot.driver.length_unit_m
         self._multipliers = robot.geometry.radius_multipliers
         self._has_multipliers = bool((self._multipliers != 1.0).any())
         least_radius = robot.geometry.wheel_radius_m * min(1.0, float(self._multipliers.min()))
@@ -148,10 +148,9 @@ class EventDecoder:
             return of_wheels
         if source.kind == "scan":
             return scan_decoder(self._period_s.get(source.topic), partial(stats.count, source.topic))
-        if source.type in ODOMETRY_DECODERS:
-            return ODOMETRY_DECODERS[source.type]()
+        if source.kind == "odometry":
+            return odometry_decoder(source.type, self._length_unit_m)
         decoders: dict[str, MessageDecoder] = {
-            "odometry": decode_odometry,
             "imu": partial(decode_imu, rate_unit_rad_s=self._imu_unit),
             "center_of_gravity": decode_cg,
             "points": cloud_decoder(self._period_s.get(source.topic)),

@@ -13,6 +13,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -23,6 +24,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from localization.errors import LogError
 from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, decompress_message, in_log_order
+from localization.logs.set_back_clock import Times, describe_set_backs, find_set_backs, later_ns, move_chunks
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -76,15 +78,19 @@ class McapFile:
         used = "ros1" if self.is_ros1 else "cdr"
         self._topics = {key: t for key, t in self._described.items() if t.encoding == used}
         self.channels = [Channel(t.name, t.type, t.definition, totals[key]) for key, t in sorted(self._topics.items())]
+        self._set_backs = find_set_backs(self._chunks, self._times)
+        self._chunks = move_chunks(self._chunks, self._set_backs, self._times)
         self.start_ns = min((c.start_ns for c in self._chunks), default=0)
         self.end_ns = max((c.end_ns for c in self._chunks), default=0)
         if reason:
             lost = f"; of its last {unread} bytes only what is whole could be read" if unread else ""
             self.warnings.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
+        self.warnings += describe_set_backs(self._set_backs, self.start_ns)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """The messages of these topics in order of log time."""
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
+        later = partial(later_ns, self._set_backs)
         with self._path.open("rb") as file:
 
             def load(chunk: Chunk) -> list[RawMessage]:
@@ -93,12 +99,17 @@ class McapFile:
                 if len(entries) < sum(chunk.counts.values()) or damage:
                     self._report(chunk, len(entries), damage or "its index lists more")
                 return [
-                    RawMessage(log_ns, wanted[key].name, wanted[key].type, decompress_message(data))
-                    for key, log_ns, data in entries
+                    RawMessage(log_ns + later(chunk.position, i), wanted[key].name, wanted[key].type, decompress_message(data))
+                    for i, (key, log_ns, data) in enumerate(entries)
                     if key in wanted
                 ]
 
             yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
+
+    def _times(self, chunk: Chunk) -> Times:
+        with self._path.open("rb") as file:
+            file.seek(chunk.position)
+            return [(key, log_ns) for key, log_ns, _ in self._entries(file.read(chunk.size))[0]]
 
     def _is_ros1(self, totals: Counter[int], reason: str) -> bool:
         """Whether most messages are encoded as in ROS 1. Raises `LogError` where none is of ROS 1 or ROS 2."""

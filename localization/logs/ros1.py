@@ -11,6 +11,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -19,6 +20,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from localization.errors import LogError
 from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, in_log_order
+from localization.logs.set_back_clock import Times, describe_set_backs, find_set_backs, later_ns, move_chunks
 
 MAGIC = b"#ROSBAG V"
 
@@ -65,13 +67,17 @@ class Ros1Bag:
             Channel(c.topic, c.type, MessageDefinition(MessageDefinitionFormat.MSG, c.definition), totals[key])
             for key, c in sorted(self._connections.items())
         ]
+        self._set_backs = find_set_backs([c for c in self._chunks if c.counts], self._times)
+        self._chunks = move_chunks(self._chunks, self._set_backs, self._times)
         filled = [c for c in self._chunks if c.counts]
         self.start_ns = min((c.start_ns for c in filled), default=0)
         self.end_ns = max((c.end_ns for c in filled), default=0)
+        self.warnings += describe_set_backs(self._set_backs, self.start_ns)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """The messages of these topics in order of log time."""
         wanted = {key: c for key, c in self._connections.items() if c.topic in topics}
+        later = partial(later_ns, self._set_backs)
         with self._path.open("rb") as file:
 
             def load(chunk: Chunk) -> list[RawMessage]:
@@ -84,9 +90,20 @@ class Ros1Bag:
                 if len(entries) < listed:
                     where = f"A chunk at byte {chunk.position} of {self._path.name} is damaged"
                     self._report(chunk, f"{where}: {len(entries)} of its {listed} messages are used.")
-                return [RawMessage(e.log_ns, wanted[e.key].topic, wanted[e.key].type, e.data) for e in entries if e.key in wanted]
+                return [
+                    RawMessage(e.log_ns + later(chunk.position, i), wanted[e.key].topic, wanted[e.key].type, e.data)
+                    for i, e in enumerate(entries)
+                    if e.key in wanted
+                ]
 
             yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
+
+    def _times(self, chunk: Chunk) -> Times:
+        try:
+            with self._path.open("rb") as file:
+                return [(e.key, e.log_ns) for e in _entries(self._chunk_bytes(file, chunk)) if isinstance(e, _Message)]
+        except DamagedError:
+            return []
 
     def _report(self, chunk: Chunk, note: str) -> None:
         """Once for each chunk."""

@@ -60,6 +60,7 @@ CHOSEN_BY = {
     "robot": "named in the robot file",
     "only": "the only one of its type",
     "names": "of several by its name",
+    "joints": "of several by its joints",
     "points": "of several by name and place of its points",
     "arms": "the arms' joints",
 }
@@ -345,6 +346,12 @@ class _RoleChooser:
         fitting, known = self._fitting(candidates)
         if not fitting and self._rename_joints(candidates, known):
             fitting, known = self._fitting(candidates)
+        if not fitting and named is not None and named.chosen_by != "option" and not self._has_joint(known):
+            candidates = self._chooser.of_type(TYPES["joint_states"])
+            fitting, known = self._fitting(candidates)
+            if fitting:
+                self._warnings.append(f"{fitting[0][0]} is used as joint states: {named.topic} has none of the wheels.")
+                named = TopicSource(fitting[0][0], "joint_states", "joints")
         if len(fitting) == 1:
             topic, self._joints = fitting[0]
             wanted = (*self._robot.joints.left, *self._robot.joints.right)
@@ -352,11 +359,12 @@ class _RoleChooser:
             if absent:
                 self._warnings.append(f"{topic} has no joints {', '.join(absent)}; their sides are the mean of the others.")
             return named if named is not None else self._warn_default(TopicSource(topic, "joint_states", "only"))
+        parts = None if self._has_all_wheels(fitting) else self._wheels_in_parts(candidates)
+        if parts is not None:
+            return parts
         if len(fitting) > 1:
             topics = ", ".join(topic for topic, _ in fitting)
             self._warnings.append(f"{topics} all have the wheel joints; name one with --topic.joint-states.")
-        elif (parts := self._wheels_in_parts(candidates)) is not None:
-            return parts
         return self._odometry(named, known, bool(candidates) and not fitting)
 
     def _fitting(self, topics: list[str]) -> tuple[list[tuple[str, Sides]], set[str]]:
@@ -368,6 +376,15 @@ class _RoleChooser:
             if joints is not None:
                 fitting.append((topic, joints))
         return fitting, set().union(*self._names.values())
+
+    def _has_joint(self, names: set[str]) -> bool:
+        """Whether one of the wheels is among joints ``names``."""
+        return not names.isdisjoint((*self._robot.joints.left, *self._robot.joints.right))
+
+    def _has_all_wheels(self, fitting: list[tuple[str, Sides]]) -> bool:
+        """Whether one topic has all wheels; else several have an axle each, or a side."""
+        joints = self._robot.joints
+        return any(len(left) + len(right) == len(joints.left) + len(joints.right) for _, (left, right) in fitting)
 
     def _rename_joints(self, topics: list[str], names: set[str]) -> bool:
         """Give the robot's wheel joints the ``names`` that ``topics`` have for them, where these have another prefix."""
@@ -395,15 +412,16 @@ class _RoleChooser:
         if not left or not right:
             return None
         self._joints = left, right
-        found = [self._chooser.find_named("joint_states") or TopicSource(topic, "joint_states", "only") for topic in topics[:1]]
-        self._more_wheels = tuple(TopicSource(topic, "joint_states", "only") for topic in topics[1:])
+        named = self._chooser.find_named("joint_states")
+        first = named if named is not None and named.topic in topics else TopicSource(topics[0], "joint_states", "joints")
+        self._more_wheels = tuple(TopicSource(topic, "joint_states", "joints") for topic in topics if topic != first.topic)
         absent = [joint for joint in (*wanted.left, *wanted.right) if joint not in names]
         rest = f" None has {', '.join(absent)}; their sides are the mean of the others." if absent else ""
         self._warnings.append(
             f"{', '.join(topics)} has no message with the wheels of both sides: those of {', '.join((*left, *right))} are put together,"
             f" each interpolated between its stamps.{rest}"
         )
-        return found[0]
+        return first
 
     def _odometry(self, joint_states: TopicSource | None, known: set[str], is_missing_joints: bool) -> TopicSource | None:
         """The odometry, where no joint states have the wheels."""

@@ -6,11 +6,22 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from localization.logs.decode import JointReading, Oddity, OdometryReading, UnusableError, frame_name, joint_decoder, stamp_ns, yaw_of
+from localization.logs.decode import (
+    JointReading,
+    Oddity,
+    OdometryReading,
+    UnusableError,
+    decode_odometry,
+    frame_name,
+    joint_decoder,
+    stamp_ns,
+    yaw_of,
+)
 from motion_models.robot import Joints
 
 TWIST_TYPES = (
@@ -168,3 +179,17 @@ ODOMETRY_DECODERS: Mapping[str, Callable[[], Callable[[Any, int], OdometryReadin
     **dict.fromkeys(TF_TYPES, transform_decoder),
 }
 """By type of message, those of odometry that is no nav_msgs/Odometry."""
+
+
+def odometry_decoder(kind: str, length_unit_m: float = 1.0) -> Callable[[Any, int], OdometryReading | None]:
+    """Decoder of odometry in messages of type ``kind`` ("": nav_msgs/Odometry), whose lengths are in units of ``length_unit_m`` [m]."""
+    decode = ODOMETRY_DECODERS[kind]() if kind in ODOMETRY_DECODERS else decode_odometry
+    if length_unit_m == 1.0:
+        return decode
+    units = np.array([length_unit_m, length_unit_m, 1.0])
+
+    def decode_scaled(message: Any, stamp: int) -> OdometryReading | None:
+        reading = decode(message, stamp)
+        return None if reading is None else replace(reading, pose=units[: len(reading.pose)] * reading.pose, twist=units * reading.twist)
+
+    return decode_scaled

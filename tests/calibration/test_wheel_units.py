@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from localization.calibration.wheel_units import check_length_unit
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
 from localization.events import WheelSample
 from localization.logs import open_log
@@ -116,3 +118,25 @@ def test_driver_odometry_in_millimetres_is_named(tmp_path: Path) -> None:
     report = report_of(bags.write_mcap(tmp_path / "log.mcap", records))
     assert "another unit than metres" in report.findings[0]
     assert report.robot.wheel_noise.longitudinal_m2_per_m > ROBOT.wheel_noise.longitudinal_m2_per_m
+
+
+@pytest.mark.parametrize(("unit", "name"), [(1e-2, "centimetres"), (1e-3, "millimetres"), (1.0 / 3.6, "km/h"), (0.1, "another unit")])
+def test_length_unit_of_the_drivers_odometry_is_named_by_the_lidar(unit: float, name: str) -> None:
+    speed = np.r_[np.zeros(10), np.full(20, 0.4), np.zeros(5), np.full(20, -0.2)]
+    report = check_length_unit(speed / unit, speed + 0.005 * np.random.default_rng(1).normal(size=len(speed)), ROBOT)
+    assert name in report.findings[0]
+    assert report.robot.driver.length_unit_m == pytest.approx(unit, rel=0.05)
+
+
+def test_length_unit_of_metres_is_left_as_it_is() -> None:
+    speed = np.r_[np.zeros(10), np.full(20, 0.4)]
+    assert not check_length_unit(speed, 0.6 * speed, ROBOT).findings
+    assert not check_length_unit(1000.0 * speed, None, ROBOT).findings
+
+
+def test_length_unit_of_the_robot_file_scales_odometry(tmp_path: Path) -> None:
+    records = [("/odom", bags.odometry(START + i * S // 20, 25.0 * i, 0.0, 0.0, 500.0), START + i * S // 20) for i in range(100)]
+    log = bags.write_mcap(tmp_path / "log.mcap", records)
+    robot = replace(ROBOT, driver=replace(ROBOT.driver, length_unit_m=1e-3))
+    found = [event for event in open_log(log, robot).events() if isinstance(event, WheelSample)]
+    np.testing.assert_allclose([event.velocity for event in found], 0.5 / ROBOT.driver.wheel_radius_m)

@@ -46,6 +46,16 @@ def test_reference_tum_with_commas_is_read(tmp_path):
     _check(_track(tmp_path / "a.csv", rows))
 
 
+@pytest.mark.parametrize("per_second", [1e3, 1e6, 1e9])
+def test_reference_tum_of_smaller_units_of_time_is_read(tmp_path, per_second):
+    rows = [
+        f"{t / 1e9 * per_second:.1f} {x} {y} 0 0 0 {math.sin(a / 2)} {math.cos(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)
+    ]
+    found = _track(tmp_path / "a.tum", rows)
+    np.testing.assert_allclose(found.poses, TRUTH, atol=1e-6)
+    np.testing.assert_allclose(found.stamps_ns - STAMPS, 0.0, atol=1e6)
+
+
 def _kitti(truth: np.ndarray) -> list[str]:
     """Of cameras: x to the right, y down, z ahead."""
     return [f"{math.cos(a)} 0 {-math.sin(a)} {-y} 0 1 0 0.01 {math.sin(a)} 0 {math.cos(a)} {x}" for x, y, a in truth]

@@ -60,6 +60,23 @@ def test_wheels_in_topics_of_their_own_are_put_together(tmp_path: Path) -> None:
     assert sorted(source.topic for source in log.sources.all_wheels) == ["/left/joints", "/right/joints"]
 
 
+def test_wheels_on_a_topic_for_each_axle_are_put_together(tmp_path: Path) -> None:
+    axles = [(LEFT[i], RIGHT[i]) for i in (0, 1)]
+    log = log_of(tmp_path, parts_of(lambda names: f"/{names[0].split('_')[0]}/joint_states", axles))
+    t, angles, _ = wheels(log)
+    np.testing.assert_allclose(angles - angles[0], RATE * (t - t[0])[:, None] * np.ones(2), atol=1e-9)
+    assert sorted(source.topic for source in log.sources.all_wheels) == ["/front/joint_states", "/rear/joint_states"]
+    assert {*log.joints[0], *log.joints[1]} == {*LEFT, *RIGHT}
+
+
+def test_wheels_beside_joint_states_of_an_arm_are_used(tmp_path: Path) -> None:
+    arm = [("/joint_states", joints(START + i * S // 20, ("lift", "gripper")), START + i * S // 20) for i in range(60)]
+    log = log_of(tmp_path, sorted([*arm, *parts_of(lambda names: "/wheel_states", [(*LEFT, *RIGHT)])], key=lambda record: record[2]))
+    assert log.sources.wheels is not None
+    assert log.sources.wheels.topic == "/wheel_states"
+    assert "/joint_states has none of the wheels" in " ".join(log.warnings())
+
+
 def test_wheels_with_equal_stamps_are_one_sample(tmp_path: Path) -> None:
     records: list[Record] = []
     for i in range(20):

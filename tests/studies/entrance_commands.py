@@ -1,6 +1,6 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [more | hostile | KIND | part of a NAME ...] [-v]` prints kind, name and outcome (of
+`python -m tests.studies.entrance_commands [other | more | hostile | KIND | part of a NAME ...] [-v]` prints kind, name and outcome (of
 `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the EKF, with those of the same drive with
 nothing wrong in brackets.
 """
@@ -63,7 +63,7 @@ def write_log(folder: Path, vehicle: Vehicle, how: Publishing, edit: Edit) -> tu
 
 def replayed(folder: Path, log: Path, robot: Path, *options: str) -> tuple[int, str]:
     """`skidloc replay` of odometry and EKF."""
-    model = "diff_drive" if "diff_drive" in robot.read_text() else "skid_steer"
+    model = "diff_drive" if 'drive = "diff_drive"' in robot.read_text() else "skid_steer"
     given = ["--model", model, "--estimator", "odometry,ekf", "--out", str(folder / "out"), *options]
     return run_command("replay", str(log), "--robot", str(robot), *given)
 
@@ -97,7 +97,7 @@ def healthy_errors(vehicle: Vehicle) -> tuple[float, float]:
         return errors_of(folder / "out", motion)
 
 
-def _warnings(text: str) -> str:
+def warnings_in(text: str) -> str:
     return "\n".join(
         line for line in text.splitlines() if (line.startswith("!") and "has no k_0" not in line) or line.startswith("skidloc:")
     )
@@ -120,7 +120,7 @@ def driven(
     def judge(folder: Path) -> Found:
         log, robot, motion = write_log(folder, vehicle, how, edit)
         code, text = replayed(folder, log, robot)
-        warned = _warnings(text)
+        warned = warnings_in(text)
         is_named = not words or any(word in warned for word in words)
         if code:
             return Found(choose_outcome(refused, is_named, True, words), f"[exit {code}] {warned or text}")
@@ -149,14 +149,14 @@ def scored(
         flat = " ".join(text.split())
         if words:
             is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
-            is_warned = bool(code) or "reference" in _warnings(text) or "until that" in flat.lower()
+            is_warned = bool(code) or "reference" in warnings_in(text) or "until that" in flat.lower()
             return Found(choose_outcome(True, is_named and not is_judged, is_warned, words), f"[exit {code}] {text}")
         if code:
             return Found("misnamed", f"[exit {code}] {text}")
         found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
         best = dict(zip(("odometry", "ekf"), healthy_errors(vehicle), strict=True))
         is_right = all(abs(found[k] - best[k]) < 0.3 * best[k] + 0.03 + noise for k in best)
-        has_doubt, warned = "Until that" in text, _warnings(text)
+        has_doubt, warned = "Until that" in text, warnings_in(text)
         return Found(choose_outcome(is_right, not has_doubt, has_doubt or bool(warned), words), f"[{found}, {best}] {warned}")
 
     return Case("references", name, judge)
@@ -169,7 +169,7 @@ def clouded(name: str, vehicle: Vehicle, field_name: str, dtype: str, times: Tim
         found = _cloud_error(folder, vehicle, field_name, dtype, times)
         (folder / "healthy").mkdir()
         best = _cloud_error(folder / "healthy", vehicle, "time", "f4", lambda u, period, stamp: u * period)
-        warned, state = _warnings(found[1]), f"[EKF {found[0]:.3f} ({best[0]:.3f}) m] "
+        warned, state = warnings_in(found[1]), f"[EKF {found[0]:.3f} ({best[0]:.3f}) m] "
         is_named = any(word in warned for word in words) if words else not warned
         is_right = bool(words) or found[0] < 1.5 * best[0] + 0.01
         return Found(choose_outcome(is_right, is_named, bool(warned), words), state + warned)
@@ -239,12 +239,15 @@ def main(arguments: Sequence[str]) -> None:
     from tests.studies.entrance_command_cases import CASES
     from tests.studies.entrance_hostile_cases import HOSTILE
     from tests.studies.entrance_more_cases import MORE
+    from tests.studies.entrance_other_cases import OTHER
 
     wanted = [a for a in arguments if not a.startswith("-")]
-    sets = {"more": MORE, "hostile": HOSTILE}
+    sets = {"more": MORE, "hostile": HOSTILE, "other": OTHER}
     found = []
     for case in (
-        c for c in (*MORE, *HOSTILE, *CASES) if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
+        c
+        for c in (*OTHER, *MORE, *HOSTILE, *CASES)
+        if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:
             try:

@@ -1,0 +1,98 @@
+"""Times of recording after the recorder's clock was set back: sorted by these, the later part of a drive would lie among the earlier one.
+
+A file holds its messages in the order of recording. Where the times of all topics that go on step back by over a second, what follows is
+moved to later times by that step. A file that was written topic after topic, or sorted in parts, has no topic that steps back. Chunks are
+compared by their spans, so that a step is not found that is shorter than what its chunk holds after it (some seconds).
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from localization.logs.chunks import Chunk
+
+_MIN_STEP_NS = 1_000_000_000
+"""Multi-threaded recorders store messages by fractions of a second out of order."""
+_COMPARED = 200
+"""Messages before and after a step in which topics are compared: 1 s of a robot's sensors."""
+_MIN_OF_TOPIC = 3
+_MAX_CANDIDATES = 100
+"""Steps of a chunk that are compared; more are no clock that was set, but times that mean nothing."""
+Times = Sequence[tuple[int, int]]
+"""Number of the topic and time of recording [ns] of the messages of a chunk, in order of the file."""
+
+
+@dataclass(frozen=True)
+class SetBack:
+    """The recorder's clock was set back."""
+
+    position: int
+    """Of the chunk in the file."""
+    index: int
+    """Of the first message of that chunk after it."""
+    at_ns: int
+    """Last time of recording before it."""
+    by_ns: int
+
+
+def find_set_backs(chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> list[SetBack]:
+    """Where the clock was set back, in order of the file; chunks that overlap with the next by over a second, and the last, are read."""
+    ordered: list[Chunk | None] = [None, *sorted(chunks, key=lambda chunk: chunk.position), None]
+    found = []
+    for previous, chunk, following in zip(ordered, ordered[1:], ordered[2:], strict=False):
+        if chunk is None or (following is not None and chunk.end_ns - following.start_ns <= _MIN_STEP_NS):
+            continue
+        before, inside, after = ([] if part is None else list(read(part)) for part in (previous, chunk, following))
+        before, after = before[-_COMPARED:], after[:_COMPARED]
+        times, first, last = [*before, *inside, *after], max(len(before), 1), len(before) + len(inside)
+        steps = [k for k in range(first, min(last + 1, len(times))) if times[k - 1][1] - times[k][1] > _MIN_STEP_NS]
+        for k in steps[:_MAX_CANDIDATES]:
+            if _is_of_all(times[max(k - _COMPARED, 0) : k], times[k : k + _COMPARED]):
+                position, index = (chunk.position, k - len(before)) if k < last or following is None else (following.position, 0)
+                found.append(SetBack(position, index, times[k - 1][1], times[k - 1][1] - times[k][1]))
+    return list({(step.position, step.index): step for step in found}.values())
+
+
+def _is_of_all(before: Times, after: Times) -> bool:
+    """Whether all topics that come before and after a step are stepping back."""
+    parts: list[dict[int, list[int]]] = []
+    for times in (before, after):
+        by_topic: dict[int, list[int]] = defaultdict(list)
+        for topic, log_ns in times:
+            by_topic[topic].append(log_ns)
+        parts.append({topic: stamps for topic, stamps in by_topic.items() if len(stamps) >= _MIN_OF_TOPIC})
+    both = parts[0].keys() & parts[1].keys()
+    last, first = ({t: statistics.median(part[t][cut]) for t in both} for part, cut in zip(parts, (slice(-3, None), slice(3)), strict=True))
+    return bool(both) and all(first[topic] < last[topic] - _MIN_STEP_NS / 2 for topic in both)
+
+
+def later_ns(set_backs: Sequence[SetBack], position: int, index: int) -> int:
+    """By how much the message ``index`` of the chunk at ``position`` was recorded later than its time says [ns]."""
+    return sum(step.by_ns for step in set_backs if (step.position, step.index) <= (position, index))
+
+
+def move_chunks(chunks: Sequence[Chunk], set_backs: Sequence[SetBack], read: Callable[[Chunk], Times]) -> list[Chunk]:
+    """Chunks with the spans of the corrected times."""
+    if not set_backs:
+        return list(chunks)
+    moved, changed = [], {step.position for step in set_backs}
+    for chunk in chunks:
+        later = later_ns(set_backs, chunk.position, 0)
+        span = chunk.start_ns + later, chunk.end_ns + later
+        if chunk.position in changed:
+            times = [log_ns + later_ns(set_backs, chunk.position, i) for i, (_, log_ns) in enumerate(read(chunk))]
+            span = min(times), max(times)
+        moved.append(replace(chunk, start_ns=span[0], end_ns=span[1]))
+    return moved
+
+
+def describe_set_backs(set_backs: Sequence[SetBack], start_ns: int) -> list[str]:
+    """A sentence for each time the clock was set back."""
+    return [
+        f"the recorder's clock was set back by {step.by_ns * 1e-9:.1f} s, {(step.at_ns - start_ns) * 1e-9:.1f} s after the start of the"
+        " log; later times of recording are moved by that."
+        for step in set_backs
+    ]

@@ -1,0 +1,64 @@
+"""Files whose recorder's clock was set back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from localization.logs.reader import open_source
+from tests.helpers import bags
+from tests.helpers.bags import START, Record, S
+
+SET_AT_S, END_S = 12.0, 30.0
+
+
+def records(back_s: float, step: Any = lambda topic, t: 0.0) -> list[Record]:
+    """Wheels at 50 Hz and IMU at 100 Hz in order of recording; the clock is set back by ``back_s`` on the way."""
+    found = []
+    for i in range(round(100 * END_S)):
+        t = i / 100
+        stamp = START + round(t * S)
+        log = stamp - round((back_s if t >= SET_AT_S else 0.0) * S)
+        found.append(("/imu/data", bags.imu(stamp, (0.0, 0.0, 0.1)), log))
+        if i % 2 == 0:
+            found.append(("/joint_states", bags.joint_state(stamp, position=[t] * 4, velocity=[1.0] * 4), log))
+    return found
+
+
+def write(path: Path, found: list[Record], form: str) -> Path:
+    if form == "mcap":
+        return bags.write_mcap(path.with_suffix(".mcap"), found)
+    return bags.write_ros1_bag(path.with_suffix(".bag"), found, chunk_bytes=None if form == "ros1" else 8000)
+
+
+@pytest.mark.parametrize(
+    ("form", "back_s"), [("mcap", 40.0), ("ros1", 40.0), ("ros1 of small chunks", 40.0), ("ros1 of small chunks", 2.5)]
+)
+def test_set_back_clock_messages_keep_the_order_of_recording(tmp_path: Path, form: str, back_s: float) -> None:
+    source = open_source(write(tmp_path / "log", records(back_s), form))
+    times = np.array([message.log_ns for message in source.messages(["/imu/data"])])
+    steps = np.diff(times) / S
+    assert len(times) == 3000
+    assert (source.end_ns - source.start_ns) / S == pytest.approx(END_S, abs=0.05)
+    np.testing.assert_allclose(steps, 0.01, atol=0.011)
+    (warning,) = source.warnings
+    assert f"set back by {back_s:.1f} s, {SET_AT_S:.1f} s after the start" in warning
+
+
+def test_set_back_clock_file_of_topic_after_topic_is_left_as_it_is(tmp_path: Path) -> None:
+    found = sorted(records(0.0), key=lambda record: record[0])
+    source = open_source(write(tmp_path / "log", found, "ros1 of small chunks"))
+    times = [message.log_ns for message in source.messages(["/imu/data", "/joint_states"])]
+    assert source.warnings == []
+    assert times == sorted(record[2] for record in found)
+
+
+def test_set_back_clock_single_message_of_a_wrong_time_is_no_step(tmp_path: Path) -> None:
+    found = records(0.0)
+    topic, message, log = found[2000]
+    found[2000] = topic, message, log - 20 * S
+    source = open_source(write(tmp_path / "log", found, "mcap"))
+    assert source.warnings == []

@@ -1,0 +1,281 @@
+"""Base logs of `tests.studies.entrance_other_cases`: parts of real drives, and simulated robots with contacts of their own."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+
+from localization.evaluation.metrics import align
+from localization.simulation.simulator import simulate, write_simulation
+from localization.trajectory import Trajectory
+from motion_models import se2
+from motion_models.robot_file import load_robot
+from tests.helpers import bags
+from tests.helpers.bags import START, Record, S
+from tests.helpers.entrance_drives import with_times
+from tests.studies.entrance_commands import Case, Edit, replayed, run_command, warnings_in
+from tests.studies.entrances import Found, choose_outcome
+
+DATA, ROBOTS = Path("tests/data"), Path("motion_models/robots")
+
+
+@dataclass(frozen=True, eq=False)
+class BaseLog:
+    """A healthy log; its stamps begin at `START`."""
+
+    name: str
+    robot: str
+    """Text of the robot file."""
+    load: Callable[[], tuple[list[Record], Trajectory | None]]
+    """Records by time, and the true poses; None: those of the healthy replay stand for them."""
+    tolerance_m: float = 0.05
+    """How much larger an error may be than that of the log with nothing wrong: 0.5 % of the way, at least 5 cm."""
+
+
+def records_in(path: Path, begin_s: float, seconds: float) -> list[Record]:
+    """Records of a part of a log, by time of recording; transforms of any time are at its beginning."""
+    with AnyReader([path], default_typestore=bags.STORE) as reader:
+        first = reader.start_time + round(begin_s * S)
+        found: list[Record] = []
+        for connection, log, raw in reader.messages():
+            is_static = connection.topic == "/tf_static"
+            if not is_static and not first <= log < first + seconds * S:
+                continue
+            if "String" in connection.msgtype:
+                continue
+            message = _writable(reader.deserialize(raw, connection.msgtype))
+            moved = with_times(message, lambda ns, s=is_static: START if s else ns - first + START)
+            found.append((connection.topic, moved, START if is_static else log - first + START))
+    return found
+
+
+def _writable(message: Any) -> Any:
+    for name, value in vars(message).items():
+        if isinstance(value, np.ndarray):
+            setattr(message, name, value.copy())
+    return message
+
+
+def truth_in(records: list[Record], topic: str) -> tuple[list[Record], Trajectory]:
+    """Records without ``topic``, and its poses."""
+    poses, stamps = [], []
+    for t, m, _ in records:
+        if t == topic:
+            p = m.pose if hasattr(m.pose, "position") else m.pose.pose
+            poses.append([p.position.x, p.position.y, 2.0 * math.atan2(p.orientation.z, p.orientation.w)])
+            stamps.append(m.header.stamp.sec * S + m.header.stamp.nanosec)
+    return [r for r in records if r[0] != topic], Trajectory(np.array(stamps), np.array(poses))
+
+
+def real_building(folder: str, log: str, begin_s: float, seconds: float) -> Callable[[], tuple[list[Record], Trajectory | None]]:
+    """A part of a log with a reference on /reference/pose."""
+
+    def load() -> tuple[list[Record], Trajectory | None]:
+        return truth_in(records_in(DATA / folder / log, begin_s, seconds), "/reference/pose")
+
+    return load
+
+
+def real_log(path: str, begin_s: float, seconds: float) -> Callable[[], tuple[list[Record], Trajectory | None]]:
+    """A part of a log without a reference."""
+    return lambda: (records_in(DATA / path, begin_s, seconds), None)
+
+
+def boreal(terrain: str, run: str, begin_s: float, seconds: float) -> Callable[[], tuple[list[Record], Trajectory | None]]:
+    """Wheels (6.5 Hz) and IMU (100 Hz) of a Husky off road."""
+
+    def load() -> tuple[list[Record], Trajectory | None]:
+        folder = DATA / "borealtc-husky" / terrain
+        wheels = np.loadtxt(folder / f"pro_{run}.csv", delimiter=",", skiprows=1)
+        imu = np.loadtxt(folder / f"imu_{run}.csv", delimiter=",", skiprows=1)
+        mount = ("base_link", "imu_link", (0.0, 0.0, 0.1), bags.quaternion())
+        records: list[Record] = [("/tf_static", bags.tf(START, [mount]), START)]
+        angles = np.cumsum(np.diff(wheels[:, 0], prepend=wheels[0, 0])[:, None] * wheels[:, 3:5], axis=0) / 0.1651
+        for row, (left, right) in zip(wheels, angles, strict=True):
+            if begin_s <= row[0] < begin_s + seconds:
+                stamp = START + round((row[0] - begin_s) * S)
+                rates = row[[3, 3, 4, 4]] / 0.1651
+                records.append(("/joint_states", bags.joint_state(stamp, FOUR, [left, left, right, right], rates), stamp + S // 250))
+        for row in imu:
+            if begin_s <= row[0] < begin_s + seconds:
+                stamp = START + round((row[0] - begin_s) * S)
+                records.append(("/imu/data", bags.imu(stamp, row[1:4], row[4:7], "imu_link"), stamp + S // 500))
+        return sorted(records, key=lambda record: record[2]), None
+
+    return load
+
+
+FOUR = ("front_left_wheel", "rear_left_wheel", "front_right_wheel", "rear_right_wheel")
+
+
+def simulated(
+    robot: str, experiment: str, seed: int, begin_s: float, seconds: float
+) -> Callable[[], tuple[list[Record], Trajectory | None]]:
+    """A part of `skidloc simulate`."""
+
+    def load() -> tuple[list[Record], Trajectory | None]:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "log.mcap"
+            write_simulation(path, simulate(experiment, load_robot(robot), seed, {}), lambda log_ns: None)
+            return truth_in(records_in(path, begin_s, seconds), "/ground_truth/odom")
+
+    return load
+
+
+def _file(path: Path, *left_out: str) -> str:
+    """Text of a robot file without some tables."""
+    parts = path.read_text().split("\n[")
+    return "\n[".join(part for part in parts if not part.startswith(tuple(f"{name}]" for name in left_out)))
+
+
+CORRIDOR = BaseLog("fr079, 500 to 600 s", _file(DATA / "fr079/fr079.toml", "topics"), real_building("fr079", "fr079.mcap", 500.0, 100.0))
+OFFICE = BaseLog(
+    "MIT-CSAIL, 60 to 150 s", _file(DATA / "mit-csail/csail.toml", "topics"), real_building("mit-csail", "csail.mcap", 60.0, 90.0)
+)
+HALL = BaseLog("ACES, 100 to 190 s", (ROBOTS / "aces.toml").read_text(), real_log("aces/aces.mcap", 100.0, 90.0))
+MEADOW = BaseLog(
+    "Husky outdoors, 60 to 180 s", _file(ROBOTS / "husky_a200.toml"), real_log("husky-outdoor-gps/test1.bag", 60.0, 120.0), 0.6
+)
+ASPHALT = BaseLog(
+    "BorealTC asphalt", _file(ROBOTS / "husky_a200.toml", "mounts.imu_link", "topics"), boreal("ASPHALT", "00", 0.0, 60.0), 0.25
+)
+LOAM = BaseLog(
+    "BorealTC sandy loam", _file(ROBOTS / "husky_a200.toml", "mounts.imu_link", "topics"), boreal("SANDY_LOAM", "01", 0.0, 60.0), 0.25
+)
+LEO = BaseLog("leo, laps", (ROBOTS / "leo.toml").read_text(), simulated("leo", "laps", 31, 0.0, 70.0))
+SCOUT = BaseLog("scout_2, laps", (ROBOTS / "scout_2.toml").read_text(), simulated("scout_2", "laps", 32, 20.0, 80.0))
+PIONEER = BaseLog("pioneer_3at, arcs", (ROBOTS / "pioneer_3at.toml").read_text(), simulated("pioneer_3at", "preliminary", 33, 0.0, 88.0))
+
+
+def trajectories(folder: Path) -> dict[str, Trajectory]:
+    """Written trajectories by estimator."""
+    found = {}
+    for estimator in ("odometry", "ekf"):
+        (path,) = folder.glob(f"*_{estimator}.tum")
+        table = np.array([[float(v) for v in line.split()] for line in path.read_text().splitlines() if line[:1] not in "#"])
+        poses = np.column_stack([table[:, 1:3], 2.0 * np.arctan2(table[:, 6], table[:, 7])])
+        found[estimator] = Trajectory(np.round(table[:, 0] * S).astype(np.int64), poses)
+    return found
+
+
+def error_of(ours: Trajectory, truth: Trajectory) -> float:
+    """Absolute trajectory error [m] at the true poses' times; infinite where less than nine tenths of these are in ``ours``."""
+    inside = (truth.stamps_ns >= ours.stamps_ns[0]) & (truth.stamps_ns <= ours.stamps_ns[-1])
+    if inside.mean() < 0.9:
+        return math.inf
+    true, at = truth.poses[inside], ours.at(truth.stamps_ns[inside])
+    moved = se2.compose(align(at, true[:, :2], true[:, 2]), at)
+    return float(np.sqrt(np.mean(np.sum((moved - true)[:, :2] ** 2, axis=1))))
+
+
+@dataclass(frozen=True, eq=False)
+class Healthy:
+    """What the log with nothing wrong gives."""
+
+    errors: dict[str, float]
+    truth: dict[str, Trajectory]
+    reference: Trajectory
+    """True poses, else the EKF's."""
+
+
+@functools.cache
+def healthy(base: BaseLog) -> Healthy:
+    """Errors, and true poses, of a base log."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        log, robot, truth = written(folder, base, lambda records: records)
+        code, text = replayed(folder, log, robot)
+        assert code == 0, text
+        found = trajectories(folder / "out")
+    known = found if truth is None else dict.fromkeys(found, truth)
+    return Healthy({k: error_of(found[k], known[k]) for k in found}, known, found["ekf"] if truth is None else truth)
+
+
+def written(
+    folder: Path, base: BaseLog, edit: Edit, robot: Callable[[str], str] = lambda text: text
+) -> tuple[Path, Path, Trajectory | None]:
+    """Log and robot file, and the true poses."""
+    records, truth = base.load()
+    changed = edit(records)
+    is_ordered = getattr(edit, "keeps_order", False)
+    path = bags.write_mcap(folder / "log.mcap", changed if is_ordered else sorted(changed, key=lambda record: record[2]))
+    (folder / "robot.toml").write_text(robot(base.robot))
+    return path, folder / "robot.toml", truth
+
+
+def based(
+    kind: str,
+    name: str,
+    base: BaseLog,
+    edit: Edit = lambda records: records,
+    words: Sequence[str] = (),
+    refused: bool = False,
+    robot: Callable[[str], str] = lambda text: text,
+) -> Case:
+    """A changed base log: right where odometry and EKF are as good as with nothing wrong, and a warning has one of ``words``."""
+
+    def judge(folder: Path) -> Found:
+        log, path, _ = written(folder, base, edit, robot)
+        code, text = replayed(folder, log, path)
+        warned = warnings_in(text)
+        is_named = any(word in warned for word in words) if words else True
+        if code:
+            return Found(choose_outcome(refused, is_named, True, words), f"[exit {code}] {warned or text}")
+        best, found = healthy(base), trajectories(folder / "out")
+        ours = {k: error_of(found[k], best.truth[k]) for k in found}
+        is_right = not refused and all(ours[k] < 1.3 * best.errors[k] + base.tolerance_m for k in ours)
+        state = "[" + ", ".join(f"{k} {ours[k]:.3f} ({best.errors[k]:.3f})" for k in ours) + " m]"
+        code, _ = run_command("check", str(log), "--robot", str(path), "--json", str(folder / "check.json"))
+        checked = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []
+        wrong = [f"{row['quantity']}: {row['advice']}" for row in checked if row["verdict"] == "contradiction"]
+        return Found(
+            choose_outcome(is_right, is_named, bool(warned), words), f"{state} check: {wrong or code or 'no contradiction'}\n{warned}"
+        )
+
+    return Case(kind, name, judge)
+
+
+def referred(
+    name: str,
+    base: BaseLog,
+    content: Callable[[Trajectory], str],
+    suffix: str = "tum",
+    words: Sequence[str] = (),
+    edit: Edit = lambda records: records,
+    reference: str = "",
+    noise_m: float = 0.0,
+) -> Case:
+    """A reference (a file, or topic ``reference``) of a base log.
+
+    Right where the runs have the errors of the healthy log, or sentences have all of ``words``.
+    """
+
+    def judge(folder: Path) -> Found:
+        log, robot, _ = written(folder, base, edit)
+        path, best = folder / f"reference.{suffix}", healthy(base)
+        path.write_text(content(best.reference))
+        code, text = replayed(folder, log, robot, "--reference", reference or str(path), "--json", str(folder / "m.json"))
+        flat = " ".join(text.split())
+        if words:
+            is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
+            is_warned = bool(code) or "reference" in warnings_in(text) or "until that" in flat.lower()
+            return Found(choose_outcome(True, is_named and not is_judged, is_warned, words), f"[exit {code}] {text}")
+        if code:
+            return Found("misnamed", f"[exit {code}] {text}")
+        found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
+        own = error_of(best.truth["ekf"], best.reference)
+        wanted = {"ekf": best.errors["ekf"] or own, **({} if base.load()[1] is None else {"odometry": best.errors["odometry"]})}
+        is_right = all(abs(found[k] - wanted[k]) < 0.3 * wanted[k] + 0.03 + noise_m for k in wanted)
+        has_doubt, warned = "Until that" in text, warnings_in(text)
+        return Found(choose_outcome(is_right, not has_doubt, has_doubt or bool(warned), words), f"[{found}, {wanted}] {warned}")
+
+    return Case("references", name, judge)
