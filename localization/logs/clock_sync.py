@@ -26,6 +26,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from localization.logs.decode import MessageStats, Oddity
 
 _SECOND = 1_000_000_000
@@ -45,6 +47,11 @@ _MAX_PENDING_NS = 10 * _SECOND  # bounds the latency
 _MAX_BURST_NS = 5 * _SECOND
 _MAX_PENDING_MESSAGES = 1000  # bounds the memory
 _MAX_BUFFERED_WEIGHT = 20_000  # bounds the memory: 200 scans
+_RATE_WINDOW_NS, _MIN_RATE_WINDOWS, _MAX_RATE_WINDOWS = 5 * _SECOND, 6, 360
+"""Times of recording over which the least latency is taken, and fewest and most of these windows, to compare the rates of clocks."""
+_MAX_RATE, _MAX_DRIFT_S, _LINEAR = 0.002, 0.15, 0.1
+"""Difference of the rates of two clocks, and of their times over a log [s], from where on it is named; largest deviation of that difference
+from a straight line. Quartzes differ by 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +163,8 @@ class TopicClock:
         self.offset_ns = plan.latency_ns.get(topic, plan.offset_ns)
         """Stamp minus time of recording, of the last plausible message."""
         self._min_latency_offset_ns = self.offset_ns
+        self._least_latency: dict[int, int] = {}
+        """Greatest offset [ns] by window of the time of recording."""
         self._pending: list[Item] = []
         self._last_log = 0
         self._pace: deque[tuple[int, int]] = deque(maxlen=_PACE_MESSAGES)
@@ -205,6 +214,27 @@ class TopicClock:
         else:
             self.drop_pending()
         return self._release()
+
+    def drift(self) -> tuple[float, float] | None:
+        """Rate of the stamps less that of the times of recording, by a line through the least latencies, and its sum over the log [s].
+
+        None where they lie on no line.
+        """
+        if len(self._least_latency) < _MIN_RATE_WINDOWS:
+            return None
+        t = np.array([*self._least_latency], dtype=float) * _RATE_WINDOW_NS * 1e-9
+        offsets = np.array([*self._least_latency.values()], dtype=float) * 1e-9
+        t, offsets = t - t[0], offsets - offsets[0]
+        line = np.polynomial.Polynomial.fit(t, offsets, 1).convert()
+        rate = float(line.coef[1]) if len(line.coef) > 1 else 0.0
+        drift = rate * float(t[-1])
+        is_straight = float(np.abs(offsets - line(t)).max()) <= max(_LINEAR * abs(drift), 0.02)
+        return (rate, drift) if is_straight else None
+
+    @property
+    def accepted(self) -> int:
+        """Plausible messages so far."""
+        return self._accepted
 
     def drop_pending(self) -> None:
         """Drop the pending messages as outliers, or as old where they lie behind all that follow."""
@@ -259,6 +289,9 @@ class TopicClock:
             self._pace.append((step, item.log_ns - self._last_log - step))
         self._last, self._last_log, self.offset_ns = stamp, item.log_ns, stamp - item.log_ns
         self._min_latency_offset_ns = max(self._min_latency_offset_ns, self.offset_ns)
+        window = item.log_ns // _RATE_WINDOW_NS
+        if window in self._least_latency or len(self._least_latency) < _MAX_RATE_WINDOWS:
+            self._least_latency[window] = max(self._least_latency.get(window, self.offset_ns), self.offset_ns)
         self._accepted += 1
         self._is_sure |= self._accepted >= _MIN_JUMPED_MESSAGES
         if self._rebased:
@@ -331,6 +364,16 @@ class Merger:
         for clock in self._clocks.values():
             self._hold(clock.flush())
         yield from self._release(2**63 - 1, 0)
+        self._compare_rates()
+
+    def _compare_rates(self) -> None:
+        """Count the messages of a topic whose clock has another rate than those of the other topics and of the recorder."""
+        drifts = {topic: found for topic, clock in self._clocks.items() if (found := clock.drift()) is not None}
+        for topic, (rate, drift) in drifts.items():
+            others = [other for name, (other, _) in drifts.items() if name != topic]
+            is_odd = bool(others) and max(map(abs, others)) < abs(rate) / 3.0
+            if is_odd and abs(rate) > _MAX_RATE and abs(drift) > _MAX_DRIFT_S:
+                self._stats.count(topic, Oddity.RATE_OF_CLOCK, self._clocks[topic].accepted)
 
     def _hold(self, items: Iterable[Item]) -> None:
         for item in items:

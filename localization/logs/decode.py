@@ -52,6 +52,10 @@ class Oddity(Enum):
     OLD = "dropped (stamped seconds before the topic's others: latched, or left in a buffer)"
     OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
     REBASED = "stamped after a jump of the clock, moved back by it"
+    RATE_OF_CLOCK = (
+        "stamped by a clock of another rate than the recorder's and the other topics', or that wait in a queue that grows; synchronize the"
+        " clocks, or make its driver faster"
+    )
     POSE_JUMP = "with a pose that wheels cannot reach (a reset); the increment was taken from the rates"
     NO_POSE = "with rates but a pose that never moves; the increment was taken from the rates"
     NO_TWIST = "with a moving pose but no rates; these were taken from the pose"

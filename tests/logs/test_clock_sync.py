@@ -443,3 +443,22 @@ def test_clock_sync_references_are_ordered_by_the_same_rules(tmp_path: Path) -> 
     references = list(log.references("/vicon"))
     assert [r.stamp_ns for r in references] == [START + i * S // 10 for i in range(100)]
     assert any("/vicon: 50 messages stamped after a jump" in note for note in log.warnings())
+
+
+def test_clock_sync_clock_of_another_rate_is_named() -> None:
+    """One of three topics runs 0.5 % slow; latencies jitter."""
+    rng = np.random.default_rng(3)
+    items = []
+    for topic, rate in (("/wheels", 0.0), ("/scan", 1e-4), ("/imu", -0.005)):
+        for i in range(1200):
+            true = START + i * S // 20
+            stamp = true + round(rate * (true - START))
+            items.append(mark(topic, true, true + int(rng.exponential(0.01) * S), stamp))
+    _, stats = run(items)
+    assert [topic for topic in ("/wheels", "/scan", "/imu") if stats.of(topic, Oddity.RATE_OF_CLOCK)] == ["/imu"]
+
+
+def test_clock_sync_latency_that_grows_of_all_topics_names_none() -> None:
+    items = [mark(topic, t, t + (t - START) // 100) for topic in ("/wheels", "/imu") for t in range(START, START + 60 * S, S // 20)]
+    _, stats = run(items)
+    assert not stats.of("/wheels", Oddity.RATE_OF_CLOCK) + stats.of("/imu", Oddity.RATE_OF_CLOCK)
