@@ -244,7 +244,8 @@ class Replay:
         )
         found = merge_maps(old.map, drive.map, self.config.estimator.lidar.range_noise_m, only_new=True, initial=self._initial())
         save_map(path, SavedMap(found.map, {"extended_from": [dict(old.provenance), dict(drive.provenance)]}))
-        return f"map: {found.added} of {len(drive.map.poses)} keyframes are new in '{path}', {found.closed} were found in '{self.map}'"
+        added = f"map: {found.added} of {len(drive.map.poses)} keyframes are new in '{path}', {found.closed} were found in '{self.map}'"
+        return f"{added}, {found.removed} points of which are gone" if found.removed else added
 
     def _check_map(self, has_lidar: bool) -> None:
         """Refuse `--save-map` before the run, where there will be no map."""

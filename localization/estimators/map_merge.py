@@ -4,7 +4,7 @@ ties them to it."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
@@ -18,6 +18,7 @@ from localization.maps import KeyframeMap, SpaceMap
 from localization.maps.changes import adds_to, find_changes
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
+from localization.maps.space_localizer import SpaceLocalizer
 from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
@@ -33,6 +34,8 @@ _LEAST_SCORE, LEAST_CLOSURES = 0.5, 3
 
 
 Map = TypeVar("Map", KeyframeMap, SpaceMap)
+Search = TypeVar("Search", Localizer, SpaceLocalizer)
+Closure = TypeVar("Closure")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,8 @@ class Merged(Generic[Map]):
     """(closed,) how far the second map, moved as a whole, is from where the merged one has these keyframes [m]."""
     added: int
     """Keyframes of the second map that the merged one has."""
+    removed: int = 0
+    """Points of the first map that are gone by the second one."""
 
 
 def refuse_few(n_closures: int, n_keyframes: int) -> None:
@@ -80,17 +85,33 @@ def merge(
     return Merged(joined, len(keys), errors, bent, len(kept))
 
 
-def _closures(places: PlaceMap, second: KeyframeMap, initial: Pose2 | None) -> dict[int, tuple[Pose2, Cov3]]:
-    """Pose (3,) in the first map and covariance (3, 3), by keyframe of the ``second``: forwards, and for its beginning backwards."""
-    scans, found = second.scans(), {}
-    for order, near in ((range(len(scans)), initial), (range(len(scans) - 1, -1, -1), None)):
-        localizer, before = Localizer(places, near), second.poses[order[0]]
-        for k in order:
-            localizer.add(scans[k], se2.between(before, second.poses[k]), FLOOR_COV)
-            before = second.poses[k]
-            if k not in found and localizer.state == "localized" and (closure := _closure(places, scans[k], localizer)) is not None:
-                found[k] = closure
+def find_closures(
+    keys: Sequence[int],
+    start: Callable[[Pose2 | None], Search],
+    close: Callable[[Search, int, int], Closure | None],
+    initial: Pose2 | None,
+) -> dict[int, Closure]:
+    """Closures of keyframes ``keys``, in their order: found forwards from ``initial`` (3,) on, and for those before the first one
+    backwards. ``start`` makes a localizer about a pose; ``close`` adds keyframe k to it after keyframe j, and gives the closure of k."""
+    found: dict[int, Closure] = {}
+    for order, near in ((keys, initial), (keys[::-1], None)):
+        localizer = start(near)
+        for i, k in enumerate(order):
+            closure = close(localizer, order[max(i - 1, 0)], k)
+            if closure is not None:
+                found.setdefault(k, closure)
     return dict(sorted(found.items()))
+
+
+def _closures(places: PlaceMap, second: KeyframeMap, initial: Pose2 | None) -> dict[int, tuple[Pose2, Cov3]]:
+    """Pose (3,) in the first map and covariance (3, 3), by keyframe of the ``second``."""
+    scans = second.scans()
+
+    def close(localizer: Localizer, before: int, k: int) -> tuple[Pose2, Cov3] | None:
+        localizer.add(scans[k], se2.between(second.poses[before], second.poses[k]), FLOOR_COV)
+        return _closure(places, scans[k], localizer) if localizer.state == "localized" else None
+
+    return find_closures(range(len(scans)), lambda near: Localizer(places, near), close, initial)
 
 
 def _closure(places: PlaceMap, points: Points2, localizer: Localizer) -> tuple[Pose2, Cov3] | None:

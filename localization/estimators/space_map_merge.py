@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from localization.estimators.map_merge import MAX_OFF_M, Merged, refuse_few
+from localization.estimators.map_merge import MAX_OFF_M, Merged, find_closures, refuse_few
 from localization.estimators.space_graph import Between, SpaceGraph
 from localization.lidar.cloud_loops import CloudLoop
 from localization.maps import SpaceMap
+from localization.maps.space_changes import find_gone, without
 from localization.maps.space_localizer import SpaceLocalizer, SpaceMotion
 from localization.maps.space_places import SpacePlaces
 from localization.trajectory import IntArray
@@ -32,7 +34,8 @@ _LEAST_NEW = 0.1
 def merge_in_space(
     first: SpaceMap, second: SpaceMap, range_noise_m: float, only_new: bool = False, initial: Pose2 | None = None
 ) -> Merged[SpaceMap]:
-    """See `map_merge.merge`. With ``only_new``, keyframes that have what the first map has not seen; what is gone stays in it."""
+    """See `map_merge.merge`. With ``only_new``, keyframes that have what the first map does not have, and that without
+    what is gone."""
     places = SpacePlaces(first, range_noise_m)
     closures = _closures(places, second, initial)
     refuse_few(len(closures), len(second.poses))
@@ -42,28 +45,30 @@ def merge_in_space(
     errors = np.linalg.norm(poses[keys, :3, 3] - measured[:, :3, 3], axis=1)
     moved = poses[keys[0]] @ se3.inverse(second.poses[keys[0]]) @ second.poses[keys]
     bent = np.linalg.norm(poses[keys, :3, 3] - moved[:, :3, 3], axis=1)
-    kept = _new_keyframes(places, second, poses) if only_new else np.arange(len(second.poses))
-    return Merged(_join(first, second, kept, (poses, covs), closures), len(keys), errors, bent, len(kept))
+    kept, n_points = np.arange(len(second.poses)), len(first.points)
+    if only_new:
+        kept = _new_keyframes(places, second, poses)
+        first = without(first, find_gone(first, replace(second, poses=poses), places.cell))
+    joined = _join(first, second, kept, (poses, covs), closures)
+    return Merged(joined, len(keys), errors, bent, len(kept), n_points - len(first.points))
 
 
 def _closures(places: SpacePlaces, second: SpaceMap, initial: Pose2 | None) -> dict[int, tuple[Transform3, FloatArray]]:
-    """Pose (4, 4) in the first map and covariance (6, 6), by keyframe of the ``second``: forwards, and for its beginning backwards."""
-    clouds, found = second.clouds(), {}
-    for order, near in ((range(len(clouds)), initial), (range(len(clouds) - 1, -1, -1), None)):
-        localizer, before = SpaceLocalizer(places, near), second.poses[order[0]]
-        for k in order:
-            motion = SpaceMotion(se3.inverse(before) @ second.poses[k], _FLOOR_COV)
-            before = second.poses[k]
-            if not len(clouds[k]):
-                continue
-            localizer.add(clouds[k], motion, second.poses[k][:3, :3])
-            if k in found or localizer.state != "localized":
-                continue
-            place = places.align(clouds[k], localizer.pose, localizer.covariance + _FLOOR_COV)
-            is_near = math.hypot(*(place.pose[:3, 3] - localizer.pose[:3, 3])) <= MAX_OFF_M
-            if place.on_surfaces >= _LEAST_ON and place.off_surfaces <= _MOST_OFF and is_near:
-                found[k] = place.match.measured, place.cov + _FLOOR_COV
-    return dict(sorted(found.items()))
+    """Pose (4, 4) in the first map and covariance (6, 6), by keyframe of the ``second``."""
+    clouds = second.clouds()
+
+    def close(localizer: SpaceLocalizer, before: int, k: int) -> tuple[Transform3, FloatArray] | None:
+        motion = SpaceMotion(se3.inverse(second.poses[before]) @ second.poses[k], _FLOOR_COV)
+        localizer.add(clouds[k], motion, second.poses[k][:3, :3])
+        if localizer.state != "localized":
+            return None
+        place = places.align(clouds[k], localizer.pose, localizer.covariance + _FLOOR_COV)
+        is_near = math.hypot(*(place.pose[:3, 3] - localizer.pose[:3, 3])) <= MAX_OFF_M
+        is_fitting = place.on_surfaces >= _LEAST_ON and place.off_surfaces <= _MOST_OFF
+        return (place.match.measured, place.cov + _FLOOR_COV) if is_fitting and is_near else None
+
+    keys = [k for k, cloud in enumerate(clouds) if len(cloud)]
+    return find_closures(keys, lambda near: SpaceLocalizer(places, near), close, initial)
 
 
 def _solve(second: SpaceMap, closures: dict[int, tuple[Transform3, FloatArray]]) -> tuple[FloatArray, FloatArray]:

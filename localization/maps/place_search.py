@@ -171,31 +171,32 @@ class PlaceMap:
         reach = float(np.quantile(np.hypot(some[:, 0], some[:, 1]), 0.8))
         n_turns = max(math.ceil(2.0 * math.pi * reach / CELL_M / _BLOCK), 8)
         step = 2.0 * math.pi / n_turns
-        yaws = step / (2 * _BLOCK) * np.arange(2 * _BLOCK * n_turns)  # every other one is a pose's, those between are middles of blocks
-        turned = se2.transform(np.column_stack([np.zeros((len(yaws), 2)), yaws])[:, None, :], some)
         starts, turns = self._starts, np.arange(n_turns)
         if near is not None and half is not None:
             starts = starts[(np.abs(starts - near[:2]) <= half[:2] + _BLOCK_M).all(axis=1)]
             turns = turns[np.abs(se2.wrap_angle(step * (turns + 0.5) - near[2])) <= half[2] + step]
         if not len(starts) or not len(turns):
             return []
-        poses, scores = self._branch_and_bound(np.ascontiguousarray(turned / CELL_M + _PADDING), starts, turns)
+        parts = np.arange(2 * _BLOCK) / (2 * _BLOCK)  # every other one is a pose's, those between are middles of blocks
+        yaws = step * (turns[:, None] + parts).ravel()
+        turned = se2.transform(np.column_stack([np.zeros((len(yaws), 2)), yaws])[:, None, :], some)
+        poses, scores = self._branch_and_bound(np.ascontiguousarray(turned / CELL_M + _PADDING), starts)
         if not len(scores):
             return []
         found = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
         places = [self.align(points, pose) for pose in _distinct(found, scores)]
         return sorted(places, key=lambda place: -place.score)
 
-    def _branch_and_bound(self, turned: FloatArray, starts: FloatArray, turns: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _branch_and_bound(self, turned: FloatArray, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The best poses (K, 3) of blocks, as x, y [cells] and row of ``turned`` (Y, N, 2), and their scores (K,): in blocks about
-        ``starts`` (C, 2) [m] and headings of ``turns`` (T,)."""
+        ``starts`` (C, 2) [m] and of headings of ``turned``, 8 rows each."""
         wide, which = np.unique(np.floor(starts / (2.0 * _BLOCK_M)), axis=0, return_inverse=True)
         centres = 2.0 * _BLOCK_M * (wide + 0.5)
         column, row = (starts > centres[which.ravel()]).T
         is_start = np.zeros((len(wide), 4), dtype=bool)
         is_start[which.ravel(), 2 * column + row] = True
         middles = (centres - self._walls.origin) / CELL_M
-        bounds = _bound_blocks(self._scores[3], turned[2 * _BLOCK * turns + _BLOCK - 1], middles).ravel()
+        bounds = _bound_blocks(self._scores[3], np.ascontiguousarray(turned[_BLOCK - 1 :: 2 * _BLOCK]), middles).ravel()
         order = np.argpartition(-bounds, min(_MAX_BLOCKS, len(bounds) - 1))[:_MAX_BLOCKS]
         order = order[np.argsort(-bounds[order], kind="stable")]
         poses, scores, best = [], [], 0.0
@@ -204,7 +205,7 @@ class PlaceMap:
             if bounds[chunk[0]] < _SHARE_OF_BEST * best:
                 break
             turn, block = np.divmod(chunk, len(wide))
-            one, score = _refine_blocks(self._scores, turned, middles[block], is_start[block], 2 * _BLOCK * turns[turn], best)
+            one, score = _refine_blocks(self._scores, turned, middles[block], is_start[block], 2 * _BLOCK * turn, best)
             poses.append(one[score > 0.0])
             scores.append(score[score > 0.0])
             best = max(best, float(score.max()))

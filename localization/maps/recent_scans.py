@@ -89,8 +89,9 @@ class RecentScans:
         if not is_narrow(motion.cov):
             self.clear()  # carried, or driven blind
         A = se2.adjoint(se2.inverse(motion.delta))
-        moved = [replace(key, cov=A @ key.cov @ A.T + motion.cov) for key in self._keys]
-        self._keys = deque((key for key in moved if is_narrow(key.cov)), _MAX_KEYFRAMES)
+        covs = A @ np.array([key.cov for key in self._keys]).reshape(-1, 3, 3) @ A.T + motion.cov
+        moved = [replace(key, cov=cov) for key, cov in zip(self._keys, covs, strict=True) if is_narrow(cov)]
+        self._keys = deque(moved, _MAX_KEYFRAMES)
         self._pose = se2.compose(self._pose, motion.delta)
         self._way_m += math.hypot(motion.delta[0], motion.delta[1])
         self._way_m += _NEW_VIEW_M * abs(motion.delta[2]) if _is_partial(points) else 0.0

@@ -74,6 +74,16 @@ def test_extension_in_space_adds_what_the_map_does_not_have(first, second) -> No
     assert again.added <= 1
 
 
+def test_extension_in_space_removes_what_is_gone(first, scene) -> None:
+    nearest = np.argsort(np.hypot(*scene.trees[:, :2].T))
+    felled = dataclasses.replace(scene, trees=scene.trees[nearest[4:]])
+    again = hill_map.make_map(felled, tuple(map(tuple, _WAY + np.array([0.4, -0.5, 0.3]))))
+    found = merge_maps(first, again, 0.02, only_new=True)
+    n = found.map.counts[: len(first.poses)].sum()
+    assert 50 < found.removed == len(first.points) - n
+    assert merge_maps(first, again, 0.02).removed == 0
+
+
 def test_maps_of_other_hills_or_of_one_kind_each_are_not_merged(first, scene) -> None:
     poses = [se3.exp(np.array([0.6 * i, 0.0, 0.0, 0.0, 0.0, 0.0])) for i in range(4)]
     there = hill_map.make_map(scene, hill_map.WAY[:4])
