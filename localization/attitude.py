@@ -77,8 +77,8 @@ class Tilt:
     """(2,) at its end."""
     cov: FloatArray
     """(2, 2) of both, by the attitude, the mount, friction and the CG's height."""
-    twist: float = 0.0
-    """Twist of the ground, the second derivative of its height by x and y in the body's axes [1/m]."""
+    twist: tuple[float, float] = (0.0, 0.0)
+    """Twist of the ground, the second derivative of its height by x and y in the body's axes, and its sigma [1/m]."""
 
     def at(self, shares: FloatArray) -> FloatArray:
         """(n, 2) at ``shares`` (n,) of the step, 0 to 1."""

@@ -35,14 +35,9 @@ class GroundCurvature:
         self._state, self._cov = np.zeros(3), _PRIOR.copy()
 
     @property
-    def twist(self) -> float:
-        """h_xy in the body's axes [1/m]."""
-        return float(self._state[1])
-
-    @property
-    def twist_variance(self) -> float:
-        """Variance of `twist` [1/m^2]."""
-        return float(self._cov[1, 1])
+    def twist(self) -> tuple[float, float]:
+        """h_xy in the body's axes, and its sigma [1/m]."""
+        return float(self._state[1]), math.sqrt(self._cov[1, 1])
 
     def advance(self, before: FloatArray, after: FloatArray, motion: tuple[float, float], variance: float) -> None:
         """Advance by a ``motion``: way ahead [m] and turn [rad] about the body's z axis.

@@ -12,7 +12,7 @@ from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.extended_model import SampleSeries, in_series, needs_series
-from motion_models.friction.slope_effect import LimitedTwist, SlopeEffect
+from motion_models.friction.slope_effect import SlopeEffect, SlopeMotion
 from motion_models.preintegration import integrate_twists
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Twist2
@@ -59,24 +59,23 @@ class WheelMotion:
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
             motion = integrate_twists(dt, inside, self._noise)
         else:
-            warp = self._slope_effect.warp_of(tilt.twist)
+            warp = self._slope_effect.warp_of(tilt.twist[0]), self._slope_effect.warp_of(tilt.twist[1])
             found = partial(self._slope_effect.twist, model, rates, cg, self.params, warp=warp)
             twist, motion = self._integrate_on_slope(found, dt, n, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
 
-    def _integrate_on_slope(self, effect: Callable[[FloatArray], LimitedTwist], dt: FloatArray, m: int, tilt: Tilt) -> tuple[Twist, Motion]:
+    def _integrate_on_slope(self, effect: Callable[[FloatArray], SlopeMotion], dt: FloatArray, m: int, tilt: Tilt) -> tuple[Twist, Motion]:
         """Twists by ``effect`` at ``m`` samples before and n in the step, and the motion over its intervals ``dt`` (n,), with what is
-        uncertain about the slope in its covariance."""
+        uncertain about the slope and the load on the diagonals in its covariance."""
         whole, k = float(dt.sum()), len(self.params)
         downhill = np.vstack([np.tile(tilt.before, (m, 1)), tilt.at((np.cumsum(dt) - 0.5 * dt) / whole)])
-        found, is_limited = effect(downhill)
-        twist = found.twist
-        by = np.concatenate([twist.d_params, found.d_downhill], axis=-1)
+        twist, d_downhill, by_warp, limited = effect(downhill)
+        by = np.concatenate([twist.d_params, d_downhill, by_warp], axis=-1)
         motion = integrate_twists(dt, Twist(twist.value[m:], twist.d_wheels[m:], twist.d_cg[m:], by[m:]), self._noise)
-        D = motion.d_params[:, k:]
-        cov = motion.cov + max(1.0, _SLOPE_ERROR_S / whole) * (D @ tilt.cov @ D.T)
-        limited_s = float(dt[is_limited[m:]].sum())
+        D, B = motion.d_params[:, k : k + 2], motion.d_params[:, k + 2 :]
+        cov = motion.cov + max(1.0, _SLOPE_ERROR_S / whole) * (D @ tilt.cov @ D.T + B @ B.T)
+        limited_s = float(dt[limited[m:]].sum())
         if limited_s:  # tipping or sliding by itself: no wheel shows the motion
             cov = cov + np.diag(self._unknown_sigma**2) * limited_s * max(1.0, limited_s)
         return twist, Motion(motion.delta, cov, motion.d_params[:, :k], motion.d_cg)

@@ -35,9 +35,11 @@ def _advance(found, hessians, way, turn, rng, yaw=0.0, gradient=(0.0, 0.0)):
 def test_ground_curvature_on_an_arc_finds_the_twist(way):
     found, rng = GroundCurvature(), np.random.default_rng(1)
     yaw = _advance(found, np.tile(HESSIAN, (150, 1, 1)), way, STEP_RAD, rng)
-    assert found.twist == pytest.approx((_axes(yaw).T @ HESSIAN @ _axes(yaw))[0, 1], abs=3.0 * math.sqrt(found.twist_variance))
+    twist, sigma = found.twist
+    assert twist == pytest.approx((_axes(yaw).T @ HESSIAN @ _axes(yaw))[0, 1], abs=3.0 * sigma)
     yaw = _advance(found, np.tile(HESSIAN, (40, 1, 1)), 0.0, math.pi / 160.0, rng, yaw)  # in place: the axes turn, not the ground
-    assert found.twist == pytest.approx((_axes(yaw).T @ HESSIAN @ _axes(yaw))[0, 1], abs=3.0 * math.sqrt(found.twist_variance))
+    twist, sigma = found.twist
+    assert twist == pytest.approx((_axes(yaw).T @ HESSIAN @ _axes(yaw))[0, 1], abs=3.0 * sigma)
 
 
 def test_ground_curvature_variance_is_that_of_its_errors():
@@ -52,9 +54,10 @@ def test_ground_curvature_variance_is_that_of_its_errors():
         hessians = np.array([[[xx, xy], [xy, yy]] for xx, xy, yy in rows[1:]])
         yaw = _advance(found, hessians, STEP_M, STEP_RAD, rng)
         true = (_axes(yaw).T @ hessians[-1] @ _axes(yaw))[0, 1]
-        squares.append((found.twist - true) ** 2 / found.twist_variance)
+        twist, sigma = found.twist
+        squares.append(((twist - true) / sigma) ** 2)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.2)
-    assert found.twist_variance < 0.5 * a * a / 3.0
+    assert sigma**2 < 0.5 * a * a / 3.0
 
 
 def test_slope_effect_of_twisted_ground_slides_more():
@@ -65,7 +68,22 @@ def test_slope_effect_of_twisted_ground_slides_more():
     cg, downhill = np.zeros((1, 2)), np.array([[0.0, 0.1]])
 
     def slide(turn, warp):
-        return effect.twist(skid, np.array([[-turn, turn]]), cg, skid.nominal, downhill, warp=warp)[0].twist.value[0, 1]
+        return effect.twist(skid, np.array([[-turn, turn]]), cg, skid.nominal, downhill, (warp, 0.0)).twist.value[0, 1]
 
     assert min(slide(2.0, 0.8), slide(2.0, -0.8)) > 1.15 * slide(2.0, 0.0) > 0.0
     assert slide(2.0, 0.8) == pytest.approx(slide(-2.0, -0.8), rel=1e-6)  # mirrored, front and rear exchanged
+
+
+@pytest.mark.parametrize("mean", [0.0, 0.5])
+def test_slope_effect_covariance_holds_uncertain_loads(mean):
+    """Monte Carlo: loads on the diagonals drawn from their distribution, against the motion at their mean."""
+    robot, sigma = load_robot("husky_a200"), 0.5
+    effect, skid = SlopeEffect.from_robot(robot), make_model("skid_steer", robot)
+
+    def motion(load, spread):
+        return effect.twist(skid, np.array([[-2.0, 2.0]]), np.zeros((1, 2)), skid.nominal, np.array([[0.0, 0.1]]), (load, spread))
+
+    drawn = np.random.default_rng(5).normal(mean, sigma, 1000)
+    slides, found = np.array([motion(load, 0.0).twist.value[0, 1] for load in drawn]), motion(mean, sigma)
+    off = math.sqrt(np.mean((slides - found.twist.value[0, 1]) ** 2))
+    assert math.sqrt((found.by_warp[0] @ found.by_warp[0].T)[1, 1]) == pytest.approx(off, rel=0.2)

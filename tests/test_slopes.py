@@ -100,19 +100,21 @@ def test_slope_effect_is_the_friction_models_difference():
     effect, wheels, cg = SlopeEffect.from_robot(ROBOT), np.array([[-2.0, 2.0], [1.0, 3.0]]), np.zeros((2, 2))
     downhill = np.array([[0.1, 0.0], [0.0, 0.1]])
     friction, skid = make_model("friction", ROBOT), make_model("skid_steer", ROBOT)
-    on_friction, _ = effect.twist(friction, wheels, cg, friction.nominal, downhill)
-    on_skid, is_limited = effect.twist(skid, wheels, cg, skid.nominal, downhill)
+    on_friction = effect.twist(friction, wheels, cg, friction.nominal, downhill)
+    on_skid = effect.twist(skid, wheels, cg, skid.nominal, downhill)
     changed = on_friction.twist.value - friction.twist(wheels, cg, friction.nominal).value
     np.testing.assert_allclose(on_skid.twist.value, skid.twist(wheels, cg, skid.nominal).value + changed, atol=1e-12)
     np.testing.assert_array_equal(on_skid.d_downhill, on_friction.d_downhill)
-    assert not is_limited.any()
+    assert not on_skid.limited.any()
 
 
 def test_slope_effect_beyond_the_limits_is_level_and_named():
     """A filter must go on: it gets the level twist, and the samples whose motion no wheel shows."""
     effect, skid = SlopeEffect.from_robot(ROBOT), make_model("skid_steer", ROBOT)
-    found, is_limited = effect.twist(skid, np.ones((3, 2)), np.zeros((3, 2)), skid.nominal, np.array([[0.0, 0.0], [1.2, 0.0], [0.0, 3.0]]))
-    assert is_limited.tolist() == [False, True, True]
+    downhill = np.array([[0.0, 0.0], [1.2, 0.0], [0.0, 3.0]])
+    found = effect.twist(skid, np.ones((3, 2)), np.zeros((3, 2)), skid.nominal, downhill, (0.5, 0.5))
+    assert found.limited.tolist() == [False, True, True]
+    assert np.isfinite(found.by_warp).all()
     np.testing.assert_allclose(found.twist.value, np.tile(skid.twist(np.ones(2), np.zeros(2), skid.nominal).value, (3, 1)), atol=1e-12)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,11 +12,12 @@ from motion_models.base import MotionModel, Twist
 from motion_models.friction.model import BoolArray, FrictionModel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
-from motion_models.slope import Slope, SlopeTwist
+from motion_models.slope import Slope
 
-LimitedTwist = tuple[SlopeTwist, BoolArray]
-"""A twist on slopes, and the samples whose slope tips the robot over or lets it slide by itself."""
 _WARP = FrictionModel.param_names.index("warp")
+_POINTS = (-1.271, -0.325, 0.325, 1.271)
+"""Means of the quarters of a normal distribution [sigmas]. Where a wheel is in the air more load changes nothing: there the mean motion by
+three points of Gauss-Hermite is off by 4.4 % (RMS), by these 1.4 %."""
 
 
 def _warped(params: FloatArray, warp: float) -> FloatArray:
@@ -22,6 +25,19 @@ def _warped(params: FloatArray, warp: float) -> FloatArray:
     out = params.copy()
     out[_WARP] += warp
     return out
+
+
+class SlopeMotion(NamedTuple):
+    """Motion on a slope, with its spread by the load on the diagonals, which is known to a sigma only."""
+
+    twist: Twist
+    """(n, 3)"""
+    d_downhill: FloatArray
+    """(n, 3, 2) by `Slope.downhill`."""
+    by_warp: FloatArray
+    """(n, 3, 4) root B of the mean square B B^T by which motions at other loads on the diagonals are off `twist`."""
+    limited: BoolArray
+    """(n,) whose slope tips the robot over or lets it slide by itself: their twist is that of level ground."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +62,27 @@ class SlopeEffect:
         return float(twist * wheelbase * track / (4.0 * self.deflection * radius))
 
     def twist(
-        self, model: MotionModel, wheels: FloatArray, cg: FloatArray, params: FloatArray, downhill: FloatArray, warp: float = 0.0
-    ) -> LimitedTwist:
-        """Twist of ``model`` at ``wheels`` (n, 2), ``cg`` (n, 2) and ``params`` where the ground falls to ``downhill`` (n, 2) and moves
-        the load ``warp`` onto the front left and rear right wheels, over m g / 4.
+        self,
+        model: MotionModel,
+        wheels: FloatArray,
+        cg: FloatArray,
+        params: FloatArray,
+        downhill: FloatArray,
+        warp: tuple[float, float] = (0.0, 0.0),
+    ) -> SlopeMotion:
+        """Motion of ``model`` at ``wheels`` (n, 2), ``cg`` (n, 2) and ``params`` where the ground falls to ``downhill`` (n, 2).
 
-        Also the samples (n,) whose slope tips the robot over or lets it slide by itself: their twist is that of level ground.
+        ``warp``: mean and sigma of the load that the ground moves onto the front left and rear right wheels, over m g / 4. The
+        motion is that at the mean. A robot on either diagonal slides farther than on four wheels, so that its error is to one side.
         """
         level = model.twist(wheels, cg, params)
         is_friction = isinstance(model, FrictionModel)
         friction, own = (model, params) if isinstance(model, FrictionModel) else (self.friction, self.friction.nominal)
         flat = level if is_friction else friction.twist(wheels, cg, own)
-        found = friction.find_on_slope(wheels, cg, _warped(own, warp), Slope(downhill, self.cg_height))
+        slope = Slope(downhill, self.cg_height)
+        found = friction.find_on_slope(wheels, cg, _warped(own, warp[0]), slope)
+        points = [friction.find_on_slope(wheels, cg, _warped(own, warp[0] + z * warp[1]), slope).twist.value for z in _POINTS]
+        by_warp = np.stack([point - found.twist.value for point in points], axis=-1) / math.sqrt(len(points))
         twist = found.twist
         if not is_friction:
             twist = Twist(
@@ -66,9 +91,9 @@ class SlopeEffect:
                 level.d_cg + (twist.d_cg - flat.d_cg),
                 level.d_params,
             )
-        limited = np.asarray(np.isnan(twist.value).any(axis=-1))
+        limited = np.asarray(np.isnan(by_warp).any(axis=(-2, -1)))
         if not limited.any():
-            return SlopeTwist(twist, found.d_downhill, found.d_cg_height), limited
+            return SlopeMotion(twist, found.d_downhill, by_warp, limited)
         at = limited[:, None, None]
         twist = Twist(
             np.where(limited[:, None], level.value, twist.value),
@@ -76,4 +101,4 @@ class SlopeEffect:
             np.where(at, level.d_cg, twist.d_cg),
             np.where(at, level.d_params, twist.d_params),
         )
-        return SlopeTwist(twist, np.where(at, 0.0, found.d_downhill), np.where(limited[:, None], 0.0, found.d_cg_height)), limited
+        return SlopeMotion(twist, np.where(at, 0.0, found.d_downhill), np.where(at, 0.0, by_warp), limited)
