@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ from localization.ros.transports.transport import Received
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
-from tests.helpers.entrance_drives import Publishing, Vehicle, write
+from tests.helpers import bags
+from tests.helpers.entrance_drives import Motion, Publishing, Vehicle, records_of, write
 from tests.helpers.entrance_drives import drive as robot_drive
 from tests.helpers.extended import cases
 from tests.helpers.online import LogTransport, track
@@ -88,8 +90,27 @@ LIVE = {
         "no third sensor shows which",
         0.4,
     ),
+    "all wheels backwards": (SCANNING, Publishing(lambda a, r: (-a, -r)), "all wheels count backwards", 0.03),
+    "swapped, LiDAR backwards": (
+        SCANNING,
+        Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]]), lidar_yaw=math.pi),
+        "joints.left",
+        0.03,
+    ),
     "swapped by the gyro alone": (Vehicle(seed=5), Publishing(lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]])), "swapped, or", math.inf),
 }
+
+
+PREFIXED = replace(
+    SCANNING, left=tuple(f"robot1/{name}" for name in SCANNING.left), right=tuple(f"robot1/{name}" for name in SCANNING.right)
+)
+
+
+def centimetres(message: Any) -> Any:
+    """A driver's odometry in centimetres."""
+    for part in (message.pose.pose.position, message.twist.twist.linear):
+        part.x, part.y = 100.0 * part.x, 100.0 * part.y
+    return message
 
 
 def started(vehicle: Vehicle, transport: LogTransport, reports: list[str], state: Path | None = None) -> Node:
@@ -128,6 +149,41 @@ def test_live_node_with_wrong_wiring_goes_back_to_the_start_of_the_drive(name: s
     errors[2] = math.remainder(errors[2], math.tau)
     assert math.hypot(*errors[:2]) < error_m
     assert (np.abs(errors) < 4.0 * sigmas).all()
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("backwards", [(), (2, 3)], ids=["as in the file", "right side reversed"])
+@pytest.mark.xdist_group("online")
+def test_live_node_finds_joints_of_another_prefix(backwards: tuple[int, ...], tmp_path: Path) -> None:
+    signs = np.array([-1.0 if i in backwards else 1.0 for i in range(4)])
+    motion, reports = robot_drive(PREFIXED), []
+    transport = LogTransport(write(tmp_path / "log.mcap", PREFIXED, motion, Publishing(lambda a, r: (a * signs, r * signs))))
+    node = started(SCANNING, transport, reports)
+    node.spin(transport.is_empty)
+    assert "its joints have other names than the robot file's" in " ".join([*reports, *node.warnings()])
+    assert ("joints.reversed" in " ".join(reports)) == bool(backwards)
+    assert end_error(transport, motion) < 0.03
+
+
+@pytest.mark.extended
+@pytest.mark.xdist_group("online")
+def test_live_node_reads_odometry_in_centimetres_by_the_lidar(tmp_path: Path) -> None:
+    motion, reports = robot_drive(SCANNING), []
+    records = records_of(SCANNING, motion, Publishing(forms="odometry"))
+    changed = [(topic, centimetres(message) if topic == "/odom" else message, log_ns) for topic, message, log_ns in records]
+    transport = LogTransport(bags.write_mcap(tmp_path / "log.mcap", changed))
+    node = started(SCANNING, transport, reports)
+    node.spin(transport.is_empty)
+    assert "driver.length_unit_m = 0.01" in " ".join(reports)
+    assert end_error(transport, motion) < 0.03
+
+
+def end_error(transport: LogTransport, motion: Motion) -> float:
+    """Error of the last published position [m]."""
+    live = track(transport)
+    pose, _ = live[max(live)]
+    true = motion.trajectory().at(np.array([min(max(live), motion.trajectory().stamps_ns[-1])]))[0]
+    return math.hypot(*(pose - true)[:2])
 
 
 @pytest.mark.extended
