@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from localization.estimators import Estimate, LearnedParameter, Residuals
 from localization.events import Step, Turn
+from localization.log_replay import replay
+from localization.logs import open_log
+from localization.pipeline import Trial
 from localization.ros.state_serialization import deserialize, serialize
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
@@ -19,6 +23,9 @@ from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER
 from localization.sensor_checks.sweep_times import REVERSED_TIMES
 from motion_models import se2
 from motion_models.base import Motion
+from motion_models.registry import make_model
+from tests.helpers import bags, entrance_drives
+from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, without_gyro
 from tests.helpers.extended import cases
 from tests.helpers.fault_drives import in_room, run, upright_axis, without_lidar
@@ -60,6 +67,23 @@ def test_reversed_times_without_a_gyro_are_named_and_turned_round(number: int) -
     assert REVERSED_TIMES in outcome.pipeline.checks.found, outcome.warnings
     error, sigma = outcome.last
     assert error < 3.0 * sigma
+
+
+@pytest.mark.extended
+def test_times_of_a_sweep_for_beams_at_once_are_named_and_left_out(tmp_path: Path) -> None:
+    vehicle = Vehicle(scan_hz=10.0, beams=180, imu_hz=0.0, seed=61)
+    motion = entrance_drives.drive(vehicle)
+    records = entrance_drives.records_of(vehicle, motion, Publishing())
+    for topic, message, _ in records:
+        if topic == "/scan":
+            message.time_increment = 0.1 / len(message.ranges)
+    log = open_log(bags.write_mcap(tmp_path / "log.mcap", records), vehicle.robot())
+    trial = Trial(make_model("skid_steer", log.robot), "ekf")
+    (found,) = replay(log.events(), [trial], log.robot, log.mounts, has_lidar=True)
+    assert any("the beams are measured at once" in warning for warning in found.warnings)
+    end_ns = int(found.trajectory.stamps_ns[-1])
+    distance = found.trajectory.poses[-1] - motion.trajectory().at(np.array([min(end_ns, motion.trajectory().stamps_ns[-1])]))[0]
+    assert np.hypot(*distance[:2]) < 0.03
 
 
 @pytest.mark.parametrize("number", cases(range(3), usual=[]))
