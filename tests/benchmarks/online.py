@@ -1,6 +1,6 @@
 """The estimator live: how long after a scan its estimate is out, what part of a core it takes, and whether its memory stays flat.
 
-python -m tests.benchmarks.online [steps | latency | start | quarter | dashboard | soak [HOURS [BEAMS]]]
+python -m tests.benchmarks.online [steps | latency | parts | start | quarter | dashboard | soak [HOURS [BEAMS]]]
 
 `quarter` confines the node to a quarter of a core by a cgroup (as root), as a computer of the Raspberry Pi's class would.
 """
@@ -36,11 +36,13 @@ from localization.simulation.simulator import SimulationConfig, simulate, write_
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from tests.benchmarks.host import paced
+from tests.benchmarks.online_parts import PartTimes, one_after_the_other, table
+from tests.benchmarks.online_parts import over_dds as over_dds_by_parts
 from tests.benchmarks.online_soak import soak
 from tests.studies.buildings import BUILDINGS
 
 BEAMS = 760
-_DASHBOARD_S = 40.0
+_DASHBOARD_S, _PARTS_S = 40.0, 45.0
 _READER = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1]).read()"
 _SETTLED_S = 3.0
 """What is heard at the start, before the first estimate, comes all at once."""
@@ -281,6 +283,21 @@ def latency() -> None:
         print("wanted: p99 <= 5 ms, less than 0.10 of a core\n")
 
 
+def parts() -> None:
+    """The node's processor time by its parts, at a robot's pace over DDS and in the processor's caches."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path, paced, quick = write_laps(folder / "laps.mcap"), PartTimes(), PartTimes()
+        peer = start_peer(path, _DOMAIN)
+        of_robot = over_dds_by_parts(folder, _PARTS_S, int(_DOMAIN), lambda: play(peer, round(_PARTS_S) + 15), paced)
+        peer.terminate()
+        peer.communicate()
+        (folder / "state").unlink()
+        for line in table((paced, *of_robot), (quick, *one_after_the_other(path, folder, quick))):
+            print(line)
+    print("wanted: less than 8 % of a core\n")
+
+
 def dashboard() -> None:
     """CPU of the whole process, with its server's threads and a page that is open, over that of the estimator's steps alone; the page is
     sent by the robot's time, as live."""
@@ -319,6 +336,8 @@ def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
         steps()
     if part in ("all", "latency"):
         latency()
+    if part in ("all", "parts"):
+        parts()
     if part in ("all", "start"):
         start()
     if part in ("all", "quarter"):
