@@ -39,16 +39,16 @@ def test_merge_counts_fine_encoder_changes_nothing() -> None:
     assert merge_counts(dt, rates, cg, 0.0015)[1] is rates
 
 
-def test_merge_counts_turn_by_the_friction_model_is_that_of_the_wheels() -> None:
+@pytest.mark.parametrize("step_rad", [0.05, 0.0115])
+def test_merge_counts_turn_by_the_friction_model_is_that_of_the_wheels(step_rad: float) -> None:
     """Rates of single samples turn the robot as if it drove turns in place and straight on by turns."""
     robot = load_robot("husky_a200")
     model = make_model("friction", robot)
-    true = preintegrate(model, np.array([2.0]), _TRUE[None], robot.center_of_gravity, model.nominal, WheelNoise()).delta
-
     def turn(dt: FloatArray, rates: FloatArray) -> float:
         return float(preintegrate(model, dt, rates, robot.center_of_gravity, model.nominal, WheelNoise()).delta[2])
 
-    dt, rates, cg = counted(0.05)
-    merged, means, _ = merge_counts(dt, rates, cg, 0.05)
-    assert abs(turn(merged, means) - true[2]) < 0.015  # half a count of a side at either end: 0.007 rad
-    assert abs(turn(dt, rates) - true[2]) > 2.0 * abs(turn(merged, means) - true[2])
+    dt, rates, cg = counted(step_rad)
+    merged, means, _ = merge_counts(dt, rates, cg, step_rad)
+    true = turn(np.array([dt.sum()]), (dt @ rates / dt.sum())[None])
+    assert abs(turn(merged, means) - true) < 5e-4
+    assert abs(turn(dt, rates) - true) > 2.0 * abs(turn(merged, means) - true)
