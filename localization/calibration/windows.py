@@ -24,9 +24,10 @@ _NOTHING = np.zeros((0,))
 _LEAST_STEP_RAD = 1e-6
 """Smaller differences of angles are rounding [rad]."""
 _FEWEST_STEPS, _MERGED_S = 16.0, 0.25
-"""Intervals of fewer steps of the encoders are merged until a side has gone so many, or so long [s]: rates are then right to a sixteenth. By
-512 counts a turn, of which a VaultBot's wheel goes 5 in a sample of 20 ms, predicted turns of 2 s were off by 4.8 mrad; merged to 8 steps
-by 3.2, to 16 by 1.8, to 32 by 1.7, and by 4096 counts by 2.3 mrad."""
+"""Intervals of fewer steps of the encoders are merged until a side has gone so many, or so long [s]: rates are then right to a sixteenth.
+
+By 512 counts a turn, of which a VaultBot's wheel goes 5 in a sample of 20 ms, predicted turns of 2 s were off by 4.8 mrad; merged to 8
+steps by 3.2, to 16 by 1.8, to 32 by 1.7, and by 4096 counts by 2.3 mrad."""
 
 
 @dataclass(frozen=True)

@@ -140,9 +140,9 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     rng = np.random.default_rng(config.seed)
     predictor = make_predictor(drive, model, baseline)
     searched = _search(predictor, config)
-    if searched.error.is_shown:
-        stiff = _search(dataclasses.replace(predictor, unmodelled=Unmodelled(log_stiffness=COULOMB_LOG_STIFFNESS)), config)
-        searched = stiff if _describes_better(stiff, searched) else searched
+    for contacts in _other_contacts(searched):
+        other = _search(dataclasses.replace(predictor, unmodelled=contacts), config)
+        searched = other if _describes_better(other, searched) else searched
     chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
     if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
         searched, chosen = searched._replace(linearization=searched.first), ()
@@ -191,6 +191,23 @@ def _search(predictor: DrivePredictor, config: DiagnosisConfig) -> _Searched:
     if error.is_shown:  # also about the best causes, not by the bent signature of a large one
         error = find_model_error(predictor, linearization)
     return _Searched(predictor, first, linearization, chosen, error)
+
+
+def _other_contacts(searched: _Searched) -> list[Unmodelled]:
+    """Contacts that may describe a drive better than the robot file's: of Coulomb's friction, where the model's error shows, and such that
+    creep by the speed of the slip, where these describe it better already beside the same causes."""
+    predictor, state = searched.predictor, searched.linearization
+    if not predictor.unmodelled.has_stiffness:
+        return []
+    found = [Unmodelled(log_stiffness=COULOMB_LOG_STIFFNESS)] if searched.error.is_shown else []
+    creeping = dataclasses.replace(predictor.unmodelled, stiffness_exponent=1.0)
+    causes = tuple(state.causes[i] for i in searched.chosen)
+    sizes = dict(zip(causes, (float(s) for s in state.problem.fit(searched.chosen)[0]), strict=True))
+    tried = dataclasses.replace(predictor, unmodelled=creeping)
+    other = dataclasses.replace(linearize(tried, state.causes, {}, TOLERANCE), noise=state.noise)
+    if refined_cost(tried, other, sizes) < refined_cost(predictor, state, sizes):
+        found.append(Unmodelled(stiffness_exponent=1.0))
+    return found
 
 
 def _describes_better(new: _Searched, old: _Searched) -> bool:
@@ -315,7 +332,7 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
     chosen, gains, dropped = _keep_useful(linearization, chosen, config, is_noise_own)
     sizes, gained = problem.fit_by_likelihood(chosen)[0], problem.gain(chosen)
     findings = _make_findings(predictor, linearization, chosen, gains, rng)
-    has_other_contacts = error.is_shown or bool(predictor.unmodelled.log_stiffness)
+    has_other_contacts = error.is_shown or any(predictor.unmodelled.contacts)
     if has_other_contacts:
         findings = [dataclasses.replace(f, sigma=math.hypot(f.sigma, size_error(predictor, f.definition))) for f in findings]
     by_contacts = _by_contacts(predictor, first)
@@ -369,6 +386,12 @@ def _by_contacts(predictor: DrivePredictor, first: Linearization) -> FloatArray:
 
 def _contact_notes(predictor: DrivePredictor, error: MissingSlips) -> tuple[str, ...]:
     """That the contacts are not those of the robot file, or not those of the friction model, in sentences."""
+    if predictor.unmodelled.stiffness_exponent:
+        return (
+            "the contacts of this robot creep, by the speed of the slip and not by its share of the way: causes are searched beside such"
+            " contacts.",
+            *error.notes,
+        )
     if not predictor.unmodelled.log_stiffness:
         return error.notes
     times = math.exp(predictor.unmodelled.log_stiffness)

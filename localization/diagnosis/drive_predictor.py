@@ -130,6 +130,14 @@ class Unmodelled:
     """Sigma of slips by kind of motion, alike on both sides, that the model does not have, over the wheels' way."""
     log_stiffness: float = 0.0
     """Logarithm of the slip stiffness over the robot file's, about which the drive is linearized."""
+    stiffness_exponent: float = 0.0
+    """Power of speed with which the slip stiffness grows, about which the drive is linearized: 1 where forces depend on the speed of the
+    slip alone (`friction_response`)."""
+
+    @property
+    def contacts(self) -> tuple[float, float]:
+        """What differs from the robot file's contacts; (0, 0) where nothing does."""
+        return self.log_stiffness, self.stiffness_exponent
 
 
 @dataclass
@@ -187,9 +195,9 @@ class DrivePredictor:
     @cached_property
     def by_file(self) -> DrivePredictor:
         """The drive with the contacts of the robot file."""
-        if not self.unmodelled.log_stiffness:
+        if not any(self.unmodelled.contacts):
             return self
-        return dataclasses.replace(self, unmodelled=dataclasses.replace(self.unmodelled, log_stiffness=0.0))
+        return dataclasses.replace(self, unmodelled=dataclasses.replace(self.unmodelled, log_stiffness=0.0, stiffness_exponent=0.0))
 
     @property
     def nominal_twist(self) -> FloatArray:
@@ -306,7 +314,8 @@ class DrivePredictor:
         return self._rows[key]
 
     def _predicted_discrepancies(self, hypothesis: Hypothesis) -> FloatArray:
-        contacts = slip_stiffness_cause(self.drive.robot).inject(Hypothesis(), self.unmodelled.log_stiffness)
+        log_stiffness, exponent = self.unmodelled.contacts
+        contacts = slip_stiffness_cause(self.drive.robot).inject(Hypothesis(stiffness_exponent=exponent), log_stiffness)
         hypothesis = self.baseline.hypothesis + contacts + hypothesis
         batch, drive = self.batch, self.drive
         out = np.full((len(batch.ends), len(CHANNELS)), np.nan)

@@ -44,6 +44,7 @@ def test_merge_counts_turn_by_the_friction_model_is_that_of_the_wheels(step_rad:
     """Rates of single samples turn the robot as if it drove turns in place and straight on by turns."""
     robot = load_robot("husky_a200")
     model = make_model("friction", robot)
+
     def turn(dt: FloatArray, rates: FloatArray) -> float:
         return float(preintegrate(model, dt, rates, robot.center_of_gravity, model.nominal, WheelNoise()).delta[2])
 

@@ -21,6 +21,7 @@ from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import drive
 from tests.helpers.mujoco_vehicle import MujocoSimulation
 from tests.studies.mujoco_blind import diagnose_mujoco, healthy
+from tests.studies.nulls import Null
 
 
 @pytest.mark.extended
@@ -54,3 +55,14 @@ def test_diagnose_stiff_contacts_nothing_wrong_or_the_right_shift(tmp_path: Path
     assert not others
     sizes = {first.cause: first.size, **dict(first.aliases)}
     assert sizes["cg_offset_x"] == pytest.approx(shift_m, rel=0.25)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("number", [1001, 1009])
+def test_diagnose_creeping_contacts_of_a_healthy_robot_are_consistent(number: int) -> None:
+    """Friction that grows to 0.15 m/s of slip: about the file's contacts a Warthog's wheels would shrink by 1 %, and a Husky's be late."""
+    drive_of_null = Null(number).drive()
+    found = examine(drive_of_null, make_model("friction", drive_of_null.robot))
+    assert found.predictor is not None
+    assert found.predictor.unmodelled.stiffness_exponent == 1.0
+    assert (found.diagnosis.verdict, found.diagnosis.findings) == ("consistent", ())
