@@ -42,6 +42,8 @@ more than labels can show that they do [m]: of points that move along, wheels ex
 _MAX_SLIP_M, _MAX_TURN_SLIP_RAD = 0.15, 0.2
 """Distance of the estimate from the motion by the wheels since that view, up to which the wheels slip as they do without moving objects
 [m, rad]: a way of .6 m, along which fr079's robot slides by up to 14 deg."""
+_STILL_M, _SLIP_SHARE, _SLIP_M_PER_RAD = 0.03, 0.25, 0.1
+"""The same for shorter ways: noise of two scans, share of the way, and of turns, in which the centre of rotation is elsewhere by 10 cm."""
 MAX_NIS = 16.3
 """NIS of a matched scan that contradicts the wheels: one of 1,000 by chance (chi^2 of 3 degrees of freedom)."""
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2
@@ -104,6 +106,8 @@ class MovingObjects:
         """Time of the last ones that showed it, and of the last labels that showed moving objects [s]."""
         self._since: FloatArray | None = None
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
+        self._is_apart = False
+        """They have been apart by more than wheels slip since then."""
         self._last = np.zeros((2, 3))
         """Poses at the end of the last step."""
         self._jumped: FloatArray | None = None
@@ -176,10 +180,14 @@ class MovingObjects:
         self._is_by_scans |= nis is not None
         inflation, view = self._faults.inflation, self._compared
         before, self._last = self._last, self._poses
-        if self._since is not None and view is not None and nis is not None and self._agree(view.poses):
-            self._settle(self._since)
-            self._since = self._last
-        inflation.ongoing_scene = None if self._since is None else self._distance(self._since)
+        since = self._since
+        if since is not None and view is not None and nis is not None:
+            if self._agree(view.poses):
+                self._settle(since)
+                self._since, since = self._last, view.poses  # within that, wheels or scans may be off
+            else:
+                self._is_apart = True
+        inflation.ongoing_scene = None if since is None else self._distance(since)
         inflation.possible = None
         begin = self._suspected if view is None or self._suspected is not None else view.poses
         if self._since is not None or begin is None:
@@ -207,14 +215,16 @@ class MovingObjects:
         return se2.local(by_estimate, by_wheels)
 
     def _agree(self, poses: FloatArray) -> bool:
-        """Whether wheels and estimate have moved alike since ``poses`` (2, 3)."""
-        off = self._distance(poses)
-        return bool(math.hypot(off[0], off[1]) < _MAX_SLIP_M and abs(off[2]) < _MAX_TURN_SLIP_RAD)
+        """Whether wheels and estimate have moved alike since ``poses`` (2, 3), but for slip."""
+        off, (x, y, yaw) = self._distance(poses), se2.between(poses[0], self._last[0]).tolist()
+        slip = min(_MAX_SLIP_M, _STILL_M + _SLIP_SHARE * math.hypot(x, y) + _SLIP_M_PER_RAD * abs(yaw))
+        return bool(math.hypot(off[0], off[1]) < slip and abs(off[2]) < _MAX_TURN_SLIP_RAD)
 
     def _settle(self, poses: FloatArray) -> None:
-        """What the estimate is off by since ``poses`` (2, 3) stays, if it is more than wheels slip."""
-        if not self._agree(poses):
+        """What the estimate is off by since ``poses`` (2, 3) stays, if it was more than wheels slip."""
+        if self._is_apart or not self._agree(poses):
             self._faults.inflation.add(self._distance(poses))
+        self._is_apart = False
 
     def lead_back(self, step: Step) -> Step:
         """``step`` at whose end the estimate is where the wheels lead from `_since`, with the distance to there as its covariance."""

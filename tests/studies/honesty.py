@@ -1,11 +1,12 @@
 """Covariances under noise that the filter does not model: mean NEES of its poses in simulated rooms, against the 95 % band.
 
-python -m tests.studies.honesty [--seeds 12] [--rooms 4] [--only NAME,...] [--estimator ekf]
+python -m tests.studies.honesty [--seeds 12] [--rooms 4] [--only NAME;...] [--estimator ekf] [--per-room]
 
 In each room a robot drives the same tour with wheels, gyro and LiDAR, once for each seed. One kind of noise at a time differs from what the
 filter assumes: slip that is correlated over 0.1 s or 2 s, slip and ranges with heavy tails (Student's t, 3 degrees of freedom), noise of
 LiDAR, wheels or gyro of half and twice the assumed size. 3 are expected; errors of one drive are correlated, so that one drive is one
-sample of the band. `make benchmark` runs 12 seeds in 4 rooms; `--seeds 100 --rooms 8` takes hours.
+sample of the band. `--per-room` prints the mean NEES per degree of freedom of each room and noise instead (1 is expected), and which are
+outside of 0.5 to 2. `make benchmark` runs 12 seeds in 4 rooms; `--seeds 100 --rooms 8` takes hours.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ _STEP_S, _GYRO_STEPS = 0.002, 10
 _SETTLED_S = 2.0
 """Left out at the start of each drive: covariances are nearly zero there."""
 _BEAMS = 381
+_HONEST = 0.5, 2.0
+"""Mean NEES per degree of freedom of covariances that are neither too small nor too wide."""
 _GRAVITY = np.array([0.0, 0.0, 9.81])
 _NO_SLIP = WheelNoise(*[0.0] * 8)
 TOUR = rooms.path((1, 0, 0), (5, 0.4, 0.5), (5, 0.4, -0.5), (2, 0, 0.5), (1, 0, 0))
@@ -170,17 +173,33 @@ def table(names: Sequence[str], seeds: int, n_rooms: int, estimator: str) -> Ite
         yield f"| {name} | {mean:.2f} | {np.median(found):.2f} | {found.mean(axis=1).max():.2f} | {verdict(mean, band)} |"
 
 
+def table_per_room(names: Sequence[str], seeds: int, n_rooms: int, estimator: str) -> Iterator[str]:
+    """Lines of the table by room, as they are computed."""
+    places, means = make_rooms(n_rooms), np.empty((len(names), n_rooms))
+    yield f"| noise ({seeds} seeds) | {' | '.join(f'room {k}' for k in range(n_rooms))} | all |"
+    yield "|---" * (n_rooms + 2) + "|"
+    for i, name in enumerate(names):
+        for k, room in enumerate(places):
+            means[i, k] = np.mean([drive_nees(drive_with(room, NOISES[name], seed), estimator) for seed in range(seeds)]) / 3.0
+        yield f"| {name} | {' | '.join(f'{mean:.2f}' for mean in means[i])} | {means[i].mean():.2f} |"
+    is_outside = (means < _HONEST[0]) | (means > _HONEST[1])
+    outside = [f"{names[i]} in room {k} ({means[i, k]:.2f})" for i, k in np.argwhere(is_outside)]
+    yield f"mean {means.mean():.2f}; {len(outside)} of {means.size} outside of {_HONEST[0]} to {_HONEST[1]}: {'; '.join(outside) or 'none'}"
+
+
 def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--rooms", type=int, default=4)
     parser.add_argument("--only", default=";".join(NOISES), help="kinds of noise, separated by semicolons")
     parser.add_argument("--estimator", default="ekf", help="ekf or graph")
+    parser.add_argument("--per-room", action="store_true", help="mean NEES per degree of freedom of each room and noise")
     options = parser.parse_args(words)
     chosen = options.only.split(";")
     if unknown := [name for name in chosen if name not in NOISES]:
         parser.error(f"no noise '{unknown[0]}'; there are {', '.join(NOISES)}.")
-    for line in table(chosen, options.seeds, options.rooms, options.estimator):
+    make_table = table_per_room if options.per_room else table
+    for line in make_table(chosen, options.seeds, options.rooms, options.estimator):
         print(line, flush=True)
 
 
