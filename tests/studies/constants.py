@@ -19,6 +19,8 @@ from tests.core.test_structure import ROOT, usual_files
 
 _NO_TUNING = {"_NS", "GRAVITY", "_SQRT2", "HIDDEN", "STILL", "MOVED"}
 """Names of units, of numbers of physics, and of labels."""
+_SHAPES = {"np.zeros", "np.empty"}
+"""Calls whose numbers are shapes."""
 _NUMERIC_CALLS = {"math", "np", "max", "min", "float", "int"}
 
 
@@ -55,14 +57,15 @@ def _is_number(value: ast.expr) -> bool:
     numbers = [node.value for node in ast.walk(value) if isinstance(node, ast.Constant)]
     names = [node.id for node in ast.walk(value) if isinstance(node, ast.Name)]
     is_numeric = all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
-    return is_numeric and any(numbers) and all(name in _NUMERIC_CALLS for name in names)
+    is_shape = isinstance(value, ast.Call) and ast.unparse(value.func) in _SHAPES
+    return is_numeric and any(numbers) and not is_shape and all(name in _NUMERIC_CALLS for name in names)
 
 
 def _text(node: ast.stmt, after: ast.stmt | None, source: str) -> str:
     if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
         return str(after.value.value).splitlines()[0]
-    line = source.splitlines()[node.lineno - 1]
-    return line.partition("#")[2].strip()
+    above, line = source.splitlines()[node.lineno - 2 : node.lineno]
+    return line.partition("#")[2].strip() or (above[1:].strip() if above.startswith("#") else "")
 
 
 def main() -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from localization.events import Step
-from localization.lidar import ScanMatch
+from localization.lidar import LidarConfig, ScanMatch
 from motion_models.se2 import Cov3
 
-_MIN_OVERLAP = 0.7
-"""Share of a scan's points on the submap, from which on it fits: below it the matcher searches another pose (`LidarConfig`)."""
+_MIN_OVERLAP = LidarConfig.search_below
+"""Share of a scan's points on the submap, from which on it fits: below it the matcher searches another pose."""
 
 NOTHING_MISSED: Cov3 = np.zeros((3, 3))
 

@@ -44,7 +44,7 @@ class SweepSlip:
         off = motion - step.duration * self._twist
         is_near = math.hypot(off[0], off[1]) < _MAX_CHANGE_M and abs(off[2]) < _MAX_CHANGE_RAD
         self._goes_on = is_near and bool(match.outlier_cov.any())
-        if not sensor.sweep_s:  # all points were measured at once
+        if step.scan is None or not len(step.scan.offsets):  # all points were measured at once
             return match, match.cov
         if self._is_measured:  # else the pose at the start was not measured: its error would look like motion
             slip = motion / step.duration - step.mean_twist
