@@ -1,4 +1,4 @@
-"""What is not nominal about a scan, one policy each: a frozen scanner, a robot that was moved, a place that is still to be found."""
+"""What is not nominal about a scan, one policy each: a frozen scanner, and a robot that was moved."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import numpy as np
 
 from localization.events import Scan, Step
-from localization.lidar.lost_scans import MAX_LOST_S
 from motion_models.se2 import FloatArray
 
 _MAPPED, _UNMAPPED, _MAX_MOTION = 0.8, 0.3, 0.3
@@ -63,24 +62,3 @@ class MovedRobot:
     def cov(self, step: Step) -> FloatArray | None:
         """(3, 3) by which the pose is off besides, where the robot was moved in ``step``."""
         return MOVED_COV if self._at_ns == step.end_ns else None
-
-
-class OpenPlace:
-    """Scans that may be anywhere do not enter the submap for some seconds: drawn there, they compete with their true place."""
-
-    def __init__(self) -> None:
-        self._since_s: float | None = None
-        self.is_open = False
-        """The scan at hand was not found from a wide prior: a place is still to be found."""
-
-    def update(self, now_s: float, *, is_found: bool) -> None:
-        """Whether the scan at ``now_s`` [s] was matched, or its prior is narrow enough to place it."""
-        if is_found:
-            self._since_s = None
-        elif self._since_s is None:
-            self._since_s = now_s
-        self.is_open = self._since_s is not None and now_s - self._since_s < MAX_LOST_S
-
-    def restart(self) -> None:
-        """The submap begins anew."""
-        self._since_s, self.is_open = None, False

@@ -12,9 +12,9 @@ from localization.events import Step
 from localization.lidar.deskew import Sweep
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
-from localization.lidar.registration import is_narrow, prior_error_at_points
+from localization.lidar.registration import prior_error_at_points
 from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
-from localization.lidar.scan_policies import MovedRobot, OpenPlace, StaleScans
+from localization.lidar.scan_policies import MovedRobot, StaleScans
 from motion_models import se2
 from motion_models.robot import Mount
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, Twist2
@@ -50,8 +50,7 @@ class ScanMatchingSensor:
         self._frame = ""  # of the last scan
         self._prior, self._cov = np.zeros(3), np.eye(3)
         self._last_key: FloatArray | None = None
-        self._stale, self._place = StaleScans(), OpenPlace()
-        self.moved, self.lost = MovedRobot(), LostScans()
+        self._stale, self.moved, self.lost = StaleScans(), MovedRobot(), LostScans()
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
@@ -86,7 +85,6 @@ class ScanMatchingSensor:
         if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
             self._scan, self._matcher.is_new_place = None, False
             return None, "moved"
-        self._place.update(step.end_ns * 1e-9, is_found=found is not None or is_narrow(self._cov))
         return found, "lost" if found is None else ""
 
     def add_no_scan(self, stamp_ns: int, is_excluded: bool) -> None:
@@ -111,7 +109,7 @@ class ScanMatchingSensor:
 
     def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
-        if self._scan is None or self._place.is_open:
+        if self._scan is None:
             return False
         if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
             return True
@@ -131,7 +129,6 @@ class ScanMatchingSensor:
     def begin_submap(self) -> None:
         """Drop the submap: the next scan begins another one."""
         self._matcher, self._kiss, self._last_key = None, None, None
-        self._place.restart()
 
     def scan_points(self) -> Points2:
         """(M, 2) the scan at hand in the body frame, or (0, 2)."""

@@ -1,4 +1,4 @@
-"""A frozen scanner, a robot that was moved, a place that is still to be found."""
+"""A frozen scanner, and a robot that was moved."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from localization.events import Scan, Step
-from localization.lidar.lost_scans import MAX_LOST_S
-from localization.lidar.scan_policies import MOVED_COV, MovedRobot, OpenPlace, StaleScans
+from localization.lidar.scan_policies import MOVED_COV, MovedRobot, StaleScans
 from motion_models.base import Motion
 
 
@@ -76,14 +75,3 @@ def test_is_moved_tells_frames_apart() -> None:
     other = Scan(0, scan(1).points, frame_id="rear")
     assert not moved.is_moved(step(1), other, 0.1, is_matched=False)
     assert moved.is_moved(step(1), scan(2), 0.1, is_matched=False)
-
-
-def test_place_is_open_for_seconds_after_scans_are_found_no_more() -> None:
-    place = OpenPlace()
-    found = []
-    for seconds, is_found in ((0.0, True), (1.0, False), (MAX_LOST_S, False), (1.0 + MAX_LOST_S, False), (9.0, True), (9.1, False)):
-        place.update(seconds, is_found=is_found)
-        found.append(place.is_open)
-    assert found == [False, True, True, False, False, True]
-    place.restart()
-    assert not place.is_open

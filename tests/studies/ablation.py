@@ -1,13 +1,14 @@
 """What each mechanism of matcher, filter and graph is worth: one is switched off at a time, all else stays at its defaults.
 
-python -m tests.studies.ablation [--only NAME;...] [--seconds 300] [--minutes 10] [--cells FILE] [--write]
+python -m tests.studies.ablation [--only NAME;...] [--seconds 300] [--begin 0] [--silent A:B,...] [--minutes 10] [--cells FILE] [--write]
 
 Five drives, the first 300 s of each (`--seconds`): ACES (mean error of the relations), fr079 and MIT-CSAIL (ATE, and mean NEES, at the
 reference's instants), laps simulated by the physics of the tyres with nominal sensors, and laps over a slippery patch whose ranges are
 twice as noisy as assumed, with slip that the filter's noise model does not have (ATE, and mean NEES of the pose with 3 expected).
 Mechanisms of matcher and filter are measured by the EKF, those of the graph by its smoothed trajectory. Cells are stored in a file as
 they are computed: called again, the study goes on where it was stopped, or where `--minutes` ended. `--write` puts the table into
-`docs/lab/estimators.md`.
+`docs/lab/estimators.md`. `--begin` leaves out the first seconds of each drive, `--silent` its scans from A to B seconds after its begin:
+cells of other drives need another file.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from localization.estimators.fusion import EkfFusion
 from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
-from localization.events import Step
+from localization.events import Event, Scan, Step
 from localization.lidar import correlative_search, registration, scan_matcher
 from localization.lidar.loop_detection import LoopDetector
 from localization.lidar.scan_matcher import ScanMatcher
@@ -165,6 +166,7 @@ PATCHES: Mapping[str, Patch] = {
     "new surfaces' error of key scans": _attribute(fusion, "key_scan_transition", _without_new),
     "scale of the wheel noise": _attribute(wheel_noise, "_MAX_NOISE_SCALE", 1.0),
     "excitation gate of corrections": _attribute(Excitation, "start_step", lambda self, motion: None),
+    "radius considered while the way is open": _attribute(Excitation, "considered_by_scan", lambda self, *a: self.considered()),
     "ways by wheels alone": _attribute(OpenWay, "cov", lambda self, step: np.zeros((3, 3))),
     "moving objects left out": _attribute(MovingObjects, "apply", lambda self, step, **_: step),
     "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
@@ -199,13 +201,24 @@ def simulated(experiment: str, sensors: SensorConfig, seed: int) -> Drive:
         return Drive(list(log.events()), robot, log.mounts, truth)
 
 
-def drives(seconds: float) -> Mapping[str, Drive]:
-    """The first ``seconds`` of all five, by the heads of their columns."""
+def part_of(drive: Drive, begin_s: float, seconds: float, silent: Sequence[tuple[float, float]] = ()) -> Drive:
+    """``seconds`` of ``drive`` from ``begin_s`` on, without the scans of the ``silent`` spans after that [s]."""
+    first_ns = drive.events[0].stamp_ns + round(begin_s * 1e9)
+
+    def is_kept(event: Event) -> bool:
+        at_s = (event.stamp_ns - first_ns) * 1e-9
+        return 0.0 <= at_s <= seconds and not (isinstance(event, Scan) and any(a <= at_s < b for a, b in silent))
+
+    return replace(drive, events=[event for event in drive.events if is_kept(event)])
+
+
+def drives(seconds: float, begin_s: float = 0.0, silent: Sequence[tuple[float, float]] = ()) -> Mapping[str, Drive]:
+    """`part_of` all five, by the heads of their columns."""
     imu = ImuConfig(rate_hz=0.0)
     noisy = ScannerConfig(noise_m=0.04)  # twice `LidarConfig.range_noise_m`
     found = [BUILDINGS[name].open() for name in ("aces", "fr079", "csail")]
     found += [simulated("laps", SensorConfig(imu=imu), 0), simulated("slippery_patch", SensorConfig(imu=imu, scanner=noisy), 1)]
-    return {column: drive.until(seconds) for column, drive in zip(COLUMNS, found, strict=True)}
+    return {column: part_of(drive, begin_s, seconds, silent) for column, drive in zip(COLUMNS, found, strict=True)}
 
 
 def cell(name: str, drive: Drive, settings: Mapping[str, Any], estimator: str) -> str:
@@ -227,12 +240,14 @@ def rows(names: Sequence[str]) -> list[tuple[str, str, str]]:
     return [*(ekf if len(ekf) > 1 else []), *(graph if len(graph) > 1 else [])]
 
 
-def compute(names: Sequence[str], seconds: float, minutes: float, cells: dict[str, str], store: Callable[[], None]) -> None:
+def compute(
+    names: Sequence[str], open_drives: Callable[[], Mapping[str, Drive]], minutes: float, cells: dict[str, str], store: Callable[[], None]
+) -> None:
     """Add the missing ``cells``, by "row | column", until ``minutes`` are over; `store` is called after each."""
     end = time.monotonic() + 60.0 * minutes
     missing = [(f"{label} | {column}", mechanism, estimator) for label, mechanism, estimator in rows(names) for column in COLUMNS]
     missing = [entry for entry in missing if entry[0] not in cells]
-    logs = drives(seconds) if missing else {}
+    logs = open_drives() if missing else {}
     for key, mechanism, estimator in missing:
         if time.monotonic() > end:
             return
@@ -259,6 +274,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", default=";".join(MECHANISMS), help="mechanisms, separated by semicolons")
     parser.add_argument("--seconds", type=float, default=300.0, help="of each drive")
+    parser.add_argument("--begin", type=float, default=0.0, help="left out at the start of each drive [s]")
+    parser.add_argument("--silent", default="", help="spans without scans, as 60:90,120:150 [s]")
     parser.add_argument("--minutes", type=float, default=math.inf, help="after which no further cell is begun")
     parser.add_argument("--cells", type=Path, default=CELLS, help="file of the cells that are computed already")
     parser.add_argument("--write", action="store_true", help="write the table into the lab journal")
@@ -267,7 +284,12 @@ def main() -> None:
     if unknown := [name for name in names if name not in MECHANISMS]:
         parser.error(f"no mechanism '{unknown[0]}'; there are {', '.join(MECHANISMS)}.")
     cells = json.loads(options.cells.read_text()) if options.cells.exists() else {}
-    compute(names, options.seconds, options.minutes, cells, lambda: options.cells.write_text(json.dumps(cells, indent=1)) and None)
+    silent = [(float(a), float(b)) for a, _, b in (span.partition(":") for span in options.silent.split(",") if span)]
+
+    def open_drives() -> Mapping[str, Drive]:
+        return drives(options.seconds, options.begin, silent)
+
+    compute(names, open_drives, options.minutes, cells, lambda: options.cells.write_text(json.dumps(cells, indent=1)) and None)
     lines = table(names, cells)
     print("\n".join(lines))
     if options.write:
