@@ -123,7 +123,7 @@ def _no_symptom(fault: SensorFault) -> Any:
 class _NoCheck:
     """A check that leaves steps as they are."""
 
-    is_acting = False
+    is_acting = is_found = False
 
     def remove(self, step: Step) -> Step:
         return step
