@@ -262,7 +262,8 @@ def main(words: Sequence[str] | None = None) -> None:
     if options.tracked:
         print("\n| map | tracked [%], mean / least |\n|---|---|")
         for kind, shares in tracked.items():
-            print(f"| {kind} | {100 * np.nanmean(shares):.1f} / {100 * np.nanmin(shares):.1f} |")
+            known = 100.0 * np.array(shares)[np.isfinite(shares)]
+            print(f"| {kind} | {f'{known.mean():.1f} / {known.min():.1f}' if len(known) else '-'} |")
     if options.figure:
         draw(moments, options.figure)
 
