@@ -37,6 +37,8 @@ _MOVED = 0.02
 """Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
 _MAX_LIDAR_S = 60.0
 """Time from the wheels' first motion in which scans are used [s]; registering one takes some milliseconds."""
+_MIN_SCAN_STEP_S = 0.18
+"""From scan to scan, at least: over 0.08 s speeds are 3 % low (2.9, 3.3 and 2.0 % in three simulated drives), over 0.24 s 1.3 %."""
 _DEG_PER_RAD = 180.0 / math.pi
 _JUMP_FACTOR = 8.0
 """Increment of a position over the 97th percentile of all, from which on it is a reset or a counter that wrapped."""
@@ -326,6 +328,8 @@ def _scan_steps(source: ScanSource, first_ns: int, start_s: float) -> Iterator[F
             continue
         if at > start_s + _MAX_LIDAR_S:
             return
+        if last is not None and at - last < _MIN_SCAN_STEP_S:
+            continue
         motion = odometry.register(profile_of(scan, source.mounts.get(scan.frame_id, Mount()), config))
         if motion is not None and last is not None and motion.has_translation:
             yield np.array([last, at, motion.delta[0], motion.delta[2], motion.delta[1]])

@@ -1,8 +1,8 @@
 """Times of recording after the recorder's clock was set back: sorted by these, the later part of a drive would lie among the earlier one.
 
-A file holds its messages in the order of recording. Where the times of all topics that go on step back by over a second, what follows is
-moved to later times by that step. A file that was written topic after topic, or sorted in parts, has no topic that steps back. Chunks are
-compared by their spans, so that a step is not found that is shorter than what its chunk holds after it (some seconds).
+A file holds its messages in the order of recording. Where the times of all topics that go on step back by over a second, what follows
+is moved to later times by that step. A file that was written topic after topic, or sorted in parts, has no topic that steps back. Chunks of
+large files are compared by their spans: a step is not found there that is shorter than what its chunk holds after it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ _MIN_STEP_NS = 1_000_000_000
 _COMPARED = 200
 """Messages before and after a step in which topics are compared: 1 s of a robot's sensors."""
 _MIN_OF_TOPIC = 3
+_SMALL_BYTES = 50_000_000
+"""Of files whose chunks are all read: 0.3 s. Chunks of larger ones hold a second or less, or hours are recorded."""
 _MAX_CANDIDATES = 100
 """Steps of a chunk that are compared; more are no clock that was set, but times that mean nothing."""
 Times = Sequence[tuple[int, int]]
@@ -39,11 +41,18 @@ class SetBack:
 
 
 def find_set_backs(chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> list[SetBack]:
-    """Where the clock was set back, in order of the file; chunks that overlap with the next by over a second, and the last, are read."""
+    """Where the clock was set back, in order of the file.
+
+    Of large files only chunks are read that overlap with the next by over a second, and the last.
+    """
     ordered: list[Chunk | None] = [None, *sorted(chunks, key=lambda chunk: chunk.position), None]
+    places = [chunk.position for chunk in ordered if chunk is not None]
+    is_small = max(places, default=0) - min(places, default=0) <= _SMALL_BYTES
     found = []
     for previous, chunk, following in zip(ordered, ordered[1:], ordered[2:], strict=False):
-        if chunk is None or (following is not None and chunk.end_ns - following.start_ns <= _MIN_STEP_NS):
+        if chunk is None or (following is not None and not is_small and chunk.end_ns - following.start_ns <= _MIN_STEP_NS):
+            continue
+        if is_small and chunk.end_ns - chunk.start_ns <= _MIN_STEP_NS and (following is None or chunk.end_ns <= following.start_ns):
             continue
         before, inside, after = ([] if part is None else list(read(part)) for part in (previous, chunk, following))
         before, after = before[-_COMPARED:], after[:_COMPARED]

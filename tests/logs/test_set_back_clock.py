@@ -35,7 +35,8 @@ def write(path: Path, found: list[Record], form: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("form", "back_s"), [("mcap", 40.0), ("ros1", 40.0), ("ros1 of small chunks", 40.0), ("ros1 of small chunks", 2.5)]
+    ("form", "back_s"),
+    [("mcap", 40.0), ("mcap", 2.5), ("ros1", 40.0), ("ros1", 2.5), ("ros1 of small chunks", 40.0), ("ros1 of small chunks", 2.5)],
 )
 def test_set_back_clock_messages_keep_the_order_of_recording(tmp_path: Path, form: str, back_s: float) -> None:
     source = open_source(write(tmp_path / "log", records(back_s), form))

@@ -155,6 +155,17 @@ LEO = BaseLog("leo, laps", (ROBOTS / "leo.toml").read_text(), simulated("leo", "
 SCOUT = BaseLog("scout_2, laps", (ROBOTS / "scout_2.toml").read_text(), simulated("scout_2", "laps", 32, 20.0, 80.0))
 PIONEER = BaseLog("pioneer_3at, arcs", (ROBOTS / "pioneer_3at.toml").read_text(), simulated("pioneer_3at", "preliminary", 33, 0.0, 88.0))
 
+# of the fourth set
+STAIRS = BaseLog("fr079, 700 to 790 s", CORRIDOR.robot, real_building("fr079", "fr079.mcap", 700.0, 90.0))
+LABS = BaseLog("MIT-CSAIL, 200 to 290 s", OFFICE.robot, real_building("mit-csail", "csail.mcap", 200.0, 90.0))
+LOBBY = BaseLog("ACES, 700 to 790 s", HALL.robot, real_log("aces/aces.mcap", 700.0, 90.0))
+PATH = BaseLog("Husky outdoors, 200 to 300 s", MEADOW.robot, real_log("husky-outdoor-gps/test1.bag", 200.0, 100.0), 0.5)
+FLOORING = BaseLog("BorealTC flooring", ASPHALT.robot, boreal("FLOORING", "02", 0.0, 60.0), 0.25)
+JACKAL = BaseLog("jackal, laps", (ROBOTS / "jackal.toml").read_text(), simulated("jackal", "laps", 91, 10.0, 70.0))
+WARTHOG = BaseLog("warthog, arcs", (ROBOTS / "warthog.toml").read_text(), simulated("warthog", "preliminary", 92, 0.0, 80.0), 0.1)
+ROVER = BaseLog("rover_pro, laps", (ROBOTS / "rover_pro.toml").read_text(), simulated("rover_pro", "laps", 93, 0.0, 75.0))
+ROSBOT = BaseLog("rosbot_xl, laps", (ROBOTS / "rosbot_xl.toml").read_text(), simulated("rosbot_xl", "laps", 94, 5.0, 70.0))
+
 
 def trajectories(folder: Path) -> dict[str, Trajectory]:
     """Written trajectories by estimator."""
@@ -220,8 +231,12 @@ def based(
     words: Sequence[str] = (),
     refused: bool = False,
     robot: Callable[[str], str] = lambda text: text,
+    is_open: bool = False,
 ) -> Case:
-    """A changed base log: right where odometry and EKF are as good as with nothing wrong, and a warning has one of ``words``."""
+    """A changed base log: right where odometry and EKF are as good as with nothing wrong, and a warning has one of ``words``.
+
+    ``is_open``: two sensors contradict each other and nothing in the log decides, so that words alone are right.
+    """
 
     def judge(folder: Path) -> Found:
         log, path, _ = written(folder, base, edit, robot)
@@ -232,7 +247,7 @@ def based(
             return Found(choose_outcome(refused, is_named, True, words), f"[exit {code}] {warned or text}")
         best, found = healthy(base), trajectories(folder / "out")
         ours = {k: error_of(found[k], best.truth[k]) for k in found}
-        is_right = not refused and all(ours[k] < 1.3 * best.errors[k] + base.tolerance_m for k in ours)
+        is_right = is_open or (not refused and all(ours[k] < 1.3 * best.errors[k] + base.tolerance_m for k in ours))
         state = "[" + ", ".join(f"{k} {ours[k]:.3f} ({best.errors[k]:.3f})" for k in ours) + " m]"
         code, _ = run_command("check", str(log), "--robot", str(path), "--json", str(folder / "check.json"))
         checked = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []

@@ -105,14 +105,14 @@ CLOCKS = (
 # wheels
 
 
-def joints(change: Callable[[np.ndarray, np.ndarray], tuple[Any, Any]]) -> Edit:
+def joints(change: Callable[[np.ndarray, np.ndarray], tuple[Any, Any]], topic: str = "/joint_states") -> Edit:
     """Angles and rates changed."""
-    return changed("/joint_states", lambda m: bags.joint_state(stamp_of(m), m.name, *change(np.array(m.position), np.array(m.velocity))))
+    return changed(topic, lambda m: bags.joint_state(stamp_of(m), m.name, *change(np.array(m.position), np.array(m.velocity))))
 
 
-def renamed(*order: int) -> Edit:
+def renamed(*order: int, topic: str = "/joint_states") -> Edit:
     """Wheels under the names of others."""
-    return joints(lambda a, r: (a[list(order)], r[list(order)]))
+    return joints(lambda a, r: (a[list(order)], r[list(order)]), topic)
 
 
 def alternating(message: Any, t: float) -> Any:
