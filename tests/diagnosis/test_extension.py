@@ -37,7 +37,7 @@ _CAUSES = ("vx[v]", "vy[wz]", "wz[wz]", "vy[v*wz]", "vx[v*abs(wz)]", "wz[abs(v)*
 
 def random_term(seed: int, powers: Collection[int] = (1, 2, 3)) -> Term:
     """A product of so many ``powers`` of speed and yaw rate that a robot with equal sides may have, and that no cause has; the search has
-    products of three at most."""
+    products of four at most."""
     rng = np.random.default_rng(seed)
     while True:
         component = str(rng.choice(["vx", "vy", "wz"]))
@@ -149,24 +149,24 @@ def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> N
     assert check.replays["odometry"].after_m < check.replays["odometry"].before_m
 
 
+_SLIP = pytest.mark.xfail(strict=True, reason="vy = 0.10 v |v| wz |wz| is named lateral_slip_speed, vy = c v wz")
+
+
 @pytest.mark.extended
-@pytest.mark.parametrize("seed", range(8))
-def test_extend_writes_at_most_three_powers_and_not_to_the_harm_of_other_drives(seed: int) -> None:
-    """Products of more are many times too large on a faster drive. For 26 of 40 effects of four powers (seeds 0 to 39) a product of fewer
-    is written, which leaves 19 % of what they add to the squares of errors on other windows, at most 81 %; for the others none is."""
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=[_SLIP] if seed == 5 else []) for seed in range(8)])
+def test_extend_effect_of_four_powers_is_found_and_its_file_drives_better(seed: int) -> None:
+    """What it adds to the error of other windows falls by 70 % at least."""
     name = "pioneer_3dx"
     plain, model, hidden = load_robot(name), ROBOTS[name], random_term(seed, powers=(4,))
     real = dataclasses.replace(plain, terms={model: (hidden,)})
     table = drive_of_table("drive.csv", plain, windows([real] * 40, model, seed), "windows")
     made = make_model(model, plain)
     extended = extend(examine(table, made), table, made)
-    if extended.robot is None:
-        assert extended.extension is None or not extended.extension.is_better
-        return
-    assert max(powers_of(term) for term in extended.robot.terms[model]) <= 3
+    assert extended.robot is not None
+    assert max(powers_of(term) for term in extended.robot.terms[model]) <= 4
     fresh = windows([real] * 40, model, 1000 + seed)
-    before, after = (np.mean(errors(robot, model, fresh) ** 2) for robot in (plain, extended.robot))
-    assert after < before, (hidden, extended.robot.terms[model])
+    before, after, floor = (np.mean(errors(robot, model, fresh) ** 2) for robot in (plain, extended.robot, real))
+    assert after - floor < 0.09 * (before - floor), (hidden, extended.robot.terms[model])  # of squares: 70 % of the root mean square
 
 
 @pytest.mark.extended
