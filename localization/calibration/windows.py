@@ -55,6 +55,8 @@ class Windows:
     """Windows that were left out because wheels or reference had no data, or no valid measurement."""
     warnings: tuple[str, ...]
     """Limits of the motion reference, in sentences for the user."""
+    step_rad: float = 0.0
+    """Step of the encoders [rad]; 0 where none was seen."""
 
 
 def cut(
@@ -116,7 +118,7 @@ def cut(
         unmeasured += use(span)
     corrected = reference.correct([span for span, _ in found])
     maneuvers = _grouped([maneuver for _, maneuver in found], corrected, first_wheel_ns or 0, config.window_s * config.per_group, name)
-    return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()))
+    return Windows(tuple(maneuvers), short, unmeasured, tuple(reference.warnings()), step_rad if math.isfinite(step_rad) else 0.0)
 
 
 def _grouped(maneuvers: Sequence[Maneuver], spans: Sequence[Span], begin_ns: int, group_s: float, name: str) -> list[Maneuver]:

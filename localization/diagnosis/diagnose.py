@@ -40,7 +40,7 @@ from localization.diagnosis.linearization import (
     make_predictor,
 )
 from localization.diagnosis.model_error import COULOMB_LOG_STIFFNESS, MissingSlips, find_model_error, size_error, unmodelled_by
-from localization.diagnosis.noise import Noise, slip_sigmas, slow_turn_sigmas
+from localization.diagnosis.noise import Noise, count_sigmas, slip_sigmas, slow_turn_sigmas
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -413,11 +413,11 @@ def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> t
 
 
 def _reference_sigmas(predictor: DrivePredictor) -> FloatArray:
-    """(M, 3) noise that a drive has to have: of the motion reference, of turns by wheels so slow that the model was never measured, and of
-    contacts that are not the model's."""
+    """(M, 3) noise that a drive has to have: of the motion reference, of the encoders' counts, of turns by wheels so slow that the model
+    was never measured, and of contacts that are not the model's."""
     given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
     given[:, 2] = np.hypot(given[:, 2], slow_turn_sigmas(predictor))
-    return np.asarray(np.hypot(given, slip_sigmas(predictor)))
+    return np.asarray(np.hypot(np.hypot(given, count_sigmas(predictor)), slip_sigmas(predictor)))
 
 
 def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:

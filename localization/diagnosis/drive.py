@@ -107,6 +107,8 @@ class Drive:
     """x and y of the LiDAR in the body frame, by its mount [m]; (0, 0) where a reference measured the motion."""
     antenna: tuple[float, float] = (0.0, 0.0)
     """x and y in the body frame of the antenna, for positions without headings [m]."""
+    encoder_step_rad: float = 0.0
+    """Step of the wheels' encoders [rad]; 0 where it is not known."""
     warnings: tuple[str, ...] = ()
 
     @property
@@ -297,6 +299,7 @@ def drive_of_events(
         lidar_mount=mount if by_lidar else None,
         lidar_at=(mount.x, mount.y),
         antenna=inner.antenna if isinstance(inner, PositionMotionReference) else (0.0, 0.0),
+        encoder_step_rad=windows.step_rad,
         warnings=(left, *([_describe_gaps(imu.gyro)] if imu.gyro.gaps else []), *windows.warnings),
     )
 

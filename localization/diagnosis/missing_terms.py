@@ -48,8 +48,8 @@ _MORE = {
 }
 """Accelerations."""
 _MAX_DEGREE = 4
-"""Most powers of speed and yaw rate in a term: products of more fit a drive as well, and are many times too large on a faster one. With three,
-laws that are no product of so few keep less of their share (`tests.studies.unseen_effects`, draws 5 and 6)."""
+"""Most powers of speed and yaw rate in a term: products of more fit a drive as well, and are many times too large on a faster one. By
+three, less is removed of laws that are no product of so few (`tests.studies.unseen_effects`, draws 5 and 6)."""
 _WARMING = {"vx": ("v", "wz", "abs(v)"), "vy": ("v", "wz", "v*wz"), "wz": ("v", "wz", "abs(wz)")}
 """Motions whose share changes while tyres and gears warm up, by component."""
 _TIME_CONSTANTS = (0.125, 0.25, 0.5, 1.0)

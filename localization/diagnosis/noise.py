@@ -15,6 +15,7 @@ from localization.diagnosis.causes import STIFFNESS_EXPONENT
 from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
 from motion_models.calibration.maneuvers import Batch, IntArray
+from motion_models.robot import DIFF_DRIVE
 from motion_models.se2 import FloatArray
 
 FLAT = 1e3
@@ -121,6 +122,17 @@ def slip_sigmas(predictor: DrivePredictor) -> FloatArray:
     rates = np.sqrt(np.mean(np.square(batch.wheels), axis=1)) * g.wheel_radius_m
     ways = np.array([rates[inside] @ batch.dt[inside] for inside in batch.intervals()])
     return np.asarray(_SLIP_LEFT_SHARE * predictor.unmodelled.slip_share * ways[:, None] * np.array([1.0, 1.0, 2.0 / g.track_width_m]))
+
+
+def count_sigmas(predictor: DrivePredictor) -> FloatArray:
+    """(3,) error of a window's predicted motion by the encoders' counts [m, m, rad]: a side's angle at either end is off by up to a step.
+
+    A robot that skids turns by k = 1 / (1 + (wheelbase / track)^2) of the wheels' difference, by contacts alike in all directions.
+    """
+    g, skids = predictor.drive.robot.geometry, predictor.drive.robot.drive != DIFF_DRIVE
+    k = 1.0 / (1.0 + (g.wheelbase_m / g.track_width_m) ** 2) if skids else 1.0
+    side_m = g.wheel_radius_m * predictor.drive.encoder_step_rad * math.sqrt(2.0 / 12.0)  # of two ends, each evenly distributed in a step
+    return np.array([side_m / math.sqrt(2.0), 0.0, math.sqrt(2.0) * side_m * k / g.track_width_m])
 
 
 def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:

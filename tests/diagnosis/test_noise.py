@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from localization.diagnosis.drive_predictor import CHANNELS
-from localization.diagnosis.noise import Noise, estimate_noise, given_noise
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
+from localization.diagnosis.noise import Noise, count_sigmas, estimate_noise, given_noise
+from motion_models.registry import make_model
 from motion_models.se2 import FloatArray
+from tests.helpers.law_drives import law_drive
 
 WINDOWS, SIGMA, CREEP = 60, 3e-4, 6e-3
 YAW, FORCE = CHANNELS.index("yaw"), CHANNELS.index("force_x")
@@ -115,3 +117,15 @@ def test_estimated_noise_whitens_what_it_was_estimated_by() -> None:
         correlations.append((white[1:] * white[:-1]).mean(axis=0))
     assert np.mean(variances) == pytest.approx(1.0, abs=0.15)
     assert abs(np.mean(correlations)) < 0.05
+
+
+def test_count_sigmas_are_those_of_counted_ways() -> None:
+    """Of a Husky whose wheels roll between two of 20,000 angles, counted in steps, on a floor where k is 0.554."""
+    drive, step = replace(law_drive("husky_a200"), encoder_step_rad=0.01), 0.01
+    g = drive.robot.geometry
+    starts = np.random.default_rng(0).uniform(0.0, 1.0, (10_000, 2))
+    way = 2.0 + np.random.default_rng(1).uniform(0.0, 1.0, (10_000, 2))
+    off = (np.floor((starts + way) / step) - np.floor(starts / step)) * step - way
+    x, turn = g.wheel_radius_m * off.mean(axis=1), 0.554 * g.wheel_radius_m * (off[:, 1] - off[:, 0]) / g.track_width_m
+    found = count_sigmas(DrivePredictor(drive, make_model("friction", drive.robot), has_inertia=False))
+    assert found[[0, 2]] == pytest.approx([x.std(), turn.std()], rel=0.05)
