@@ -21,19 +21,13 @@ covariances have the same names where all leading axes are given in the docstrin
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import math
-import os
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from motion_models.compiled import subroutine
+from motion_models.gufunc import gufunc
 
 FloatArray = NDArray[np.float64]
 """Any shape; the docstring gives it."""
@@ -53,76 +47,6 @@ Triple = tuple[float, float, float]
 
 # Below this angle the closed forms lose digits to cancellation and the series is exact to double precision.
 _SMALL_ANGLE = 1e-4
-
-
-def gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
-    """A compiled function of pose-like arguments, the last of which is its result, that broadcasts over leading axes."""
-    signature = "void(" + ", ".join("float64" + "[:" + ",:" * part.count(",") + "]" for part in _parts(layout)) + ")"
-
-    def compiled(function: Callable[..., None]) -> Any:
-        with _cache_lock() as is_locked:
-            decorate: Callable[..., Any] = numba.guvectorize([signature], layout, nopython=True, cache=is_locked)  # type: ignore[no-untyped-call]
-            return decorate(function).ufunc  # numpy's own object: without numba's Python wrapper around each call
-
-    return compiled
-
-
-_MAX_LOCK_WAIT_S = 5.0
-"""A function is compiled in 0.1 to 1 s: who holds the lock longer is stopped, and may be for ever."""
-_LOCK_POLL_S = 0.02
-
-
-@contextlib.contextmanager
-def _cache_lock() -> Iterator[bool]:
-    """Whether numba's cache may be used inside: one process at a time has it.
-
-    Numba caches a gufunc in two files that name each other. Two processes that compile it at the same time leave one file of each, and
-    whoever loads these crashes. Where the lock is not to be had in time, a process compiles for itself.
-    """
-    global _MAX_LOCK_WAIT_S
-    descriptor = _open_lock()
-    if descriptor is None:  # without a place for the lock there is none for the cache
-        yield True
-        return
-    try:
-        is_locked = _lock(descriptor, _MAX_LOCK_WAIT_S)
-        if not is_locked:
-            _MAX_LOCK_WAIT_S = 0.0  # a dozen functions do not wait one after another
-        yield is_locked
-    finally:
-        os.close(descriptor)
-
-
-def _open_lock() -> int | None:
-    """The lock file, in the first of the folders of numba's cache that is writable; others cannot put files there."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    usual = [os.path.join(os.path.dirname(__file__), "__pycache__"), os.path.expanduser("~/.cache/numba")]
-    for folder in [chosen] if chosen else usual:
-        with contextlib.suppress(OSError):
-            os.makedirs(folder, exist_ok=True)
-            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-            return os.open(os.path.join(folder, ".skidloc.lock"), flags, 0o666)
-    return None
-
-
-def _lock(descriptor: int, wait_s: float) -> bool:
-    """Whether it could be locked within ``wait_s`` [s]. A file system without locks counts as locked."""
-    end = time.monotonic() + wait_s
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() >= end:
-                return False
-            time.sleep(_LOCK_POLL_S)
-        except OSError:
-            return True
-        else:
-            return True
-
-
-def _parts(layout: str) -> list[str]:
-    return [part.strip("()") for part in layout.replace("->", ",").replace("),(", ")|(").split("|")]
 
 
 @subroutine
