@@ -34,7 +34,7 @@ class FilterConfig(Settings):
     clock_walk_s_per_sqrt_s: float = 1e-4
     """Random walk of the clock offset."""
     wheel_radius_sigma: float = 0.03
-    """Prior sigma of the radius of all wheels, relative: wear, pressure and load of tyres; 0 takes the robot file's. It takes a LiDAR."""
+    """Prior sigma of the radius of all wheels, relative: wear, pressure, load of tyres; 0: the robot file's. Only a LiDAR measures it."""
     standstill_m2_per_s: float = 1e-6
     """Variance of the position while no wheel moves, per second: a push, a slope [m^2/s]."""
     standstill_rad2_per_s: float = 1e-6
@@ -53,7 +53,7 @@ class NoiseModel:
 def initial_state(noise: NoiseModel, has_lidar: bool = True) -> State:
     """State at the origin of the odometry frame: zero covariance of pose and submap, which define it, and priors of the others.
 
-    Without a LiDAR nothing measures ways, and there is no second clock until the gyro's first reading.
+    Without a LiDAR there is no second clock until the gyro's first reading.
     """
     gyro, corrections, config = noise.gyro, noise.corrections, noise.config
     one, unknown = Vector(1), np.zeros((1, 1))
@@ -65,7 +65,7 @@ def initial_state(noise: NoiseModel, has_lidar: bool = True) -> State:
         "gyro_bias": (one, unknown + gyro.bias_sigma_rad_per_s**2),
         "gyro_scale": (one, unknown + gyro.scale_sigma**2),
         "clock": (one, unknown + has_lidar * config.clock_sigma_s**2),
-        "radius": (one, unknown + has_lidar * config.wheel_radius_sigma**2),
+        "radius": (one, unknown + config.wheel_radius_sigma**2),
         "corrections": (Vector(len(corrections.names)), corrections.cov),
     }
     layout = Layout({name: group for name, (group, _) in priors.items()})

@@ -255,7 +255,7 @@ class EkfFusion(Estimator):
         state, nominal = self.state, dict(zip(self.model.param_names, self.model.nominal, strict=True))
         changes, sigmas = state["corrections"], np.sqrt(np.diagonal(state.cov("corrections")))
         radius = state.number("radius"), math.sqrt(state.variance("radius")), 0.0, self.noise.config.wheel_radius_sigma
-        found = [LearnedParameter("wheel_radius_scale", *radius)] if state.variance("radius") else []
+        found = [LearnedParameter("wheel_radius_scale", *radius)] if self._sensor is not None and state.variance("radius") else []
         for name, change, sigma, prior in zip(
             self.noise.corrections.names, changes.tolist(), sigmas.tolist(), self.noise.corrections.sigmas.tolist(), strict=True
         ):

@@ -112,7 +112,7 @@ class World:
         self.bias = rng.normal(0.0, noise.gyro.bias_sigma_rad_per_s)
         self.clock = rng.normal(0.0, belief.clock_sigma_s) if belief is not None else 0.0
         self.belief, self.scale = belief, rng.normal(0.0, noise.gyro.scale_sigma)
-        has_radius = belief is not None and has_lidar and "wheel_radius_scale" not in corrected.names
+        has_radius = belief is not None and "wheel_radius_scale" not in corrected.names
         self.radius = rng.normal(0.0, belief.wheel_radius_sigma) if has_radius else 0.0
         k = len(corrected.names)
         self.correction = rng.multivariate_normal(np.zeros(k), corrected.cov) if k else np.zeros(0)

@@ -11,9 +11,9 @@ from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.scales import SCALES_APART, ScaleCheck
 from localization.trajectory import Trajectory
-from tests.helpers.event_faults import change_wheels, scale_ranges
+from tests.helpers.event_faults import change_wheels, multiply_wheels, scale_ranges
 from tests.helpers.extended import cases
-from tests.helpers.fault_drives import in_room, run
+from tests.helpers.fault_drives import in_room, run, without_lidar
 
 PRIOR = 0.03
 
@@ -86,3 +86,11 @@ def test_wheels_of_another_radius_leave_the_pose_of_a_lidar() -> None:
     assert outcome.worst[0] < 0.05
     assert outcome.last[1] < 0.05
     assert SCALES_APART not in outcome.pipeline.checks.found
+
+
+@pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
+def test_wheels_of_another_radius_are_in_the_covariance_without_a_lidar(factor: float) -> None:
+    """Nothing measures ways there."""
+    found = run(without_lidar("husky_a200"), multiply_wheels(factor, 0.0, 2.0))
+    assert found.errors.max() > 0.1
+    assert not found.is_wrong
