@@ -102,11 +102,15 @@ def watched(transport: type[Any], times: PartTimes) -> Iterator[None]:
 
 
 class QuickTransport(LogTransport):
-    """A robot whose messages of 20 ms come at once."""
+    """A robot whose messages of 20 ms come at once; those after the first seconds wait until the node is ``started``."""
+
+    started = False
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """Those of the next 20 ms."""
-        if not self._left:
+        if self._begin is not None and not self.started:
+            time.sleep(timeout_s)
+        if not self._left or (self._begin is not None and not self.started):
             return []
         begins_ns = self._left[0].received_ns if self._begin is None else self._begin
         self._begin = begins_ns + (_TICK_NS if self._begin is not None else round(_SETTLED_S * 1e9))
@@ -148,6 +152,7 @@ def one_after_the_other(path: Path, folder: Path, times: PartTimes) -> tuple[flo
     """The same for the messages of ``path`` without a pause between them."""
     transport, run = QuickTransport(path), live_run(folder)
     node = Node.start(transport, run, print)
+    transport.started = True
     first_ns = transport.now_ns()
     times.clear()
     cpu = time.process_time()
