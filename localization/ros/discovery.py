@@ -116,6 +116,7 @@ class TopicDiscovery:
             if (
                 is_ready()
                 and now - begin > wait_s
+                and (first is None or silent)
                 and ((text := self._silence(published, silent)) != last_report or now - reported > _REPORT_PERIOD_S)
             ):
                 last_report, reported = text, now

@@ -23,6 +23,7 @@ from localization.logs import TopicOverrides, open_log
 from localization.logs.serialization import encode
 from localization.logs.writer import FusedEstimate, transform_message
 from localization.pipeline import Trial
+from localization.ros import discovery
 from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
 from localization.ros.discovery import TF
@@ -387,6 +388,22 @@ def test_discovery_of_silent_topics_reports_once_and_continues():
     named.types.pop("/scan")
     _, reports = run_node(named, topics=TopicOverrides(scan="/scan"))
     assert reports[0] == "waiting for /scan (no publisher)."
+
+
+def test_discovery_is_silent_while_topics_that_have_come_settle(monkeypatch):
+    """The first messages come in the last tenth of a second before the node would report that none do."""
+    robot, now = LogTransport(drive_log(scans_hz=6.25)), 0.0
+    take = robot.take
+
+    def late(timeout_s, batch_s=0.0):
+        nonlocal now
+        now += 0.1
+        return take(timeout_s, batch_s) if now > 1.95 else []
+
+    robot.take = late
+    monkeypatch.setattr(discovery, "time", types.SimpleNamespace(monotonic=lambda: now, sleep=time.sleep))
+    _, reports = run_node(robot, config=NodeConfig(wait_s=2.0, predict=False))
+    assert not any("no messages come" in text for text in reports)
 
 
 def test_discovery_names_topics_of_the_wanted_type():
