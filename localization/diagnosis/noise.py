@@ -223,11 +223,15 @@ def _correlation(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
 
 def reference_noise(predictor: DrivePredictor, linear: FloatArray, causes: tuple[Cause, ...]) -> Noise:
     """As the motion reference states it, and with errors of the model; of discrepancies ``linear`` (M, 6)."""
+    return given_noise(linear, np.hypot(*_claimed_sigmas(predictor, causes)), _follows(predictor))
+
+
+def _follows(predictor: DrivePredictor) -> NDArray[np.bool_]:
+    """(M,) which windows begin where the one before has ended."""
     batch, drive = predictor.batch, predictor.drive
-    follows = np.r_[False, batch.owner[1:] == batch.owner[:-1]]
     if len(drive.spans_ns):
-        follows = np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000]
-    return given_noise(linear, np.hypot(*_claimed_sigmas(predictor, causes)), follows)
+        return np.asarray(np.r_[False, drive.spans_ns[1:, 0] - drive.spans_ns[:-1, 1] < 10_000_000])
+    return np.asarray(np.r_[False, batch.owner[1:] == batch.owner[:-1]])
 
 
 def _claimed_sigmas(predictor: DrivePredictor, causes: tuple[Cause, ...]) -> tuple[FloatArray, FloatArray]:
@@ -252,7 +256,7 @@ def estimate_drive_noise(
     batch, g = predictor.batch, predictor.drive.robot.geometry
     features = variance_regressors(batch, g.wheel_radius_m, g.track_width_m)
     sigmas, creep = _claimed_sigmas(predictor, causes)
-    noise = reference_noise(predictor, linear, causes)
+    noise = given_noise(linear, np.hypot(sigmas, creep), _follows(predictor))
     scale = np.array([e.plausible for e in causes])
     known = np.isfinite(linear)
     for _ in range(3):

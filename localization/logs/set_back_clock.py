@@ -79,7 +79,7 @@ def _is_of_all(before: Times, after: Times) -> bool:
 
 
 def later_ns(set_backs: Sequence[SetBack], position: int, index: int) -> int:
-    """By how much the message ``index`` of the chunk at ``position`` was recorded later than its time says [ns]."""
+    """By how much the message ``index`` of the chunk at ``position`` was recorded later than its time of recording has it [ns]."""
     return sum(step.by_ns for step in set_backs if (step.position, step.index) <= (position, index))
 
 

@@ -109,10 +109,8 @@ class CovarianceInflation:
             A = se2.adjoint(se2.between(self._pose, before))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
-        if self._turned_about_m is not None:
-            estimate = estimate.widened(_turned_about(self._pose, self._turned_about_m))
-        if self.scale:
-            estimate = estimate.widened(_scaled_by(self._pose, self.scale))
+        if self._turned_about_m is not None or self.scale:
+            estimate = estimate.widened(self._of_path(self._pose))
         if estimate.covariance is not None and self.possible is not None:
             estimate = estimate.widened(np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
@@ -127,12 +125,9 @@ class CovarianceInflation:
         which the poses' clock may be off."""
         if self.late_s and smoothed.covariances is not None:
             smoothed = _widen_by_way(smoothed, self.late_s)
-        if self._turned_about_m is not None and smoothed.covariances is not None:
-            turned = np.array([_turned_about(se2.between(smoothed.poses[0], pose), self._turned_about_m) for pose in smoothed.poses])
-            smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + turned)
-        if self.scale and smoothed.covariances is not None:
-            scaled = np.array([_scaled_by(se2.between(smoothed.poses[0], pose), self.scale) for pose in smoothed.poses])
-            smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + scaled)
+        if (self._turned_about_m is not None or self.scale) and smoothed.covariances is not None:
+            of_path = np.array([self._of_path(se2.between(smoothed.poses[0], pose)) for pose in smoothed.poses])
+            smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + of_path)
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
@@ -140,6 +135,11 @@ class CovarianceInflation:
         for i in np.flatnonzero(smoothed.stamps_ns >= self._since_ns):
             covariances[i] += se2.rotate_covariance(world, -float(smoothed.poses[i, 2]))
         return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
+
+    def _of_path(self, pose: Pose2) -> Cov3:
+        """Covariance (3, 3) of a ``pose`` since the start by what is unsure of all of the path."""
+        scaled = _scaled_by(pose, self.scale)
+        return scaled if self._turned_about_m is None else scaled + _turned_about(pose, self._turned_about_m)
 
     @property
     def total(self) -> Cov3:

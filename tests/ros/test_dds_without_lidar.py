@@ -56,7 +56,7 @@ def drive(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def heard(drive):
+def received(drive):
     """Decoded messages that a node published, by topic, while the log's wheels and IMU were played in real time."""
     transport = DdsTransport(DOMAIN)
     source = open_source(drive)
@@ -91,8 +91,8 @@ def heard(drive):
 
 
 def _take(transport, decoders, found, seconds):
-    for received in transport.take(seconds):
-        found[received.topic].append(decoders[received.topic](received.data))
+    for message in transport.take(seconds):
+        found[message.topic].append(decoders[message.topic](message.data))
 
 
 def path_of(messages):
@@ -115,17 +115,17 @@ def unexplained(stamps, poses, twists):
 
 
 @pytest.mark.parametrize("topic", [_ODOMETRY, _PREDICTED])
-def test_published_pose_without_a_lidar_never_jumps(topic, heard):
-    stamps, poses, twists = path_of(heard[topic])
+def test_published_pose_without_a_lidar_never_jumps(topic, received):
+    stamps, poses, twists = path_of(received[topic])
     assert (np.diff(stamps) > 0.0).all()
     assert stamps[-1] - stamps[0] > 10.0
     assert np.diff(stamps).max() < 0.3
     assert (unexplained(stamps, poses, twists) < [_CONTINUOUS_M, _CONTINUOUS_RAD]).all()
 
 
-def test_transforms_without_a_lidar_are_those_of_predicted_odometry(heard):
-    transforms = {t.header.stamp.sec * S + t.header.stamp.nanosec: t.transform for m in heard[_TF] for t in m.transforms}
-    for message in heard[_PREDICTED]:
+def test_transforms_without_a_lidar_are_those_of_predicted_odometry(received):
+    transforms = {t.header.stamp.sec * S + t.header.stamp.nanosec: t.transform for m in received[_TF] for t in m.transforms}
+    for message in received[_PREDICTED]:
         at = transforms[message.header.stamp.sec * S + message.header.stamp.nanosec]
         assert (at.translation.x, at.translation.y) == (message.pose.pose.position.x, message.pose.pose.position.y)
         assert at.rotation.z == message.pose.pose.orientation.z

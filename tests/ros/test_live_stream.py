@@ -366,18 +366,22 @@ def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     assert "resumed from" in run_node(again, estimator, Files(state=tmp_path / "state"))[1][-1]
 
 
+def silent_at_first(robot: LogTransport, polls: int) -> list[int]:
+    """Let ``robot`` send nothing when it is asked for the first ``polls`` times; returns how often it was asked."""
+    asked, take = [0], robot.take
+
+    def late(timeout_s, batch_s=0.0):
+        asked[0] += 1
+        return take(timeout_s, batch_s) if asked[0] > polls else []
+
+    robot.take = late
+    return asked
+
+
 @pytest.mark.extended
 def test_discovery_of_silent_topics_reports_once_and_continues():
     quiet = LogTransport(drive_log(scans_hz=6.25))
-    polls = 0
-    take = quiet.take
-
-    def late(timeout_s, batch_s=0.0):
-        nonlocal polls
-        polls += 1
-        return take(timeout_s, batch_s) if polls > 3 else []
-
-    quiet.take = late
+    silent_at_first(quiet, 3)
     quiet.types = {}
     _, reports = run_node(quiet)
     assert "no messages come on /joint_states (sensor_msgs/JointState)" in reports[0]
@@ -392,16 +396,9 @@ def test_discovery_of_silent_topics_reports_once_and_continues():
 
 def test_discovery_is_silent_while_topics_that_have_come_settle(monkeypatch):
     """The first messages come in the last tenth of a second before the node would report that none do."""
-    robot, now = LogTransport(drive_log(scans_hz=6.25)), 0.0
-    take = robot.take
-
-    def late(timeout_s, batch_s=0.0):
-        nonlocal now
-        now += 0.1
-        return take(timeout_s, batch_s) if now > 1.95 else []
-
-    robot.take = late
-    monkeypatch.setattr(discovery, "time", types.SimpleNamespace(monotonic=lambda: now, sleep=time.sleep))
+    robot = LogTransport(drive_log(scans_hz=6.25))
+    polls = silent_at_first(robot, 19)
+    monkeypatch.setattr(discovery, "time", types.SimpleNamespace(monotonic=lambda: 0.1 * polls[0], sleep=time.sleep))
     _, reports = run_node(robot, config=NodeConfig(wait_s=2.0, predict=False))
     assert not any("no messages come" in text for text in reports)
 

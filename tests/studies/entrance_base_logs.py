@@ -22,7 +22,7 @@ from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 from tests.helpers.entrance_drives import with_times
-from tests.studies.entrance_commands import Case, Edit, replayed, run_command, warnings_in
+from tests.studies.entrance_commands import Case, Edit, judge_scores, replayed, run_command, warnings_in
 from tests.studies.entrances import Found, choose_outcome
 
 DATA, ROBOTS = Path("tests/data"), Path("motion_models/robots")
@@ -279,18 +279,11 @@ def referred(
         path, best = folder / f"reference.{suffix}", healthy(base)
         path.write_text(content(best.reference))
         code, text = replayed(folder, log, robot, "--reference", reference or str(path), "--json", str(folder / "m.json"))
-        flat = " ".join(text.split())
-        if words:
-            is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
-            is_warned = bool(code) or "reference" in warnings_in(text) or "until that" in flat.lower()
-            return Found(choose_outcome(True, is_named and not is_judged, is_warned, words), f"[exit {code}] {text}")
-        if code:
-            return Found("misnamed", f"[exit {code}] {text}")
-        found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
-        own = error_of(best.truth["ekf"], best.reference)
-        wanted = {"ekf": best.errors["ekf"] or own, **({} if base.load()[1] is None else {"odometry": best.errors["odometry"]})}
-        is_right = all(abs(found[k] - wanted[k]) < 0.3 * wanted[k] + 0.03 + noise_m for k in wanted)
-        has_doubt, warned = "Until that" in text, warnings_in(text)
-        return Found(choose_outcome(is_right, not has_doubt, has_doubt or bool(warned), words), f"[{found}, {wanted}] {warned}")
+
+        def wanted() -> dict[str, float]:
+            own = error_of(best.truth["ekf"], best.reference)
+            return {"ekf": best.errors["ekf"] or own, **({} if base.load()[1] is None else {"odometry": best.errors["odometry"]})}
+
+        return judge_scores(code, text, folder / "m.json", words, wanted, noise_m)
 
     return Case("references", name, judge)

@@ -136,6 +136,24 @@ def driven(
     return Case(kind, name, judge)
 
 
+def judge_scores(
+    code: int, text: str, scores: Path, words: Sequence[str], healthy: Callable[[], dict[str, float]], noise_m: float
+) -> Found:
+    """Of a replay with a reference that ended with ``code``: all of ``words`` and no verdict, where there are some; else the errors in the
+    file ``scores`` are those of the ``healthy`` drive [m], but for the reference's noise."""
+    flat = " ".join(text.split())
+    if words:
+        is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
+        is_warned = bool(code) or "reference" in warnings_in(text) or "until that" in flat.lower()
+        return Found(choose_outcome(True, is_named and not is_judged, is_warned, words), f"[exit {code}] {text}")
+    if code:
+        return Found("misnamed", f"[exit {code}] {text}")
+    found, best = {r["estimator"]: r["ate_rmse_m"] for r in json.loads(scores.read_text())["results"]}, healthy()
+    is_right = all(abs(found[k] - best[k]) < 0.3 * best[k] + 0.03 + noise_m for k in best)
+    has_doubt, warned = "Until that" in text, warnings_in(text)
+    return Found(choose_outcome(is_right, not has_doubt, has_doubt or bool(warned), words), f"[{found}, {best}] {warned}")
+
+
 def scored(
     name: str, vehicle: Vehicle, content: Callable[[Motion], str], suffix: str = "tum", words: Sequence[str] = (), noise: float = 0.0
 ) -> Case:
@@ -146,18 +164,9 @@ def scored(
         path = folder / f"reference.{suffix}"
         path.write_text(content(motion))
         code, text = replayed(folder, log, robot, "--reference", str(path), "--json", str(folder / "m.json"))
-        flat = " ".join(text.split())
-        if words:
-            is_named, is_judged = all(word in flat for word in words), "covariances are" in flat or "is best" in flat
-            is_warned = bool(code) or "reference" in warnings_in(text) or "until that" in flat.lower()
-            return Found(choose_outcome(True, is_named and not is_judged, is_warned, words), f"[exit {code}] {text}")
-        if code:
-            return Found("misnamed", f"[exit {code}] {text}")
-        found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
-        best = dict(zip(("odometry", "ekf"), healthy_errors(vehicle), strict=True))
-        is_right = all(abs(found[k] - best[k]) < 0.3 * best[k] + 0.03 + noise for k in best)
-        has_doubt, warned = "Until that" in text, warnings_in(text)
-        return Found(choose_outcome(is_right, not has_doubt, has_doubt or bool(warned), words), f"[{found}, {best}] {warned}")
+        return judge_scores(
+            code, text, folder / "m.json", words, lambda: dict(zip(("odometry", "ekf"), healthy_errors(vehicle), strict=True)), noise
+        )
 
     return Case("references", name, judge)
 
