@@ -1,8 +1,9 @@
 """Times of recording after the recorder's clock was set back: sorted by these, the later part of a drive would lie among the earlier one.
 
-A file holds its messages in the order of recording. Where the times of all topics that go on step back by over a second, what follows
-is moved to later times by that step. A file that was written topic after topic, or sorted in parts, has no topic that steps back. Chunks of
-large files are compared by their spans: a step is not found there that is shorter than what its chunk holds after it.
+A file holds its messages in the order of recording, a .db3 file as rows by number. Where the times of all topics that go on step back by
+over a second, what follows is moved to later times by that step. A file that was written topic after topic, or sorted in parts, has no
+topic that steps back. Chunks of large files are compared by their spans: a step is not found there that is shorter than what its chunk
+holds after it.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ from dataclasses import dataclass, replace
 
 from localization.logs.chunks import Chunk
 
-_MIN_STEP_NS = 1_000_000_000
+MIN_STEP_NS = 1_000_000_000
 """Multi-threaded recorders store messages by fractions of a second out of order."""
-_COMPARED = 200
+COMPARED = 200
 """Messages before and after a step in which topics are compared: 1 s of a robot's sensors."""
 _MIN_OF_TOPIC = 3
 _SMALL_BYTES = 50_000_000
 """Of files whose chunks are all read: 0.3 s. Chunks of larger ones hold a second or less, or hours are recorded."""
-_MAX_CANDIDATES = 100
+MAX_CANDIDATES = 100
 """Steps of a chunk that are compared; more are no clock that was set, but times that mean nothing."""
 Times = Sequence[tuple[int, int]]
 """Number of the topic and time of recording [ns] of the messages of a chunk, in order of the file."""
@@ -50,22 +51,22 @@ def find_set_backs(chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> l
     is_small = max(places, default=0) - min(places, default=0) <= _SMALL_BYTES
     found = []
     for previous, chunk, following in zip(ordered, ordered[1:], ordered[2:], strict=False):
-        if chunk is None or (following is not None and not is_small and chunk.end_ns - following.start_ns <= _MIN_STEP_NS):
+        if chunk is None or (following is not None and not is_small and chunk.end_ns - following.start_ns <= MIN_STEP_NS):
             continue
-        if is_small and chunk.end_ns - chunk.start_ns <= _MIN_STEP_NS and (following is None or chunk.end_ns <= following.start_ns):
+        if is_small and chunk.end_ns - chunk.start_ns <= MIN_STEP_NS and (following is None or chunk.end_ns <= following.start_ns):
             continue
         before, inside, after = ([] if part is None else list(read(part)) for part in (previous, chunk, following))
-        before, after = before[-_COMPARED:], after[:_COMPARED]
+        before, after = before[-COMPARED:], after[:COMPARED]
         times, first, last = [*before, *inside, *after], max(len(before), 1), len(before) + len(inside)
-        steps = [k for k in range(first, min(last + 1, len(times))) if times[k - 1][1] - times[k][1] > _MIN_STEP_NS]
-        for k in steps[:_MAX_CANDIDATES]:
-            if _is_of_all(times[max(k - _COMPARED, 0) : k], times[k : k + _COMPARED]):
+        steps = [k for k in range(first, min(last + 1, len(times))) if times[k - 1][1] - times[k][1] > MIN_STEP_NS]
+        for k in steps[:MAX_CANDIDATES]:
+            if is_of_all(times[max(k - COMPARED, 0) : k], times[k : k + COMPARED]):
                 position, index = (chunk.position, k - len(before)) if k < last or following is None else (following.position, 0)
                 found.append(SetBack(position, index, times[k - 1][1], times[k - 1][1] - times[k][1]))
     return list({(step.position, step.index): step for step in found}.values())
 
 
-def _is_of_all(before: Times, after: Times) -> bool:
+def is_of_all(before: Times, after: Times) -> bool:
     """Whether all topics that come before and after a step are stepping back."""
     parts: list[dict[int, list[int]]] = []
     for times in (before, after):
@@ -75,7 +76,7 @@ def _is_of_all(before: Times, after: Times) -> bool:
         parts.append({topic: stamps for topic, stamps in by_topic.items() if len(stamps) >= _MIN_OF_TOPIC})
     both = parts[0].keys() & parts[1].keys()
     last, first = ({t: statistics.median(part[t][cut]) for t in both} for part, cut in zip(parts, (slice(-3, None), slice(3)), strict=True))
-    return bool(both) and all(first[topic] < last[topic] - _MIN_STEP_NS / 2 for topic in both)
+    return bool(both) and all(first[topic] < last[topic] - MIN_STEP_NS / 2 for topic in both)
 
 
 def later_ns(set_backs: Sequence[SetBack], position: int, index: int) -> int:

@@ -7,6 +7,8 @@ A database can hold code (views, computed columns); only plain tables are read, 
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator
@@ -19,10 +21,12 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from localization.errors import LogError
 from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, Channel, DamagedError, RawMessage, decompress_message
+from localization.logs.set_back_clock import COMPARED, MAX_CANDIDATES, MIN_STEP_NS, SetBack, describe_set_backs, is_of_all, later_ns
 
 MAGIC = b"SQLite format 3\x00"
 
 _TABLE_LEAF = 13
+_MAX_ROW = 2**63 - 1
 _MAX_TOPICS = 100_000  # robots have tens to hundreds
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 _ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the latter where SQLite's message quotes a damaged name
@@ -67,6 +71,38 @@ def _describe(database: sqlite3.Connection) -> tuple[dict[int, tuple[str, str]],
     return topics, definitions
 
 
+def _find_set_backs(database: sqlite3.Connection) -> list[SetBack]:
+    """Where the recorder's clock was set back; rows are in the order of recording."""
+    steps = (
+        "SELECT at, before, timestamp FROM (SELECT rowid AS at, timestamp, lag(timestamp) OVER (ORDER BY rowid) AS before FROM messages)"
+        " WHERE before - timestamp > ? LIMIT ?"
+    )
+    before = "SELECT topic_id, timestamp FROM messages WHERE rowid < ? ORDER BY rowid DESC LIMIT ?"
+    after = "SELECT topic_id, timestamp FROM messages WHERE rowid >= ? ORDER BY rowid LIMIT ?"
+    found = []
+    for at, last_ns, next_ns in database.execute(steps, (MIN_STEP_NS, MAX_CANDIDATES)).fetchall():
+        rows = [database.execute(query, (at, COMPARED)).fetchall() for query in (before, after)]
+        parts = [[(topic, log_ns) for topic, log_ns in part if isinstance(log_ns, int)] for part in rows]
+        if is_of_all(parts[0][::-1], parts[1]):
+            found.append(SetBack(0, at, last_ns, last_ns - next_ns))
+    return found
+
+
+def _span(database: sqlite3.Connection, first: int, last: int, later: int) -> tuple[int, int] | None:
+    """First and last time of recording [ns] of a part; None without any."""
+    query = "SELECT min(timestamp), max(timestamp) FROM messages WHERE rowid BETWEEN ? AND ?"
+    begin, end = database.execute(query, (first, last)).fetchone()
+    return (begin + later, end + later) if isinstance(begin, int) and isinstance(end, int) else None
+
+
+def _rows_of(database: sqlite3.Connection, topics: Collection[int], first: int, last: int, later: int) -> Iterator[Row]:
+    """Rows of a part of these ``topics`` in order of the time of recording."""
+    query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, topics))})"
+    for key, stamp, data in database.execute(f"{query} AND +rowid BETWEEN ? AND ? ORDER BY timestamp", (first, last)):
+        if isinstance(stamp, int) and isinstance(data, bytes):
+            yield key, stamp + later, data
+
+
 def _channels(topics: dict[int, tuple[str, str]], definitions: dict[str, MessageDefinition], counts: Counter[int]) -> list[Channel]:
     return [Channel(name, kind, definitions.get(kind, _NO_DEFINITION), counts[key]) for key, (name, kind) in topics.items()]
 
@@ -82,13 +118,14 @@ class SqliteFile:
             with closing(_connect(path)) as database:
                 self._topics, definitions = _describe(database)
                 count = database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall()
-                span = database.execute("SELECT min(timestamp), max(timestamp) FROM messages").fetchone()
+                self._set_backs = _find_set_backs(database)
+                spans = [span for part in self._parts() if (span := _span(database, *part)) is not None]
         except _ERRORS as error:
             raise DamagedError(_reason(error)) from error
         self._counts = Counter({key: n for key, n in count if key in self._topics})
         self.channels = _channels(self._topics, definitions, self._counts)
-        self.start_ns, self.end_ns = (int(stamp) if isinstance(stamp, int) else 0 for stamp in span)
-        self.warnings: list[str] = []
+        self.start_ns, self.end_ns = min((begin for begin, _ in spans), default=0), max((end for _, end in spans), default=0)
+        self.warnings: list[str] = describe_set_backs(self._set_backs, self.start_ns)
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
             self.warnings.append(
@@ -101,12 +138,10 @@ class SqliteFile:
         """The messages of these topics in order of log time."""
         wanted = {key: topic for key, topic in self._topics.items() if topic[0] in topics}
         last, found = self.start_ns - 1, 0
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, wanted))}) ORDER BY timestamp"
         with closing(_connect(self._path)) as database:
-            rows: Iterator[Row] | None = None
+            rows = heapq.merge(*(_rows_of(database, wanted, *part) for part in self._parts()), key=lambda row: row[1])
             while True:
                 try:
-                    rows = database.execute(query) if rows is None else rows
                     key, stamp, data = next(rows)
                 except StopIteration:
                     self._compare(found, sum(self._counts[key] for key in wanted))
@@ -114,14 +149,17 @@ class SqliteFile:
                 except _ERRORS as error:
                     reason = _reason(error)
                     break
-                found += 1
-                if isinstance(stamp, int) and isinstance(data, bytes):
-                    last = stamp
-                    yield RawMessage(stamp, *wanted[key], decompress_message(data))
+                found, last = found + 1, stamp
+                yield RawMessage(stamp, *wanted[key], decompress_message(data))
         if self._rest is None:
             self._rest = RecoveredSqlite(self._path, reason)
             self.warnings += self._rest.warnings
         yield from (message for message in self._rest.messages(topics) if message.log_ns > last)
+
+    def _parts(self) -> list[tuple[int, int, int]]:
+        """First and last row, and by how much later it was recorded [ns], of each part between steps of the recorder's clock."""
+        edges = [-_MAX_ROW, *(step.index for step in self._set_backs), _MAX_ROW]
+        return [(first, end - 1, later_ns(self._set_backs, 0, first)) for first, end in itertools.pairwise(edges)]
 
     def _compare(self, found: int, listed: int) -> None:
         note = f"{self._path.name} is damaged: {found} of {listed} messages of the topics in use could be read."

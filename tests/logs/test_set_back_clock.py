@@ -29,6 +29,8 @@ def records(back_s: float, step: Any = lambda topic, t: 0.0) -> list[Record]:
 
 
 def write(path: Path, found: list[Record], form: str) -> Path:
+    if form == "sqlite3":
+        return bags.write_ros2_bag(path, found, form)
     if form == "mcap":
         return bags.write_mcap(path.with_suffix(".mcap"), found)
     return bags.write_ros1_bag(path.with_suffix(".bag"), found, chunk_bytes=None if form == "ros1" else 8000)
@@ -36,7 +38,16 @@ def write(path: Path, found: list[Record], form: str) -> Path:
 
 @pytest.mark.parametrize(
     ("form", "back_s"),
-    [("mcap", 40.0), ("mcap", 2.5), ("ros1", 40.0), ("ros1", 2.5), ("ros1 of small chunks", 40.0), ("ros1 of small chunks", 2.5)],
+    [
+        ("sqlite3", 40.0),
+        ("sqlite3", 2.5),
+        ("mcap", 40.0),
+        ("mcap", 2.5),
+        ("ros1", 40.0),
+        ("ros1", 2.5),
+        ("ros1 of small chunks", 40.0),
+        ("ros1 of small chunks", 2.5),
+    ],
 )
 def test_set_back_clock_messages_keep_the_order_of_recording(tmp_path: Path, form: str, back_s: float) -> None:
     source = open_source(write(tmp_path / "log", records(back_s), form))
@@ -57,9 +68,10 @@ def test_set_back_clock_file_of_topic_after_topic_is_left_as_it_is(tmp_path: Pat
     assert times == sorted(record[2] for record in found)
 
 
-def test_set_back_clock_single_message_of_a_wrong_time_is_no_step(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", ["mcap", "sqlite3"])
+def test_set_back_clock_single_message_of_a_wrong_time_is_no_step(tmp_path: Path, form: str) -> None:
     found = records(0.0)
     topic, message, log = found[2000]
     found[2000] = topic, message, log - 20 * S
-    source = open_source(write(tmp_path / "log", found, "mcap"))
+    source = open_source(write(tmp_path / "log", found, form))
     assert source.warnings == []
