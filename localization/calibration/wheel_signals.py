@@ -31,6 +31,12 @@ STEP_S = 0.5
 """Length of an interval [s]: latencies of drivers (up to 0.1 s) are small against it."""
 _MAX_MOVING_S, _MAX_READ_S = 120.0, 900.0
 """Time after the wheels' first motion, and in all, that is read [s]."""
+_MIN_COMPARED = 12
+"""Intervals: six seconds."""
+MIN_TURN_RAD_S = 0.03
+"""Root mean square of turns that are compared."""
+MAX_BIAS_RAD_S = 0.05
+"""Of a gyro, at rest."""
 _MIN_SCAN_INTERVALS = 12
 """With a motion from scan to scan; fewer are of scans that do not match."""
 _MOVED = 0.02
@@ -292,6 +298,20 @@ def bias_at_rest(wheels: FloatArray, other: FloatArray, largest: float) -> float
     return min(max(bias, -largest), largest)
 
 
+def correlation(a: FloatArray, b: FloatArray, least: float, max_bias: float) -> float | None:
+    """Correlation about zero of two rates (n,), up to a bias of ``b``; None where ``b``'s root mean square is below ``least``, or with too
+    few values."""
+    both = np.isfinite(a) & np.isfinite(b)
+    if both.sum() < _MIN_COMPARED:
+        return None
+    a, b = a[both], b[both]
+    b = b - bias_at_rest(a, b, max_bias)
+    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
+    if size_b < least * math.sqrt(len(b)) or size_a == 0.0:
+        return None
+    return float(a @ b) / (size_a * size_b)
+
+
 class ScanSource(Protocol):
     """A log, or what a live LiDAR has measured so far."""
 
@@ -317,6 +337,14 @@ def lidar_motion(source: ScanSource, signals: WheelSignals) -> LidarMotion | Non
     if np.isfinite(rates[:, 0]).sum() < _MIN_SCAN_INTERVALS:
         return None
     return LidarMotion(rates[:, 0], rates[:, 1], rates[:, 2])
+
+
+def with_lidar(source: ScanSource, signals: WheelSignals) -> WheelSignals:
+    """``signals`` with the motion by scans, where there are any."""
+    motion = lidar_motion(source, signals)
+    if motion is None:
+        return signals
+    return replace(signals, speeds={**signals.speeds, "LiDAR": motion.speed}, turns={**signals.turns, "LiDAR": motion.turn})
 
 
 def _scan_steps(source: ScanSource, first_ns: int, start_s: float) -> Iterator[FloatArray]:

@@ -11,12 +11,23 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from localization.calibration.wheel_signals import STEP_S, WheelSignals, bias_at_rest, lidar_motion, read_signals
+from localization.calibration.recorded_clocks import find_recorded_clock
+from localization.calibration.wheel_signals import (
+    MAX_BIAS_RAD_S,
+    MIN_TURN_RAD_S,
+    STEP_S,
+    WheelSignals,
+    correlation,
+    lidar_motion,
+    read_signals,
+    with_lidar,
+)
 from localization.calibration.wheel_units import (
     CORRECTED,
     UnitReport,
@@ -37,13 +48,10 @@ _MIN_CORRELATION = 0.6
 """Correlation above which a source does not contradict the robot file, as in the sensor checks: no window of healthy logs is below."""
 _SURE_CORRELATION = 0.9
 """What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
-_MIN_TURN_RAD_S, _MIN_SPEED_M_S = 0.03, 0.02
-"""Root mean square of motions that are compared."""
-_MIN_INTERVALS = 12
-"""Six seconds."""
+_MIN_SPEED_M_S = 0.02
+"""Root mean square of speeds that are compared."""
 _MIN_CLOCK_INTERVALS = 60
 """Half a minute, of which offsets of up to a third are searched in a live drive."""
-_MAX_BIAS_RAD_S = 0.05
 _UNKNOWN_YAW_RAD2_PER_RAD, _UNKNOWN_WAY_M2_PER_M = 4.0 * math.pi, 40.0
 """Variance per radian turned and metre driven with an unknown sign: a heading of one radian, and a way of ten metres, may be the opposite
 (4 x^2)."""
@@ -134,6 +142,10 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     signals = read_signals(log)
     if signals is None:
         return WiringReport(log.robot)
+    clock = None if is_clock_known else find_recorded_clock(log, signals, partial(_turn_by_wheels, log))
+    if clock is not None:
+        found = WiringReport(clock.robot, (clock.text,), clock.keys)
+        return _joined(found, check_wiring(open_log(log.path, clock.robot, log.overrides), is_clock_known=True))
     if not signals.joints:
         return _check_odometry(log, signals, is_clock_known)
     signals, found = _wiring_of(log, signals, is_clock_known)
@@ -198,7 +210,7 @@ def _other_clock(log: Log | LiveSensors, signals: WheelSignals, offset_s: float)
     signals = with_lidar(log, signals)
     by_lidar = None
     if "LiDAR" in signals.turns:
-        by_lidar = correlation(signals.turns["gyro"], signals.turns["LiDAR"], _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+        by_lidar = correlation(signals.turns["gyro"], signals.turns["LiDAR"], MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
     is_wheels = by_lidar is not None and abs(by_lidar) >= _SURE_CORRELATION
     name, clock = ("wheel_time_offset_s" if is_wheels else "gyro_time_offset_s"), log.robot.clock
     value = round(getattr(clock, name) + (-offset_s if is_wheels else offset_s), 2)
@@ -220,7 +232,7 @@ def clock_offset(turn: FloatArray, other: FloatArray | None) -> float | None:
     """
     if other is None:
         return None
-    at_zero = correlation(turn, other, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    at_zero = correlation(turn, other, MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
     if at_zero is None or abs(at_zero) >= _MAX_UNSHIFTED:
         return None
     shifts = np.arange(-round(_MAX_CLOCK_S / STEP_S), round(_MAX_CLOCK_S / STEP_S) + 1)
@@ -241,7 +253,7 @@ def _correlation_shifted(turn: FloatArray, other: FloatArray, shift: int) -> flo
     if n < len(turn) // 2:
         return 0.0
     ours, theirs = (turn[:n], other[shift:]) if shift >= 0 else (turn[-shift:], other[:n])
-    return correlation(ours, theirs, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S) or 0.0
+    return correlation(ours, theirs, MIN_TURN_RAD_S, MAX_BIAS_RAD_S) or 0.0
 
 
 def _with_unknown_signs(robot: Robot) -> Robot:
@@ -340,7 +352,7 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     gyro, turn = signals.turns.get("gyro"), signals.turns.get(topic)
     if gyro is None or turn is None or not signals.is_gyro_upright:
         return WiringReport(log.robot)
-    r = correlation(turn, gyro, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    r = correlation(turn, gyro, MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
     if r is None:
         return WiringReport(log.robot)
     offset_s = None if is_clock_known else clock_offset(turn, gyro)
@@ -350,7 +362,7 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     if r > -_SURE_CORRELATION:
         return _check_multiplier(log, float(np.nansum(turn * gyro) / max(np.nansum(turn**2), 1e-12)), measured)
     signals = with_lidar(log, signals)
-    third = None if "LiDAR" not in signals.turns else correlation(turn, signals.turns["LiDAR"], _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+    third = None if "LiDAR" not in signals.turns else correlation(turn, signals.turns["LiDAR"], MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
     if third is None or abs(third) < _SURE_CORRELATION:
         ways = [f"left and right are swapped in the driver of {topic}", "the gyro's sign is reversed (an IMU upside down)"]
         return _ambiguous(log, ways, measured)
@@ -385,12 +397,11 @@ def _check_multiplier(log: Log | LiveSensors, ratio: float, measured: Mapping[st
     return WiringReport(robot, (text,), {"driver.wheel_separation_multiplier": f"{value:g}"}, correlations=measured, ratios=ratios)
 
 
-def with_lidar(log: Log | LiveSensors, signals: WheelSignals) -> WheelSignals:
-    """``signals`` with the motion by scans, where there are any."""
-    motion = lidar_motion(log, signals)
-    if motion is None:
-        return signals
-    return replace(signals, speeds={**signals.speeds, "LiDAR": motion.speed}, turns={**signals.turns, "LiDAR": motion.turn})
+def _turn_by_wheels(log: Log, signals: WheelSignals) -> FloatArray:
+    """Right less left (n,) [rad/s], or the turn of a driver's odometry."""
+    if signals.joints:
+        return _signed(signals.joint_rates, Wiring(tuple(range(signals.left)), tuple(range(signals.left, len(signals.joints)))))[1]
+    return signals.turns[log.sources.all_wheels[0].topic]
 
 
 def _signed(rates: FloatArray, wiring: Wiring) -> tuple[FloatArray, FloatArray]:
@@ -401,27 +412,13 @@ def _signed(rates: FloatArray, wiring: Wiring) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (left + right), right - left
 
 
-def correlation(a: FloatArray, b: FloatArray, least: float, max_bias: float) -> float | None:
-    """Correlation about zero of two rates (n,), up to a bias of ``b``; None where ``b``'s root mean square is below ``least``, or with too
-    few values."""
-    both = np.isfinite(a) & np.isfinite(b)
-    if both.sum() < _MIN_INTERVALS:
-        return None
-    a, b = a[both], b[both]
-    b = b - bias_at_rest(a, b, max_bias)
-    size_a, size_b = math.sqrt(float(a @ a)), math.sqrt(float(b @ b))
-    if size_b < least * math.sqrt(len(b)) or size_a == 0.0:
-        return None
-    return float(a @ b) / (size_a * size_b)
-
-
 def correlations(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> dict[str, float]:
     """Correlations of speed and yaw rate by the wheels with each source that moves enough."""
     mean, difference = _signed(rates, wiring)
     found: dict[str, float] = {}
     for name, turn in signals.turns.items():
         sign = wiring.gyro if name == "gyro" else wiring.lidar[1] if name == "LiDAR" else 1.0
-        r = correlation(difference, sign * turn, _MIN_TURN_RAD_S, _MAX_BIAS_RAD_S)
+        r = correlation(difference, sign * turn, MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
         if r is not None:
             found[f"turn by {_source(name)}"] = abs(r) if name == "gyro" and not signals.is_gyro_upright else r
     for name, speed in signals.speeds.items():

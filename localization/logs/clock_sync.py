@@ -220,16 +220,7 @@ class TopicClock:
 
         None where they lie on no line.
         """
-        if len(self._least_latency) < _MIN_RATE_WINDOWS:
-            return None
-        t = np.array([*self._least_latency], dtype=float) * _RATE_WINDOW_NS * 1e-9
-        offsets = np.array([*self._least_latency.values()], dtype=float) * 1e-9
-        t, offsets = t - t[0], offsets - offsets[0]
-        line = np.polynomial.Polynomial.fit(t, offsets, 1).convert()
-        rate = float(line.coef[1]) if len(line.coef) > 1 else 0.0
-        drift = rate * float(t[-1])
-        is_straight = float(np.abs(offsets - line(t)).max()) <= max(_LINEAR * abs(drift), 0.02)
-        return (rate, drift) if is_straight else None
+        return drift_of(self._least_latency)
 
     @property
     def accepted(self) -> int:
@@ -325,6 +316,42 @@ class TopicClock:
         self.offset_ns = self._min_latency_offset_ns = offset + self._shift
 
 
+def drift_of(least_latency: Mapping[int, int]) -> tuple[float, float] | None:
+    """`TopicClock.drift` by the greatest offsets [ns] of windows of the time of recording, by their number."""
+    if len(least_latency) < _MIN_RATE_WINDOWS:
+        return None
+    t = np.array([*least_latency], dtype=float) * _RATE_WINDOW_NS * 1e-9
+    offsets = np.array([*least_latency.values()], dtype=float) * 1e-9
+    t, offsets = t - t[0], offsets - offsets[0]
+    line = np.polynomial.Polynomial.fit(t, offsets, 1).convert()
+    rate = float(line.coef[1]) if len(line.coef) > 1 else 0.0
+    drift = rate * float(t[-1])
+    is_straight = float(np.abs(offsets - line(t)).max()) <= max(_LINEAR * abs(drift), 0.02)
+    return (rate, drift) if is_straight else None
+
+
+def odd_rates(offsets: Iterable[tuple[str, int, int]]) -> dict[str, float]:
+    """Rate of the stamps of each topic less that of the times of recording [s/s], where it is another than those of the other topics.
+
+    ``offsets``: topic, time of recording and stamp less that [ns], of messages in order of recording.
+    """
+    least: dict[str, dict[int, int]] = {}
+    for topic, log_ns, offset_ns in offsets:
+        windows, window = least.setdefault(topic, {}), log_ns // _RATE_WINDOW_NS
+        windows[window] = max(windows.get(window, offset_ns), offset_ns)
+    return _odd_of({topic: found for topic, windows in least.items() if (found := drift_of(windows)) is not None})
+
+
+def _odd_of(drifts: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Rates of the topics that drift, and whose rate no other topic's comes near."""
+    found = {}
+    for topic, (rate, drift) in drifts.items():
+        others = [abs(other) for name, (other, _) in drifts.items() if name != topic]
+        if others and max(others) < abs(rate) / 3.0 and abs(rate) > _MAX_RATE and abs(drift) > _MAX_DRIFT_S:
+            found[topic] = rate
+    return found
+
+
 class Merger:
     """Merges items by stamp: `insert` an item, take the payloads that are due. A topic's payloads always have increasing stamps.
 
@@ -369,11 +396,8 @@ class Merger:
     def _compare_rates(self) -> None:
         """Count the messages of a topic whose clock has another rate than those of the other topics and of the recorder."""
         drifts = {topic: found for topic, clock in self._clocks.items() if (found := clock.drift()) is not None}
-        for topic, (rate, drift) in drifts.items():
-            others = [other for name, (other, _) in drifts.items() if name != topic]
-            is_odd = bool(others) and max(map(abs, others)) < abs(rate) / 3.0
-            if is_odd and abs(rate) > _MAX_RATE and abs(drift) > _MAX_DRIFT_S:
-                self._stats.count(topic, Oddity.RATE_OF_CLOCK, self._clocks[topic].accepted)
+        for topic in _odd_of(drifts):
+            self._stats.count(topic, Oddity.RATE_OF_CLOCK, self._clocks[topic].accepted)
 
     def _hold(self, items: Iterable[Item]) -> None:
         for item in items:

@@ -165,16 +165,18 @@ def _with_true_ranges(points: FloatArray, lidar: Lidar) -> FloatArray:
     return np.asarray(points * (true / np.maximum(ranges, 1e-9))[:, None])
 
 
+CLOCKS = {"joint_states": "wheel", "odometry": "wheel", "imu": "gyro", "scan": "lidar", "points": "lidar"}
+"""Sensor of each role, as the entries of `motion_models.robot.Clock` have it."""
+
+
 def late_ns(kind: str, clock: Clock) -> int:
     """By how much the stamps of a topic in the role ``kind`` are late [ns]."""
-    seconds = {
-        "joint_states": clock.wheel_time_offset_s,
-        "odometry": clock.wheel_time_offset_s,
-        "imu": clock.gyro_time_offset_s,
-        "scan": clock.lidar_time_offset_s,
-        "points": clock.lidar_time_offset_s,
-    }
-    return round(seconds.get(kind, 0.0) * 1e9)
+    return round(getattr(clock, f"{CLOCKS[kind]}_time_offset_s") * 1e9) if kind in CLOCKS else 0
+
+
+def rate_error(kind: str, clock: Clock) -> float:
+    """By how much faster the clock of a topic in the role ``kind`` runs than the recorder's [s/s]."""
+    return float(getattr(clock, f"{CLOCKS[kind]}_rate_error")) if kind in CLOCKS else 0.0
 
 
 def decode_item(topic: str, log_ns: int, read: Callable[[], Any], decoder: TopicDecoder, stats: MessageStats) -> Item | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 import tempfile
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -19,9 +20,9 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference, Scan
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
-from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, odd_rates, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
-from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item, late_ns
+from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item, late_ns, rate_error
 from localization.logs.reference_topics import reference_decoder
 from localization.logs.serialization import LogDeserializer
 from localization.logs.topic_names import find_in_namespace, is_measured_outside
@@ -36,6 +37,7 @@ _GPS = "/fix"
 _TF_READ_NS = 10_000_000_000  # in ROS 1, and from simulators, fixed transforms are repeated every 0.1 to 1 s on /tf
 _TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
 _FIRST_READ_NS = 20_000_000_000  # of a topic, for its latency; a long log is not read to its end for one that is slow
+_RATES_READ_NS, _RATES_READ_BYTES = 120_000_000_000, 300_000_000  # from the start, for the rates of clocks: .2 % is .24 s then
 _POINTS_READ = 100  # first messages of a point that may be the centre of gravity
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
 
@@ -101,6 +103,29 @@ class Log:
     def period_s(self) -> Mapping[str, float]:
         """Median time from message to message, by stamp, of each topic that is used [s], where its first messages show it."""
         return self._clocks.period_s
+
+    @property
+    def behind_s(self) -> Mapping[str, float]:
+        """Time of recording less stamp of each stamped topic that is used [s], by its first messages: the latency, where clocks agree."""
+        return {topic: (self._clocks.offset_ns - offset) * 1e-9 for topic, offset in self._clocks.latency_ns.items()}
+
+    def rate_errors(self) -> dict[str, float]:
+        """By how much faster than the recorder's the clock of a topic in use runs [s/s], where it is another than the other topics', by the
+        headers of the first minutes."""
+        return odd_rates(self._stamp_offsets())
+
+    def _stamp_offsets(self) -> Iterator[tuple[str, int, int]]:
+        """Topic, time of recording, and stamp less that [ns], of messages that begin with a header."""
+        topics, form = set(self.behind_s), "<xxxxII" if self.source.is_ros1 else "<xxxxiI"
+        size = 0
+        for raw in self.source.messages(topics):
+            size += len(raw.data)
+            if raw.log_ns > self.start_ns + _RATES_READ_NS or size > _RATES_READ_BYTES:
+                return
+            is_known = self.source.is_ros1 or raw.data[1:2] == b"\x01"  # little-endian
+            if is_known and len(raw.data) >= struct.calcsize(form) and raw.type == self.types[raw.topic]:
+                seconds, rest = struct.unpack_from(form, raw.data)
+                yield raw.topic, raw.log_ns, seconds * 1_000_000_000 + rest - raw.log_ns
 
     @property
     def reference_topic(self) -> str | None:
@@ -218,9 +243,14 @@ class Log:
 
     def _items(self, decoders: Mapping[str, TopicDecoder], stats: MessageStats) -> Iterator[Item]:
         decode = LogDeserializer([c for c in self.channels if c.topic in decoders], is_ros1=self.source.is_ros1)
+        rates = {s.topic: error for s in self.sources.used() if (error := rate_error(s.kind, self.robot.clock))}
         for raw in self.source.messages(decoders.keys()):
             if raw.type == self.types[raw.topic]:
-                item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoders[raw.topic], stats)
+                decoder = decoders[raw.topic]
+                if raw.topic in rates:
+                    late_ns = decoder.late_ns + round(rates[raw.topic] * (raw.log_ns - self.start_ns))
+                    decoder = decoder._replace(late_ns=late_ns)
+                item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoder, stats)
                 if item is not None:
                     yield item
 

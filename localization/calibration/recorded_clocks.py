@@ -1,0 +1,103 @@
+"""A clock that is off by the times of recording, where turns confirm it.
+
+A message is recorded soon after its measurement, and never before. A topic whose stamps are ahead of that, far behind it, or run faster or
+slower, has a clock of its own, or waits in a queue with stamps that are right. The turns of another sensor decide: they agree with those by
+the corrected clock, or with those of the stamps as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from localization.calibration.wheel_signals import MAX_BIAS_RAD_S, MIN_TURN_RAD_S, WheelSignals, correlation, read_signals, with_lidar
+from localization.calibration.wheel_units import CORRECTED
+from localization.logs import Log, open_log
+from localization.logs.event_decoder import CLOCKS
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_MIN_OFF_S, _MAX_LATENCY_S = 0.15, 0.1
+"""Least time of recording less stamp, of either sign, of a clock that may be off, and largest of one that is not: the latency of drivers,
+as of the LiDAR's check."""
+_MIN_CORRELATION, _CLEARER = 0.9, 2.0
+"""Of turns with the corrected clock, and how many times nearer to 1 than without."""
+
+
+@dataclass(frozen=True)
+class RecordedClock:
+    """A sensor's clock that is off."""
+
+    robot: Robot
+    """With the corrected clock."""
+    text: str
+    keys: Mapping[str, str]
+    """Entries to write to the robot file."""
+
+
+@dataclass(frozen=True)
+class _Suspect:
+    sensor: str
+    """As the entries of `Clock` have it."""
+    topic: str
+    key: str
+    value: float
+    """Of that entry of `Clock`."""
+    why: str
+
+
+def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSignals], FloatArray]) -> RecordedClock | None:
+    """The first clock of ``log`` that is off by the times of recording, where turns of another sensor agree better with it corrected.
+
+    ``signals``: of ``log``; ``turn``: (n,) by the wheels, up to a scale.
+    """
+    for suspect in _suspects(log):
+        clock = replace(log.robot.clock, **{suspect.key: suspect.value})
+        corrected = open_log(log.path, replace(log.robot, clock=clock), log.overrides)
+        after_signals = read_signals(corrected)
+        if after_signals is None:
+            continue
+        before, after = _agreement(log, signals, suspect, turn), _agreement(corrected, after_signals, suspect, turn)
+        if before is None or after is None or after < _MIN_CORRELATION or 1.0 - before < _CLEARER * (1.0 - after):
+            continue
+        value = f"{suspect.value:.4g}"
+        other = "other sensor" if suspect.sensor == "wheel" else "wheels"
+        text = (
+            f"{suspect.topic}: {suspect.why}, and its turns agree with those of the {other} with that undone"
+            f" (correlation {before:.3f} -> {after:.3f}): its clock is off. {CORRECTED} clock.{suspect.key} = {value}, or"
+            " synchronize the clocks."
+        )
+        return RecordedClock(corrected.robot, text, {f"clock.{suspect.key}": value})
+    return None
+
+
+def _suspects(log: Log) -> Iterator[_Suspect]:
+    sensors = {source.topic: CLOCKS[source.kind] for source in log.sources.used() if source.kind in CLOCKS}
+    clock = log.robot.clock
+    if len({*sensors.values()}) < 2:
+        return
+    for topic, rate in log.rate_errors().items():
+        key = f"{sensors[topic]}_rate_error"
+        value = round(getattr(clock, key) + rate, 5)
+        way = "faster" if rate > 0.0 else "slower"
+        yield _Suspect(sensors[topic], topic, key, value, f"its stamps run {abs(rate):.2%} {way} than the times of recording")
+    behind = {topic: late for topic, late in log.behind_s.items() if topic in sensors}
+    for topic, late in behind.items():
+        others = [abs(other) for name, other in behind.items() if sensors[name] != sensors[topic]]
+        if abs(late) < _MIN_OFF_S or not others or max(others) > _MAX_LATENCY_S:
+            continue
+        key = f"{sensors[topic]}_time_offset_s"
+        value = round(getattr(clock, key) - late, 2)
+        way = "behind" if late > 0.0 else "ahead of"
+        off = f"those of the other sensors at most {max(others):.2f} s off them"
+        why = f"its stamps are {abs(late):.2f} s {way} the times of recording, {off}"
+        yield _Suspect(sensors[topic], topic, key, value, why)
+
+
+def _agreement(log: Log, signals: WheelSignals, suspect: _Suspect, turn: Callable[[WheelSignals], FloatArray]) -> float | None:
+    """Correlation of turns by the wheels with those of the gyro, or of the LiDAR where it is in question or there is no gyro."""
+    if suspect.sensor == "lidar" or "gyro" not in signals.turns:
+        signals = with_lidar(log, signals)
+    other = signals.turns.get("LiDAR" if suspect.sensor == "lidar" or "gyro" not in signals.turns else "gyro")
+    r = None if other is None else correlation(turn(signals), other, MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
+    return None if r is None else abs(r)
