@@ -16,11 +16,12 @@ from localization.sensor_checks.clocks import ClockCheck
 from localization.sensor_checks.contradictions import Contradictions
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GyroRate, rate_off
-from localization.sensor_checks.inflation import CovarianceInflation, lever_of_unknown_front
+from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.lidar_tilt import LidarTilt
 from localization.sensor_checks.moving_objects import MAX_NIS, MIN_OFF_M, MovingObjects
 from localization.sensor_checks.own_body import OwnBody
+from localization.sensor_checks.path_uncertainty import PathUncertainty, lever_of_unknown_front
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
@@ -57,8 +58,8 @@ class SensorChecks:
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, robot: Robot | None = None) -> None:
         """``robot``: whose clocks and front may not be known for sure; None where they are."""
-        self._inflation = CovarianceInflation(lever_of_unknown_front(robot, mounts))
-        self._faults = faults = FaultLog(self._inflation)
+        self._inflation = CovarianceInflation()
+        self._faults = faults = FaultLog(self._inflation, PathUncertainty(lever_of_unknown_front(robot, mounts)))
         self._window = window = Window(mounts, config)
         self._moving, self._sweep_times = MovingObjects(faults, window), SweepTimes(faults)
         self._own_body, self._contradictions, self._gyro_rate = OwnBody(faults), Contradictions(faults), GyroRate(faults)
@@ -66,7 +67,6 @@ class SensorChecks:
         self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
         self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
-        self._reckoning = self._inflation.reckoning
         self._records: list[_Record] = []
         self._by_wheels = np.zeros(3)
         self._examined = np.zeros((2, 3)), np.zeros((2, 3))  # poses by wheels and estimate at the last examination but one, and at the last
@@ -108,13 +108,12 @@ class SensorChecks:
         pose = estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]
         self._records.append(_Record(step, estimate, pose, estimator.residuals, self._is_acting))
         by_wheels = self._by_wheels = se2.compose(self._by_wheels, step.predicted.delta)
-        before, _ = self._examined
-        x, y, _ = np.subtract(*se2.between(before, (by_wheels, pose)))
+        x, y, _ = np.subtract(*se2.between(self._examined[0], (by_wheels, pose)))
         contradicts = math.hypot(x, y) > MIN_OFF_M or not (estimate.nis is None or estimate.nis < MAX_NIS)
         if self._is_acting or contradicts:
             estimate = self._examine_records(estimator) or estimate
-        late_s, twist = self._inflation.late_s, estimate.twist  # the way in the time by which the clock of the poses may be off
-        return estimate if not late_s or twist is None else estimate.widened(twist[:, None] * twist * late_s**2)
+        path = self._faults.path
+        return path.widen(estimate, pose) if path.late_s or path.scale or path.turned_about_m is not None else estimate
 
     def examine(self, estimator: Estimator, *, is_last: bool = False) -> None:
         """Examine the steps that ``estimator`` has published, once there are enough, or none ``is_last``."""
@@ -155,7 +154,7 @@ class SensorChecks:
         step = replace(step, turn=None) if "gyro" in excluded else step
         step = step.without_scan() if "LiDAR" in excluded else step
         step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
-        self._reckoning.predict(step)
+        self._inflation.reckoning.predict(step)
         return self._moving.apply(step)
 
     def _compare_estimate(self, record: _Record, estimator: Estimator) -> None:
@@ -164,7 +163,7 @@ class SensorChecks:
         Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
         """
         step, estimate, pose, residuals, _ = record
-        self._reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
+        self._inflation.reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
         self._moving.keep_view()
         if estimate.nis is not None:
             self._standstill.restart()
@@ -189,7 +188,7 @@ class SensorChecks:
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the same covariance at its end, from the first fault on."""
-        return self._inflation.inflate_trajectory(smoothed)
+        return self._inflation.inflate_trajectory(self._faults.path.widen_trajectory(smoothed))
 
     def counts(self) -> Mapping[str, int]:
         """Number of scans in which objects moved, if there were any."""

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from localization.events import Step
 from localization.sensor_checks.inflation import CovarianceInflation, DeadReckoning
+from localization.sensor_checks.path_uncertainty import PathUncertainty
 
 MEMORY_S = 3.0
 """A sensor is left out while most comparisons of the last seconds contradict it. Signs and units are never off by chance for so long
@@ -48,8 +49,8 @@ class DetectedFault:
 class FaultLog:
     """Faults so far. `start_step`, then the checks `declare` what they find."""
 
-    def __init__(self, inflation: CovarianceInflation) -> None:
-        self.inflation = inflation
+    def __init__(self, inflation: CovarianceInflation, path: PathUncertainty | None = None) -> None:
+        self.inflation, self.path = inflation, path or PathUncertainty()
         self.start_s = self.now_s = 0.0
         """Stamp of the first step's begin [s], and end of the present one after it [s]."""
         self.declared: dict[SensorFault, DetectedFault] = {}

@@ -32,8 +32,9 @@ class GyroRate:
 
     def apply(self, step: Step) -> Step:
         """``step`` without the gyro, now and for the next seconds."""
-        off = rate_off(step)
-        if off:
+        if step.turn is None:
+            return step
+        if off := rate_off(step):
             self._last_s = self._faults.now_s
             self._faults.declare(GYRO_RATE, self._last_s, {"rate": off})
         return replace(step, turn=None) if self.is_acting else step

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -13,26 +12,16 @@ from localization.events import Step
 from localization.sensor_checks.reckoning import ESTIMATE, GYRO, WHEELS, Reckoning
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.robot import Mount, Robot
-from motion_models.se2 import Cov3, FloatArray, Pose2
+from motion_models.se2 import Cov3, FloatArray
 
 DeadReckoning = Literal["wheels", "wheels and gyro"]
 """Motion by the wheels alone, and that with the turns by the gyro."""
 
 
-def lever_of_unknown_front(robot: Robot | None, mounts: Mapping[str, Mount]) -> float | None:
-    """How far sensors at ``mounts`` are from the middle of a ``robot`` whose front may be its rear [m]; None where its front is known."""
-    if robot is None or robot.joints.is_front_known:
-        return None
-    return max((abs(mount.x) for mount in mounts.values()), default=0.0)
-
-
 class CovarianceInflation:
     """Differences that were added, carried along with the body as the covariance of an estimate is."""
 
-    def __init__(self, turned_about_m: float | None = None) -> None:
-        """``turned_about_m``: `lever_of_unknown_front`."""
-        self._turned_about_m = turned_about_m
+    def __init__(self) -> None:
         self.reckoning = Reckoning()
         """By the sensors, and by the estimate."""
         self._agreed = self.reckoning.poses  # where the sensors last agreed
@@ -50,10 +39,6 @@ class CovarianceInflation:
         """(3,) difference of wheels and scans while objects move in these."""
         self.possible: FloatArray | None = None
         """(3,) the same while that is not decided: no fault yet."""
-        self.late_s = 0.0
-        """By how much the clock of the poses may be off [s]."""
-        self.scale = 0.0
-        """Share by which the path may be too long or too short."""
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
@@ -80,7 +65,7 @@ class CovarianceInflation:
     @property
     def is_acting(self) -> bool:
         """Whether estimates get another covariance."""
-        return self.is_inflating or self.possible is not None or self._turned_about_m is not None or self.scale > 0.0
+        return self.is_inflating or self.possible is not None
 
     @property
     def is_inflating(self) -> bool:
@@ -109,8 +94,6 @@ class CovarianceInflation:
             A = se2.adjoint(se2.between(self._pose, before))
             self._spread = A @ self._spread @ A.T + self._pending
             self._pending = np.zeros((3, 3))
-        if self._turned_about_m is not None or self.scale:
-            estimate = estimate.widened(self._of_path(self._pose))
         if estimate.covariance is not None and self.possible is not None:
             estimate = estimate.widened(np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
@@ -121,13 +104,7 @@ class CovarianceInflation:
         return estimate.widened(spread)
 
     def inflate_trajectory(self, smoothed: Trajectory) -> Trajectory:
-        """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes; and with the way in the time by
-        which the poses' clock may be off."""
-        if self.late_s and smoothed.covariances is not None:
-            smoothed = _widen_by_way(smoothed, self.late_s)
-        if (self._turned_about_m is not None or self.scale) and smoothed.covariances is not None:
-            of_path = np.array([self._of_path(se2.between(smoothed.poses[0], pose)) for pose in smoothed.poses])
-            smoothed = Trajectory(smoothed.stamps_ns, smoothed.poses, smoothed.covariances + of_path)
+        """``smoothed`` with the same covariance at its end, from the first fault on, in the world's axes."""
         if self._since_ns is None or smoothed.covariances is None:
             return smoothed
         covariances = smoothed.covariances.copy()
@@ -136,11 +113,6 @@ class CovarianceInflation:
             covariances[i] += se2.rotate_covariance(world, -float(smoothed.poses[i, 2]))
         return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
 
-    def _of_path(self, pose: Pose2) -> Cov3:
-        """Covariance (3, 3) of a ``pose`` since the start by what is unsure of all of the path."""
-        scaled = _scaled_by(pose, self.scale)
-        return scaled if self._turned_about_m is None else scaled + _turned_about(pose, self._turned_about_m)
-
     @property
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
@@ -148,31 +120,3 @@ class CovarianceInflation:
         for difference in (self.ongoing_pair, self.ongoing_scene):
             total = total if difference is None else total + np.outer(difference, difference)
         return total
-
-
-def _turned_about(pose: Pose2, ahead_m: float) -> Cov3:
-    """Covariance (3, 3) of a ``pose`` since the start of a robot that may drive backwards: then it is as far away on the other side, and a
-    sensor ``ahead_m`` of its middle [m] is behind it."""
-    x, y, _ = se2.inverse(pose)
-    difference = np.array([2.0 * x, 2.0 * y, 0.0])
-    lever = (2.0 * ahead_m) ** 2
-    return np.asarray(np.outer(difference, difference) + np.diag([lever, lever, 0.0]))
-
-
-def _scaled_by(pose: Pose2, scale: float) -> Cov3:
-    """Covariance (3, 3) of a ``pose`` since the start whose path is too long by the share ``scale``, or too short."""
-    x, y, _ = se2.inverse(pose)
-    difference = np.array([scale * x, scale * y, 0.0])
-    return np.asarray(np.outer(difference, difference))
-
-
-def _widen_by_way(trajectory: Trajectory, late_s: float) -> Trajectory:
-    """``trajectory`` whose covariances have the longer one of the ways in the ``late_s`` [s] before and after each pose."""
-    assert trajectory.covariances is not None
-    stamps, shift_ns = trajectory.stamps_ns, round(late_s * 1e9)
-    before, after = (
-        se2.local(trajectory.poses, trajectory.at(np.clip(stamps + shift, stamps[0], stamps[-1]))) for shift in (-shift_ns, shift_ns)
-    )
-    is_longer = np.hypot(*after[:, :2].T) > np.hypot(*before[:, :2].T)
-    way = np.where(is_longer[:, None], after, before)
-    return Trajectory(stamps, trajectory.poses, trajectory.covariances + way[:, :, None] * way[:, None, :])

@@ -71,7 +71,7 @@ class InnovationWindow(NamedTuple):
         rows = np.array([(b.innovation, b.variance, b.seconds) for b in self.bins])
         innovation, variance, _ = np.diff(rows, axis=0).T
         X = np.array([b.regressors for b in self.bins[1:]])
-        if not X[:, [TURN, WAY]].any():
+        if np.allclose(X[:, [TURN, WAY]], 0.0):
             return SECONDS, _STANDING[pair.quantity].format(first=pair.first)
         gains = [_fit(X[:, regressor], innovation, variance) for regressor, _ in causes]
         best = max(range(len(gains)), key=lambda k: gains[k][0])

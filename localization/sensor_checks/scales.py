@@ -2,6 +2,11 @@
 
 The filter learns the wheels' radius from scans. Ranges that are all too long by a factor look the same: no turn shows it, and the submap
 has the factor as well. Then the whole path is too long by it, from the start on.
+
+The difference m of both scales is that of the wheels' error less that of the ranges', of which the wheels' has the standard deviation s_w a
+priori and the ranges' s_r. By Bayes the square of the ranges' error is w m^2 in the mean, w = s_r^2 / (s_r^2 + s_w^2), where m itself shows
+how large such errors are: its mean is w m, its variance w (1 - w) m^2. What m is beyond its own error is so in the covariance. From
+`_MIN_PRIOR_SIGMAS` on it is too large for the wheels: all of it is.
 """
 
 from __future__ import annotations
@@ -20,7 +25,9 @@ SCALES_APART = SensorFault(
 RADIUS = "wheel_radius_scale"
 _MIN_PRIOR_SIGMAS, _MIN_SIGMAS, _MIN_REPORTED_SIGMAS = 2.0, 2.0, 4.0
 """Radius by scans alone, in sigmas of its prior (3 %) and of its own, from which on the covariance has the difference, and is reported.
-MIT-CSAIL's is 2.5 %, the others' 1 % and less: ranges that are off by less cannot be distinguished from such wheels."""
+MIT-CSAIL's is 1.3 to 3.1 %, the others' 1.6 % and less: ranges that are off by less are not distinguished from such wheels."""
+_RANGES_SIGMA = 0.015
+"""Standard deviation of the scale of ranges: accuracy of LiDARs that triangulate (RPLIDAR A1: 1 % up to 3 m, 2 % up to 5 m)."""
 _MAX_SCALE = 0.3
 """Beyond it the wheels have another unit, or spin: ranges that are 3 % off are those of the cheapest LiDARs (URG-04LX)."""
 
@@ -35,7 +42,7 @@ class ScaleCheck:
     def compare(self, radius: LearnedParameter) -> None:
         """Take the wheels' ``radius`` as it is learned."""
         if self._faults.declared and any(fault in self._faults.declared for fault in NAMED[LIDAR_WHEELS_WAYS]):
-            self._faults.inflation.scale = 0.0
+            self._faults.path.scale = 0.0
             self._faults.retract(SCALES_APART)
             return
         share = 1.0 - (radius.sigma / radius.prior_sigma) ** 2  # of its information, by scans
@@ -45,10 +52,16 @@ class ScaleCheck:
         self._most = min(self._most, abs(off) + 2.0 * sigma)
         scale = min(abs(off), self._most)
         is_off = max(_MIN_PRIOR_SIGMAS * radius.prior_sigma, _MIN_SIGMAS * sigma) < scale < _MAX_SCALE
-        self._faults.inflation.scale = scale if is_off else 0.0
+        self._faults.path.scale = scale if is_off else _error_of_ranges(share * scale, radius)
         if is_off and scale > _MIN_REPORTED_SIGMAS * sigma and round(scale, 2) != self._reported:
             self._reported = round(scale, 2)
             words = ("longer", "long", "larger") if off > 0.0 else ("shorter", "short", "smaller")
             numbers = dict(zip(("longer", "long", "larger"), words, strict=True))
             message = SCALES_APART.message.format(percent=100.0 * scale, **numbers)
             self._faults.revise(DetectedFault(SCALES_APART, 0.0, message))
+
+
+def _error_of_ranges(off: float, radius: LearnedParameter) -> float:
+    """Standard deviation of the ranges' scale where a ``radius`` is learned as ``off`` by a share, by what is beyond its own error."""
+    share = 1.0 / (1.0 + (radius.prior_sigma / _RANGES_SIGMA) ** 2)
+    return math.sqrt(share * max(off**2 - radius.sigma**2, 0.0)) if off < _MAX_SCALE else 0.0

@@ -9,7 +9,6 @@ import pytest
 
 from localization.estimators import Estimate
 from localization.sensor_checks.contradictions import LIDAR_DIRECTION
-from localization.sensor_checks.inflation import CovarianceInflation
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.checked_drive import SPEED, CheckedDrive, turned
@@ -42,32 +41,3 @@ def test_fault_inflates_the_covariance_by_what_it_has_done() -> None:
     assert inflated.covariances is not None
     np.testing.assert_allclose(inflated.covariances[-1], end.covariance, atol=1e-9)
     np.testing.assert_allclose(inflated.covariances[0], 1e-6 * np.eye(3))
-
-
-def test_smoothed_trajectory_of_an_uncertain_clock_has_the_way_in_that_time() -> None:
-    """Ahead at 1 m/s after a second at rest: where the motion begins, the way is that afterwards."""
-    t = np.arange(0.0, 5.0, 0.1)
-    poses = np.column_stack([np.maximum(t - 1.0, 0.0), 0.0 * t, 0.0 * t])
-    inflation = CovarianceInflation()
-    inflation.late_s = 0.5
-    found = inflation.inflate_trajectory(Trajectory(np.round(t * 1e9).astype(int), poses, np.zeros((len(t), 3, 3)))).covariances
-    assert found is not None
-    np.testing.assert_allclose(np.sqrt(found[[0, 10, 30], 0, 0]), [0.0, 0.5, 0.5], atol=1e-6)
-    assert not found[:, 1:].any()
-
-
-def test_covariance_of_an_unknown_front_reaches_the_other_side_of_the_start() -> None:
-    """Two metres ahead and one to the left, in a right turn; turned about, the robot is two behind and one to the right."""
-    pose, stamps = np.array([2.0, 1.0, -0.5]), np.arange(2)
-    inflation = CovarianceInflation(turned_about_m=0.05)
-    inflation.reckoning.poses = np.tile(pose, (5, 1))
-    found = inflation.inflate(Estimate(0, pose, 1e-6 * np.eye(3), None, None)).covariance
-    poses = Trajectory(stamps, np.array([np.zeros(3), pose]), np.tile(1e-6 * np.eye(3), (2, 1, 1)))
-    smoothed = inflation.inflate_trajectory(poses).covariances
-    assert found is not None
-    assert smoothed is not None
-    error = se2.between(pose, [-2.0, -1.0, -0.5])
-    for covariance in (found, smoothed[1]):
-        assert float(error @ np.linalg.solve(covariance, error)) == pytest.approx(1.0, abs=0.01)
-        assert covariance[2, 2] == pytest.approx(1e-6)
-    assert smoothed[0, 0, 0] == pytest.approx(0.01, rel=0.01)
