@@ -264,14 +264,9 @@ class Step:
         motion = replace(self.predicted, cov=self.predicted.cov + unknown)
         return replace(self, predicted=motion, twist=turn_twist(self.turn), is_standing=False, has_wheels=False)
 
-    @property
-    def twist_change(self) -> FloatArray:
-        """(3,) by the wheels from the mean of the step to its end; zero where they are not used."""
-        return self.twist - self.mean_twist if self.has_wheels else np.zeros(3)
-
     @cached_property
     def mean_twist(self) -> FloatArray:
-        """(3,) by the wheels over the step; of one of no duration, and without wheel data, that at its end."""
+        """(3,) by the wheels over the step; of one of no duration, and where they are not used, `twist`."""
         return se2.log(self.predicted.delta) / self.duration if self.has_wheels and self.duration > 0.0 else self.twist
 
 

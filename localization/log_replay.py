@@ -165,7 +165,7 @@ class _Replay:
 
     def finish(self) -> Run:
         begin = time.perf_counter()
-        self._add(self._pipeline.stream_rest())
+        self._add(self._pipeline.stream(None))
         stamps, table = self._table.stamps(), self._table.rows()
         if not len(stamps):
             raise LogError("no two wheel samples or scans span an interval of time. Check the log's length and options of topics.")

@@ -79,7 +79,7 @@ class Pipeline:
         model = add_correction_parameters(trial.model, trial.corrections) if has_corrections else trial.model
         self.synchronizer = Synchronizer(model, robot, self.mounts, has_lidar, config.step)
         if is_in_space:
-            self.synchronizer.measure_in_space()
+            self.synchronizer.inertial.measure_in_space()
         graph: SpaceGraphSettings | None = None
         if trial.estimator == "graph":
             corrections = make_corrections(model, trial.corrections)
@@ -105,7 +105,7 @@ class Pipeline:
     @property
     def attitude(self) -> AttitudeFilter | None:
         """Roll and pitch; None where they are not known."""
-        found = self.synchronizer.attitude
+        found = self.synchronizer.inertial.attitude
         return found if found is not None and found.has_attitude else None
 
     def process(self, event: Event) -> list[Estimate]:
@@ -116,8 +116,9 @@ class Pipeline:
         """
         return list(self.stream(event))
 
-    def stream(self, event: Event) -> Iterator[Estimate]:
-        """`process`, one estimate at a time: `attitude` is that of the estimate until the next is taken."""
+    def stream(self, event: Event | None) -> Iterator[Estimate]:
+        """`process`, one estimate at a time: `attitude` is that of the estimate until the next is taken. None: the events have ended, and
+        what still waits for others is done without these."""
         if isinstance(event, PositionSample):
             self.estimator.add_position(event)
             return
@@ -125,15 +126,13 @@ class Pipeline:
             self.checks.insert_imu(event)
         if isinstance(event, Scan):
             event = self.checks.correct(event)
-        if isinstance(event, Scan) and not event.is_planar and (self.space_choice is not None or self._is_in_planar_map):
-            self.synchronizer.measure_in_space()
-            if self.space_choice is not None:
-                self.space_choice.has_clouds = True
-        self.synchronizer.insert(event)
-        yield from self._estimates(is_last=False)
-
-    def _estimates(self, is_last: bool) -> Iterator[Estimate]:
-        while (interval := self.synchronizer.next_interval(is_last)) is not None:  # synchronize
+            if not event.is_planar and (self.space_choice is not None or self._is_in_planar_map):
+                self.synchronizer.inertial.measure_in_space()
+                if self.space_choice is not None:
+                    self.space_choice.has_clouds = True
+        if event is not None:
+            self.synchronizer.insert(event)
+        while (interval := self.synchronizer.next_interval(is_last=event is None)) is not None:  # synchronize
             self.run_deferred()
             step = self.synchronizer.preintegrate(interval)  # wheels through the motion model, gyro, scan
             step = self.checks.apply(step, self.estimator)  # without faulty sensors
@@ -149,6 +148,9 @@ class Pipeline:
             if step.duration > 0.0:
                 self.wheel_twist = step.twist if step.has_wheels else None
             yield estimate  # publish
+        if event is None:
+            self.checks.examine(self.estimator, is_last=True)
+            self.run_deferred()
 
     def run_deferred(self) -> None:
         """Do the work that published estimates need not wait for, and predict with what it has corrected. Left out, the next `process`
@@ -159,13 +161,7 @@ class Pipeline:
 
     def finish(self) -> list[Estimate]:
         """The estimates that still waited for events when these ended."""
-        return list(self.stream_rest())
-
-    def stream_rest(self) -> Iterator[Estimate]:
-        """`finish`, one estimate at a time."""
-        yield from self._estimates(is_last=True)
-        self.checks.examine(self.estimator, is_last=True)
-        self.run_deferred()
+        return list(self.stream(None))
 
     @property
     def lidar(self) -> LidarLosses | None:

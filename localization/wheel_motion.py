@@ -13,7 +13,7 @@ from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.extended_model import SampleSeries, in_series, needs_series
 from motion_models.friction.slope_effect import SlopeEffect, SlopeMotion
-from motion_models.preintegration import integrate_twists
+from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Twist2
 
@@ -29,7 +29,7 @@ class WheelMotion:
         ``has_slopes``: gravity acts where the ground tilts."""
         self.model, self.params, self._needs_series = model, model.nominal, needs_series(model)
         self.buffer = WheelBuffer(robot.center_of_gravity)
-        self._noise, self._max_hold_s, self._unknown_sigma = robot.wheel_noise, max_hold_s, unknown_sigma
+        self._noise, self._max_hold_s, self._unknown_sigma = noise_vector(robot.wheel_noise), max_hold_s, unknown_sigma
         self._slope_effect = SlopeEffect.from_robot(robot) if has_slopes else None
 
     def twist_at(self, stamp_ns: int) -> tuple[FloatArray, Twist2]:

@@ -7,17 +7,14 @@ are the same for every model.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from motion_models import se2
 from motion_models.base import Motion, MotionModel, Twist
 from motion_models.compiled import kernel
 from motion_models.linear_equations import multiply_affine
-from motion_models.online_calibration import Corrections
 from motion_models.robot import WheelNoise
-from motion_models.se2 import FloatArray, Pose2, fill_inverse_adjoint, fill_right_jacobian, scalar_exp, scalar_transform, triple
+from motion_models.se2 import FloatArray, fill_inverse_adjoint, fill_right_jacobian, scalar_exp, scalar_transform, triple
 
 
 def noise_vector(noise: WheelNoise) -> FloatArray:
@@ -45,15 +42,15 @@ def preintegrate(
     ``dt`` (n,) [s] lengths of the intervals; ``wheels`` (n, 2) [rad/s]; ``cg`` (n, 2) or (2,) [m]; ``params`` (k,). The error of
     the motion is a right perturbation, as everywhere; on each interval it follows e' = Ad(exp(-xi dt)) e + J_r(xi dt) d(xi) dt.
     """
-    return integrate_twists(dt, model.twist(wheels, cg, params), noise)
+    return integrate_twists(dt, model.twist(wheels, cg, params), noise_vector(noise))
 
 
-def integrate_twists(dt: FloatArray, twist: Twist, noise: WheelNoise) -> Motion:
-    """`preintegrate` for given twists (n, 3)."""
+def integrate_twists(dt: FloatArray, twist: Twist, noise: FloatArray) -> Motion:
+    """`preintegrate` for given twists (n, 3) and ``noise`` (8,) of `noise_vector`."""
     k = twist.d_params.shape[-1]
     by = np.concatenate([twist.d_params, twist.d_cg], axis=-1)
     delta, cov, d = np.zeros(3), np.zeros((3, 3)), np.zeros((3, by.shape[-1]))
-    integrate(np.ascontiguousarray(dt), twist.value, by, noise_vector(noise), delta, cov, d)
+    integrate(np.ascontiguousarray(dt), twist.value, by, noise, delta, cov, d)
     return Motion(delta, cov, d[:, :k], d[:, k:])
 
 
@@ -88,47 +85,3 @@ def integrate(
 
         delta[0], delta[1] = scalar_transform(triple(delta), step[0], step[1])
         delta[2] += step[2]  # not wrapped: it counts whole turns
-
-
-@dataclass(frozen=True)
-class PreintegratedMotion:
-    """The wheels' motion from keyframe to keyframe, by any motion model."""
-
-    delta: Pose2
-    """(3,) at the corrections ``at``."""
-    cov: FloatArray
-    """(3, 3)"""
-    by_corrections: FloatArray
-    """(3, c) its derivative (right perturbation)."""
-    at: FloatArray
-    """(c,)"""
-
-
-class MotionPreintegration:
-    """Preintegrates steps from keyframe to keyframe, for a factor between both poses and the ``n`` corrections."""
-
-    def __init__(self, n: int) -> None:
-        self._delta, self._cov = np.zeros(3), np.zeros((3, 3))
-        self._by_corrections, self._straight = np.zeros((3, n)), np.zeros((3, n))
-        self._corrected = np.zeros(3)  # share of the corrections in the motion
-        self._prior = np.zeros((n, n))
-
-    def add(self, motion: Motion, corrections: Corrections, is_turning: bool, at: FloatArray) -> None:
-        """Add the next step, predicted with the corrections ``at`` (n,). Nearly straight motion does not excite the corrections: there they
-        are one error of the whole motion."""
-        A = se2.adjoint(se2.inverse(motion.delta))
-        self._delta = se2.compose(self._delta, motion.delta)
-        self._cov = A @ self._cov @ A.T + motion.cov
-        D = motion.d_params @ corrections.directions if motion.d_params.shape[1] else np.zeros_like(self._straight)
-        excited, straight = (D, np.zeros_like(D)) if is_turning else (np.zeros_like(D), D)
-        self._by_corrections = A @ self._by_corrections + excited
-        self._straight = A @ self._straight + straight
-        self._corrected = A @ self._corrected + excited @ at
-        self._prior = corrections.cov
-
-    def with_corrections(self, at: FloatArray) -> PreintegratedMotion:
-        """All of it, as predicted with the corrections ``at`` (n,)."""
-        cov = self._cov + self._straight @ self._prior @ self._straight.T + 1e-10 * np.eye(3)
-        delta = se2.compose(self._delta, se2.exp(self._by_corrections @ at - self._corrected))
-        by_scale = np.append(-se2.inverse(delta)[:2], 0.0)  # R^T (x, y), yaw 0: turns have a scale of their own, k
-        return PreintegratedMotion(delta, cov, np.column_stack([self._by_corrections, by_scale]), np.append(at, 0.0))

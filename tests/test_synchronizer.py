@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from localization.errors import EventError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
-from localization.synchronizer import StepConfig, Synchronizer, UnknownVelocity
+from localization.synchronizer import StepConfig, Synchronizer
 from localization.wheel_buffer import WheelBuffer
+from localization.wheel_gaps import UnknownVelocity
 from motion_models import se2
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
@@ -349,7 +350,7 @@ def test_missing_wheels_between_angles_give_one_covariance_however_cut(step_s):
 
 def test_unknown_velocity_turns_from_the_last_turn_of_the_gyro_on():
     """Ten seconds with a gyro, in which any turn is known, then one without: the limit of the yaw variance is not reached."""
-    velocity = UnknownVelocity(StepConfig())
+    velocity = UnknownVelocity(StepConfig().unknown_sigma)
     for _ in range(100):
         np.testing.assert_allclose(np.sqrt(velocity.increment(0.1, has_turn=True)[2, 2]), 0.05)
     found = np.sum([velocity.increment(0.1, has_turn=False) for _ in range(10)], axis=0)
@@ -623,7 +624,7 @@ def test_scans_of_unknown_frame_are_reported_and_not_mixed():
     assert "frame 'top'" in note
     assert "7 scans of it were not used" in note
     assert "[mounts.top]" in note
-    assert cutter.frames.problem is not None
+    assert cutter.scans.frames.problem is not None
     # where none is known, they are all there is
     found, cutter = cut(in_order(ahead, strange))
     assert sum(s.scan is not None for s in found) == 7

@@ -18,7 +18,7 @@ from localization.trajectory import BoolArray, Trajectory
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
-from motion_models.preintegration import integrate_twists
+from motion_models.preintegration import preintegrate
 from motion_models.robot import GyroNoise, Mount, WheelNoise
 from motion_models.se2 import FloatArray
 
@@ -82,7 +82,7 @@ class Wheels:
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """Motion from start to end; the last rates hold for `HOLD_S`."""
         dt, rates, cg, _ = self.buffer.window(start_ns, end_ns, HOLD_S)
-        return integrate_twists(dt, self.model.twist(rates, cg, self.model.nominal), self.noise)
+        return preintegrate(self.model, dt, rates, cg, self.model.nominal, self.noise)
 
     def is_standing(self, start_ns: int, end_ns: int) -> bool:
         """Whether no wheel moved."""

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from localization.core.twist import mean_twist, twist_at_end
 from localization.errors import EstimatorError
-from localization.estimators.estimator import NO_POINTS, Estimate, Estimator, mean_twist, twist_at_end
+from localization.estimators.estimator import NO_POINTS, Estimate, Estimator
 from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
@@ -40,7 +41,7 @@ class DeadReckoning(Estimator):
         self._by_cg = A @ self._by_cg + motion.d_cg @ _square_root(step.cg_cov)
         twist, twist_cov = step.twist, None
         if step.duration > 0.0:
-            twist, twist_cov = twist_at_end(*mean_twist(motion.delta, step.cov, step.duration), step.twist_change, step.duration)
+            twist, twist_cov = twist_at_end(*mean_twist(motion.delta, step.cov, step.duration), step.twist - step.mean_twist, step.duration)
         return Estimate(step.end_ns, self._pose, self._cov + self._by_cg @ self._by_cg.T, twist, twist_cov)
 
 

@@ -19,6 +19,7 @@ from localization.core.policies.outlier import NOTHING_MISSED, PriorOutlier
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
+from localization.core.twist import fuse_turn, mean_twist, twist_at_end
 from localization.estimators.estimator import (
     NO_POINTS,
     ClocksApart,
@@ -27,9 +28,6 @@ from localization.estimators.estimator import (
     GyroCalibration,
     LearnedParameter,
     Residuals,
-    fuse_turn,
-    mean_twist,
-    twist_at_end,
 )
 from localization.events import Step
 from localization.lidar import OUTLIER_SIGMAS, LostScans, ScanMatchingSensor
@@ -185,7 +183,8 @@ class EkfFusion(Estimator):
             return step.twist, None
         mean, cov = mean_twist(*self.state.between("start", "pose"), step.duration)
         self._policies.slip.end_step(step, mean, is_measured)
-        twist, cov = twist_at_end(mean, cov, step.twist_change, math.inf if is_measured or not step.has_wheels else step.duration)
+        change, measured_over = step.twist - step.mean_twist, math.inf if is_measured or not step.has_wheels else step.duration
+        twist, cov = twist_at_end(mean, cov, change, measured_over)
         if step.turn is None or step.is_standing:
             return twist, cov
         gyro = self.gyro_calibration

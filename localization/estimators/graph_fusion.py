@@ -20,6 +20,7 @@ from localization.estimators.estimator import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_positions import GraphPositions
+from localization.estimators.keyframe_motion import MotionPreintegration, PreintegratedMotion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph
 from localization.estimators.recorded_path import RecordedPath
 from localization.events import PositionSample, Step
@@ -29,7 +30,6 @@ from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.preintegration import MotionPreintegration, PreintegratedMotion
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _CONSTANT_SHARE = 1e-3

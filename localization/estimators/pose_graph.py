@@ -20,8 +20,8 @@ import numpy as np
 from localization.core.measurements.position import predict_position
 from localization.core.measurements.relative_pose import motion_residual
 from localization.errors import EstimatorError
+from localization.estimators.keyframe_motion import PreintegratedMotion
 from motion_models import se2
-from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
 _ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)

@@ -18,7 +18,8 @@ from localization.core.space import (
     start_at,
 )
 from localization.core.state import State
-from localization.estimators.estimator import NO_POINTS, Estimate, Estimator, twist_at_end
+from localization.core.twist import twist_at_end
+from localization.estimators.estimator import NO_POINTS, Estimate, Estimator
 from localization.events import Gravity, Step
 from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size, key_scan_noise
 from localization.lidar.cloud_map import SYSTEMATIC_COV, CloudMap, thin
@@ -185,7 +186,7 @@ class SpaceFusion(Estimator):
             delta, cov = self.state.between("start", "pose")
             mean, mean_cov = se3.log(delta)[_PLANAR] / step.duration, cov[np.ix_(_PLANAR, _PLANAR)] / step.duration**2
             measured_over = math.inf if nis is not None or not step.has_wheels else step.duration
-            twist, twist_cov = twist_at_end(mean, mean_cov, step.twist_change, measured_over)
+            twist, twist_cov = twist_at_end(mean, mean_cov, step.twist - step.mean_twist, measured_over)
         return Estimate(step.end_ns, planar, planar_cov, twist, twist_cov, nis, in_space=in_space)
 
     @property

@@ -18,10 +18,10 @@ import gtsam
 import numpy as np
 
 from localization.core.measurements.position import predict_position_in_space
+from localization.estimators.keyframe_motion import PreintegratedMotion
 from localization.estimators.pose_graph import LEVER_SIGMA_M, check_solvable, levenberg_marquardt, robust_factor, robust_loop_noise
 from localization.lidar.cloud_loops import CloudLoop
 from motion_models import se2, se3
-from motion_models.preintegration import PreintegratedMotion
 from motion_models.se2 import FloatArray
 from motion_models.se3 import Transform3
 from motion_models.slope import GRAVITY

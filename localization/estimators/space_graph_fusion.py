@@ -16,6 +16,7 @@ from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
+from localization.estimators.keyframe_motion import MotionPreintegration
 from localization.estimators.position_queue import PositionQueue, align_map
 from localization.estimators.recorded_path import RecordedPath
 from localization.estimators.space_fusion import SpaceFusion
@@ -28,7 +29,6 @@ from localization.maps.space_map import in_units
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2, se3
 from motion_models.online_calibration import Corrections
-from motion_models.preintegration import MotionPreintegration
 from motion_models.se2 import FloatArray, Points2, Pose2
 
 _OPEN_M2, _OPEN_RAD2 = 1.0, 1.0

@@ -179,7 +179,7 @@ class Health:
                 "longest_lost_s": f"{losses.longest_s:.1f}",
                 "lost_now_s": f"{losses.ongoing_s:.1f}",
             }
-        if (problem := pipeline.synchronizer.frames.problem) is not None:
+        if (problem := pipeline.synchronizer.scans.frames.problem) is not None:
             return Status("lidar", ERROR, problem, values)
         scene = self.degeneracy
         if scene is not None:

@@ -213,7 +213,7 @@ class Node:
 
     def batch_s(self) -> float:
         """How long messages that are not urgent may wait for others [s]: not while a scan waits for them."""
-        is_waiting = self.session.pipeline.synchronizer.is_waiting
+        is_waiting = bool(self.session.pipeline.synchronizer.scans.waiting)
         return 0.0 if is_waiting else self.inputs.stream.batch_s(self._transport.now_ns())
 
     def publish_status(self, now: float) -> None:
@@ -423,13 +423,13 @@ class Node:
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""
         pipeline = self.session.pipeline
-        was_missing = pipeline.synchronizer.frames.problem is not None
+        was_missing = pipeline.synchronizer.scans.frames.problem is not None
         if not pipeline.add_mounts(mounts):
             return
         self.payloads.mounts = pipeline.mounts
         self.session.change_mounts(pipeline.mounts)
         self.status.doctor.add_mounts(pipeline.mounts)
-        if was_missing and pipeline.synchronizer.frames.problem is None:
+        if was_missing and pipeline.synchronizer.scans.frames.problem is None:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
             self.session.view.begin(self.inputs.robot, pipeline.mounts)

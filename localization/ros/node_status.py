@@ -52,7 +52,7 @@ class NodeStatus:
 
     def report_problems(self, session: Session) -> None:
         """Report problems of the frames of scans and transforms that are new."""
-        for problem in (session.pipeline.synchronizer.frames.problem, self._inputs.transforms.problem):
+        for problem in (session.pipeline.synchronizer.scans.frames.problem, self._inputs.transforms.problem):
             if problem is not None and problem not in self._reported:
                 self._reported.add(problem)
                 self._report(problem)

@@ -7,13 +7,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from localization.core.twist import CHANGE_SHARE, fuse_turn, mean_twist, twist_at_end
 from localization.estimators import Estimate
-from localization.estimators.estimator import CHANGE_SHARE, GyroCalibration, fuse_turn, mean_twist, twist_at_end
+from localization.estimators.estimator import GyroCalibration
 from localization.events import CgSample, Event, Turn, WheelSample
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
-from motion_models.preintegration import integrate_twists
+from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -36,7 +37,7 @@ class Predictor:
 
     def __init__(self, model: MotionModel, robot: Robot, max_hold_s: float, max_rate_hz: float = math.inf) -> None:
         """``max_hold_s``: gaps between wheel samples that are longer end the prediction [s]. ``max_rate_hz``: more are not made [Hz]."""
-        self._model, self._noise, self._max_hold_s = model, robot.wheel_noise, max_hold_s
+        self._model, self._noise, self._max_hold_s = model, noise_vector(robot.wheel_noise), max_hold_s
         self._period_ns, self._due_ns = 1.0 / (max_rate_hz * _NS), -math.inf
         self._params = model.nominal
         self._wheels = WheelBuffer(robot.center_of_gravity, _KEEP_S)

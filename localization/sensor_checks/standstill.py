@@ -11,7 +11,8 @@ import numpy as np
 from localization.events import ImuSample, Step
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.window import Bins, Window
-from localization.synchronizer import StepConfig, UnknownVelocity
+from localization.synchronizer import StepConfig
+from localization.wheel_gaps import UnknownVelocity
 from motion_models.se2 import FloatArray
 
 WHEELS_STANDING = SensorFault(
@@ -46,7 +47,7 @@ class Standstill:
     """
 
     def __init__(self, faults: FaultLog, window: Window, config: StepConfig) -> None:
-        self._faults, self._window, self._velocity = faults, window, UnknownVelocity(config)
+        self._faults, self._window, self._velocity = faults, window, UnknownVelocity(config.unknown_sigma)
         self._shaking: dict[str, ShakeDetector] = {}  # by the IMU's frame
         self._stood_s = 0.0  # time for which the wheels read zero
         self._turned_s = 0.0  # the same, while the gyro turns

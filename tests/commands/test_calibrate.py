@@ -21,7 +21,7 @@ from localization.logs import TopicOverrides, open_log
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_text
-from motion_models.preintegration import integrate_twists
+from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import WheelNoise
 from motion_models.robot_file import load_robot
@@ -191,7 +191,7 @@ def heading_errors(robot_file: str) -> np.ndarray:
     errors = []
     for start, end, motion in zip(relations.starts_ns[short], relations.ends_ns[short], relations.motions[short], strict=True):
         dt, rates, cg, _ = history.window(int(start), int(end), 0.5)
-        predicted = integrate_twists(dt, model.twist(rates, cg, model.nominal), robot.wheel_noise).delta
+        predicted = preintegrate(model, dt, rates, cg, model.nominal, robot.wheel_noise).delta
         errors.append(float(se2.wrap_angle(predicted[2] - motion[2])))
     assert len(errors) > 100
     return np.array(errors)
@@ -340,7 +340,7 @@ def made_windows(model_name: str, n: int = 24, seed: int = 0) -> list[Maneuver]:
     rng, found = np.random.default_rng(seed), []
     for i in range(n):
         q = np.repeat(rng.uniform(-3, 3, (1, 2)), 20, axis=0)
-        delta = integrate_twists(np.full(20, 0.1), model.twist(q, np.zeros(2), params), WheelNoise()).delta
+        delta = preintegrate(model, np.full(20, 0.1), q, np.zeros(2), params, WheelNoise()).delta
         measured = delta + rng.normal(0, [1e-3, 1e-3, 1e-3])
         found.append(Maneuver(np.full(20, 0.1), q, measured[None], np.array([20]), cov=np.diag([1e-6] * 3), group=f"g{i // 2}"))
     return found
@@ -452,7 +452,7 @@ def test_calibrate_with_distances_fits_the_wheel_radius(tmp_path: Path) -> None:
     windows = []
     for i in range(24):
         q = np.repeat(rng.uniform(-3, 3, (1, 2)), 20, axis=0)
-        delta = integrate_twists(np.full(20, 0.1), true.twist(q, np.zeros(2), true.nominal), WheelNoise()).delta
+        delta = preintegrate(true, np.full(20, 0.1), q, np.zeros(2), true.nominal, WheelNoise()).delta
         measured = (delta + rng.normal(0, 1e-3, 3))[None]
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([1e-6] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
@@ -470,7 +470,7 @@ def test_calibrate_of_a_radius_difference_writes_both_multipliers(tmp_path: Path
     for i in range(24):
         q = np.repeat(rng.uniform(1, 3, (1, 2)), 20, axis=0)
         rolled = q * [1.005, 0.995]
-        delta = integrate_twists(np.full(20, 0.1), model.twist(rolled, np.zeros(2), model.nominal), WheelNoise()).delta
+        delta = preintegrate(model, np.full(20, 0.1), rolled, np.zeros(2), model.nominal, WheelNoise()).delta
         measured = (delta + rng.normal(0, 1e-3, 3))[None]
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([1e-6] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"
@@ -488,7 +488,7 @@ def test_calibrate_worse_on_held_out_data_is_not_recommended(tmp_path: Path, cap
     windows = []
     for i in range(6):
         q = np.repeat(rng.uniform(-3, 3, (1, 2)), 20, axis=0)
-        delta = integrate_twists(np.full(20, 0.1), model.twist(q, np.zeros(2), model.nominal), WheelNoise()).delta
+        delta = preintegrate(model, np.full(20, 0.1), q, np.zeros(2), model.nominal, WheelNoise()).delta
         measured = (delta + rng.normal(0, [0.05, 0.05, 0.05]))[None]
         windows.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), cov=np.diag([2.5e-3] * 3), group=str(i)))
     table, out = tmp_path / "w.csv", tmp_path / "robot.toml"

@@ -17,6 +17,7 @@ from localization.errors import EstimatorError
 from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate, EstimatorConfig
 from localization.estimators.graph_fusion import subtract_information
+from localization.estimators.keyframe_motion import MotionPreintegration
 from localization.estimators.pose_graph import PoseGraph
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
@@ -29,7 +30,6 @@ from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import add_correction_parameters, make_corrections
-from motion_models.preintegration import MotionPreintegration
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from tests.helpers import rooms

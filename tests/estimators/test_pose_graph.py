@@ -12,11 +12,11 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators import pose_graph
+from localization.estimators.keyframe_motion import PreintegratedMotion
 from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
 from localization.evaluation.consistency import nees
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
-from motion_models.preintegration import PreintegratedMotion
 
 COV = np.diag([0.02, 0.02, 0.01]) ** 2
 LOOP_COV = np.diag([0.02, 0.02, 0.005]) ** 2

@@ -9,11 +9,11 @@ import pytest
 
 from localization.core.measurements.position import predict_position_in_space
 from localization.core.space import SE3
+from localization.estimators.keyframe_motion import PreintegratedMotion
 from localization.estimators.recorded_path import through_nodes
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
 from localization.lidar.cloud_loops import CloudLoop
 from motion_models import se2, se3
-from motion_models.preintegration import PreintegratedMotion
 from motion_models.slope import GRAVITY
 
 _PLANAR = [0, 1, 5]

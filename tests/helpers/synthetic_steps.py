@@ -20,7 +20,7 @@ from localization.lidar.scan_policies import MovedRobot
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import Corrections, make_corrections
-from motion_models.preintegration import integrate_twists
+from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.registry import make_model
 from motion_models.robot import GyroNoise, Robot, WheelNoise
 from motion_models.robot_file import load_robot
@@ -160,7 +160,7 @@ class World:
         shifted = self.t + clock_offset - self.clock
         dt, rates, cg = self._rates(shifted)
         twist = self.model.twist(rates, cg, params)
-        predicted = integrate_twists(dt, twist, noise.wheels)
+        predicted = integrate_twists(dt, twist, noise_vector(noise.wheels))
         ends = shifted + np.array([0.0, DT])  # the very ends: the middles of the intervals would leave out a part of the change
         first, last = self.model.twist(np.array([self.wheels(s) for s in ends]), np.array([self.cg(s) for s in ends]), params).value
         d_clock = last - se2.adjoint(se2.inverse(predicted.delta)) @ first

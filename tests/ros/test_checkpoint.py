@@ -80,7 +80,7 @@ def test_resumed_pipeline_with_late_mounts_gives_the_same_bits(estimator):
         assert not goes_on.add_mounts({"laser": Mount(x=9.0)})  # a frame that has its place keeps it
         rest += [numbers(e) for event in events[met : met + AHEAD] for e in goes_on.process(event)]
         found.append(rest)
-        assert goes_on.synchronizer.frames.problem is None
+        assert goes_on.synchronizer.scans.frames.problem is None
         assert "/tf_static gave the mount of the LiDAR's frame 'laser' late" in goes_on.synchronizer.warnings()[-1]
     assert found[0] == found[1]
     assert len(before) > 50
