@@ -115,12 +115,27 @@ class _Sums(NamedTuple):
     """(4,) way [m] and turn [rad] in the window, turn by the wheels as difference of the sides' angles, and its agreement with the gyro."""
 
 
+def scale_of_force(size: float, named: str) -> tuple[float, str]:
+    """Factor to m/s^2 of an accelerometer, ``named`` so, by the size of the mean of its first samples, which is gravity's; 0 where it
+    measures none, and what is the matter ("" where there is no accelerometer)."""
+    if is_gravity(size):
+        return 1.0, ""
+    if _IN_G[0] < size < _IN_G[1]:
+        return GRAVITY, ""
+    if not size:
+        return 0.0, ""
+    if size < _NO_GRAVITY:
+        return 0.0, f"{named} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it."
+    return 0.0, f"{named} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g."
+
+
 class AttitudeFilter:
     """`insert` each sample of the IMU, `advance` to the end of each step."""
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], wheel_radius_m: float) -> None:
         self._mounts = mounts
         self._frame: str | None = None
+        self._unmounted: str | None = None  # frame of an accelerometer whose mount is not known
         self._stamps, self._samples, self._n = np.empty(_BUFFER, np.int64), np.empty((_BUFFER, 6)), 0
         self._imu = _Imu(np.eye(3), np.zeros(3), 0.0, wheel_radius_m, noise.white_rad_per_sqrt_s)
         self._first: list[FloatArray] = []
@@ -183,6 +198,8 @@ class AttitudeFilter:
         """Take the next sample of the first IMU whose mount is known."""
         if self._frame is None and sample.frame_id in self._mounts:
             self._frame = sample.frame_id
+        if self._frame is None and sample.linear_acceleration.any():
+            self._unmounted = sample.frame_id
         if sample.frame_id != self._frame or self._problem or self._is_unusable:
             return
         if not self._imu.scale:
@@ -197,19 +214,14 @@ class AttitudeFilter:
 
     def _check_force(self) -> None:
         """Units and sign of the accelerometer, by the mean of the first samples."""
-        mean = np.mean(self._first, axis=0)
-        size = float(np.linalg.norm(mean))
-        named = f"the accelerometer of IMU '{self._frame}'"
-        if is_gravity(size):
-            self._set_scale(1.0)
-        elif _IN_G[0] < size < _IN_G[1]:
-            self._set_scale(GRAVITY)
-        elif not size:  # no accelerometer
-            self._is_unusable = True
-        elif size < _NO_GRAVITY:
-            self._problem = f"{named} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it. Slopes are not modelled."
+        size = float(np.linalg.norm(np.mean(self._first, axis=0)))
+        scale, self._problem = scale_of_force(size, f"the accelerometer of IMU '{self._frame}'")
+        if self._problem:
+            self._problem += " Slopes are not modelled."
+        elif scale:
+            self._set_scale(scale)
         else:
-            self._problem = f"{named} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g. Slopes are not modelled."
+            self._is_unusable = True
         if self._problem or self._is_unusable:
             self._n = 0
 
@@ -290,12 +302,12 @@ class AttitudeFilter:
         named = f"gravity contradicts the mount of IMU '{self._frame}'"
         if up_z > -least:
             angle = math.degrees(math.acos(min(max(up_z, -1.0), 1.0)))
-            self._problem = f"{named} by {angle:.0f} deg: slopes are not modelled. Correct the mount's roll and pitch."
+            self._problem = f"{named} by {angle:.0f} deg. Slopes are not modelled. Correct the mount's roll and pitch."
         elif self._sums.wheels[2] > _MIN_TURN_RAD:
             if self._sums.wheels[3] > 0.0:  # the gyro agrees with the mount: this driver publishes gravity, not specific force
                 self._set_scale(-self._imu.scale)
             else:
-                self._problem = f"{named}, it hangs upside down: slopes are not modelled. Correct the mount's roll or pitch."
+                self._problem = f"{named}: it hangs upside down. Slopes are not modelled. Correct the mount's roll or pitch."
         return False
 
     def _tilt(self) -> Tilt | None:
@@ -318,6 +330,9 @@ class AttitudeFilter:
         """Problems of the accelerometer, and their remedy."""
         if self._problem:
             return [self._problem]
+        if self._frame is None and self._unmounted is not None:
+            where = "/tf_static or in the robot file's [mounts]"
+            return [f"the mount of IMU '{self._unmounted}' is unknown: slopes are not modelled. Give it in {where}."]
         if self._imu.scale == GRAVITY:
             return [f"the accelerometer of IMU '{self._frame}' is in g, not m/s^2: it was scaled by {GRAVITY}."]
         if self._imu.scale < 0.0:

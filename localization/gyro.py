@@ -58,6 +58,11 @@ class UprightAxis:
         self.axis, self.is_mount_wrong, self.sign = found, True, None
         return True
 
+    @property
+    def is_force_reversed(self) -> bool:
+        """Whether the mount is right, and the accelerometer publishes gravity instead of specific force: by the turns of the wheels."""
+        return self.is_mount_wrong and self.sign is not None and float(self.sign * self.axis @ self._up) >= math.cos(MAX_MOUNT_ERROR_RAD)
+
     def compare(self, angle: float, by_wheels: float) -> None:
         """A turn about the axis, and that by the wheels [rad]: which way the axis points."""
         if self.is_mount_wrong:
@@ -124,7 +129,7 @@ class GyroBuffer:
         if spikes:
             plural = "s" * (spikes > 1)
             found.append(f"IMU '{self._frame}': {spikes} reading{plural} dropped (the yaw rate jumped as no such robot's does).")
-        if not self._axis.is_mount_wrong:
+        if not self._axis.is_mount_wrong or self._axis.is_force_reversed:
             return found
         contradiction = f"the mount of IMU '{self._frame}' contradicts gravity"
         if self._axis.sign is None:

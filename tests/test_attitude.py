@@ -159,8 +159,11 @@ def test_attitude_of_an_imu_on_its_side_without_its_mount_is_named():
     assert "contradicts the mount of IMU 'imu' by 90 deg" in made.warnings()[0]
 
 
-def test_attitude_without_a_mount_is_none():
+def test_attitude_without_a_mount_is_none_and_named():
     made = filter_at(MOUNTS["upright"])
     assert not any(drive(made, MOUNTS["upright"], 10.0, frame="other").values())
     assert not made.has_attitude
+    assert made.warnings() == [
+        "the mount of IMU 'other' is unknown: slopes are not modelled. Give it in /tf_static or in the robot file's [mounts]."
+    ]
     np.testing.assert_array_equal(made.up, [0.0, 0.0, 1.0])

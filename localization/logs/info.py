@@ -7,10 +7,18 @@ import heapq
 import statistics
 import struct
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
+import numpy as np
+
+from localization.attitude import scale_of_force
+from localization.gyro import GRAVITY_SAMPLES
+from localization.logs.decode import decode_imu
+from localization.logs.event_decoder import TopicDecoder
 from localization.logs.reader import Log
 from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
+from motion_models.slope import GRAVITY
 
 _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
 _MAX_LATCHED, _LATCHED_S = 5, 1.0
@@ -129,7 +137,7 @@ class _StampStats:
 
 
 def inspect_log(log: Log) -> LogInfo:
-    """Inspect a log: one pass, which reads the headers of messages only."""
+    """Inspect a log: one pass, which reads the headers of messages only, and the first samples of the IMU."""
     stamped = [channel.topic for channel in log.channels if channel.type in _STAMPED]
     stats_of = {topic: _StampStats() for topic in stamped}
     for raw in log.source.messages(stamped) if stamped else ():
@@ -196,11 +204,22 @@ def _describe_tilt(log: Log) -> str:
     if imu is None or frame not in log.mounts:
         missing = "no IMU" if imu is None else f"no mount of the IMU's frame '{frame}'"
         return f"not available: there is {missing}, and the ground is taken as level."
+    scale, problem = scale_of_force(_first_force(log, imu.topic), f"the accelerometer of {imu.topic}")
+    if not scale:
+        return f"not available, and the ground is taken as level: {problem or f'{imu.topic} has no accelerometer.'}"
+    in_g = ", which is in g and is scaled to m/s^2" if scale == GRAVITY else ""
     in_3d = f" `ekf` then registers the clouds of {lidar.topic} in 3D." if lidar is not None and lidar.kind == "points" else ""
     return (
-        f"by the accelerometer of {imu.topic}. Where the ground tilts by over 3 deg, models take gravity on the slope into account, and "
-        f"poses have height, roll and pitch.{in_3d}"
+        f"by the accelerometer of {imu.topic}{in_g}. Where the ground tilts by over 3 deg, models take gravity on the slope into account, "
+        f"and poses have height, roll and pitch.{in_3d}"
     )
+
+
+def _first_force(log: Log, topic: str) -> float:
+    """Size of the mean specific force of an IMU's first samples, as it is published; 0 where there are none."""
+    samples = islice(log.readings({topic: TopicDecoder(0, decode_imu)}), GRAVITY_SAMPLES)
+    forces = [sample.linear_acceleration for sample in samples]
+    return float(np.linalg.norm(np.mean(forces, axis=0))) if forces else 0.0
 
 
 def _description(source: TopicSource) -> dict[str, str]:

@@ -295,6 +295,18 @@ def test_tilt_in_info_without_an_imu_says_what_is_missing(tmp_path: Path) -> Non
     assert inspect_log(log_of(tmp_path, {"/joint_states": "joints", "/scan": "scan"})).tilt.startswith("not available: there is no IMU")
 
 
+@pytest.mark.parametrize(
+    ("force", "words"), [(0.02, "its driver removes it"), (1.0, "is in g"), (30.0, "neither gravity in m/s^2 nor in g")]
+)
+def test_tilt_in_info_names_what_the_accelerometer_measures(tmp_path: Path, force: float, words: str) -> None:
+    records = [("/imu/data", bags.imu(START + i * S // 10, (0.0, 0.0, 0.0), (0.0, 0.0, force)), START + i * S // 10) for i in range(30)]
+    path = bags.write_mcap(tmp_path / "run.mcap", records)
+    frame = open_log(path, ROBOT).frames["/imu/data"]
+    tilt = inspect_log(open_log(path, dataclasses.replace(ROBOT, mounts={**ROBOT.mounts, frame: Mount()}))).tilt
+    assert words in tilt
+    assert tilt.startswith("not available") == (force != 1.0)
+
+
 def test_topic_of_the_gyro_is_the_imu_beside_an_accelerometer(tmp_path: Path) -> None:
     """Cameras publish both as Imu, each with zeros for the other; an accelerometer alone is used for gravity."""
     log = log_of(tmp_path, {"/joint_states": "joints", "/camera/accel/sample": "imu", "/camera/gyro/sample": "imu"})
