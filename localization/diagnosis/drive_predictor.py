@@ -125,7 +125,7 @@ class Unmodelled:
     """What no robot file has of the contacts, as nuisances of a diagnosis (`model_error`)."""
 
     has_stiffness: bool = False
-    """The tyres' slip stiffness, how it grows with speed, and how far contacts give way while speeds change, are unknown."""
+    """The tyres' slip stiffness, and how it grows with speed, are unknown."""
     slip_share: float = 0.0
     """Sigma of slips by kind of motion, alike on both sides, that the model does not have, over the wheels' way."""
     log_stiffness: float = 0.0
@@ -460,21 +460,6 @@ def relative_speeds(predictor: DrivePredictor) -> FloatArray:
     speeds = np.array([np.sqrt(np.mean(np.square(batch.wheels[inside]))) for inside in batch.intervals()])
     mean = max(float(speeds.mean()), 1e-9)
     return np.asarray(speeds / mean - 1.0)
-
-
-_GIVE_S = 0.01
-"""Sigma of how far wheels slip while speeds change, over the change: MuJoCo's contacts stop a slip within 5 to 9 ms [s]."""
-
-
-def give_columns(predictor: DrivePredictor) -> FloatArray:
-    """(M, 6, 2) motion by contacts that give way while speed and turning rate change, for `_GIVE_S` seconds of the change."""
-    batch, twist = predictor.batch, predictor.nominal_twist
-    found = np.zeros((len(batch.ends), len(CHANNELS), 2))
-    for i, inside in enumerate(batch.intervals()):
-        gains = np.diff(twist[inside], axis=0, prepend=twist[inside][:1])[:, [0, 2]] * _GIVE_S
-        moved = moved_by(twist[inside], batch.dt[inside], gains)
-        found[i, :3] = np.column_stack([moved[:, 0, 0], moved[:, 2, 1]])
-    return found
 
 
 def rolling_column(predictor: DrivePredictor) -> FloatArray:

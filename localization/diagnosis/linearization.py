@@ -17,7 +17,6 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import (
     Baseline,
     DrivePredictor,
-    give_columns,
     mirrored,
     relative_speeds,
     rolling_column,
@@ -339,7 +338,7 @@ def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArr
         for cause in (slip_stiffness_cause(predictor.drive.robot), stiffness_exponent_cause()):
             columns.append(predictor.signature(hypothesis, cause, rows)[..., None] * (cause.plausible / FLAT))
         columns[1] *= math.exp(predictor.unmodelled.log_stiffness)  # the cause is relative to the robot file's stiffness
-        columns += [give_columns(predictor) / FLAT, rolling_column(predictor) / FLAT]
+        columns.append(rolling_column(predictor) / FLAT)
     if predictor.unmodelled.slip_share:
         slips = mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT)
         columns += [slips, slips * relative_speeds(predictor)[:, None, None]]
