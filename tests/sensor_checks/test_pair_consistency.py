@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from localization.estimators import Estimate, LearnedParameter, Residuals
-from localization.events import Step, Turn
+from localization.events import Scan, Step, Turn
 from localization.log_replay import replay
 from localization.logs import open_log
 from localization.pipeline import Trial
@@ -20,13 +21,13 @@ from localization.sensor_checks.innovations import InnovationWindows
 from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
 from localization.sensor_checks.reckoning import ESTIMATE
 from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency
-from localization.sensor_checks.sweep_times import REVERSED_TIMES
+from localization.sensor_checks.sweep_times import OTHER_UNIT, REVERSED_TIMES
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.registry import make_model
 from tests.helpers import bags, entrance_drives
 from tests.helpers.entrance_drives import Publishing, Vehicle
-from tests.helpers.event_faults import faults_of_stamps, faults_of_turns, without_gyro
+from tests.helpers.event_faults import EventFault, change_scans, faults_of_stamps, faults_of_turns, without_gyro
 from tests.helpers.extended import cases
 from tests.helpers.fault_drives import in_room, run, upright_axis, without_lidar
 
@@ -200,3 +201,23 @@ def test_sums_of_innovations_exceed_a_limit_as_often_as_a_normal_variable(limit:
         assert worst is not None
         beyond += worst.sigmas > limit
     assert abs(beyond - n * expected) < 3.0 * math.sqrt(n * expected * (1.0 - expected))
+
+
+def as_clouds(unit: float) -> EventFault:
+    """Scans as clouds of six rings whose times are ``unit`` times what they should be; backwards where it is negative."""
+
+    def change(scan: Scan, _first_ns: int) -> Scan:
+        rings = [scan.points + np.array([0.0, 0.0, z]) for z in np.linspace(-0.15, 0.6, 6)]
+        times = abs(unit) * (scan.offsets if unit > 0.0 else scan.offsets.max() - scan.offsets)
+        return replace(scan, points=np.vstack(rings), offsets=np.tile(times, 6), is_planar=False)
+
+    return change_scans(change)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("unit", [1.0, 0.1, -0.1])
+def test_points_times_of_another_unit_are_named_and_undone(unit: float) -> None:
+    outcome = run(in_room(), as_clouds(unit))
+    assert (OTHER_UNIT in outcome.pipeline.checks.found) == (unit != 1.0), outcome.warnings
+    error, sigma = outcome.last
+    assert error < max(5.0 * sigma, 0.03)

@@ -166,6 +166,19 @@ WARTHOG = BaseLog("warthog, arcs", (ROBOTS / "warthog.toml").read_text(), simula
 ROVER = BaseLog("rover_pro, laps", (ROBOTS / "rover_pro.toml").read_text(), simulated("rover_pro", "laps", 93, 0.0, 75.0))
 ROSBOT = BaseLog("rosbot_xl, laps", (ROBOTS / "rosbot_xl.toml").read_text(), simulated("rosbot_xl", "laps", 94, 5.0, 70.0))
 
+# of the fifth set
+WING = BaseLog("fr079, 300 to 390 s", CORRIDOR.robot, real_building("fr079", "fr079.mcap", 300.0, 90.0))
+STUDIOS = BaseLog("MIT-CSAIL, 300 to 380 s", OFFICE.robot, real_building("mit-csail", "csail.mcap", 300.0, 80.0))
+GALLERY = BaseLog("ACES, 1000 to 1090 s", HALL.robot, real_log("aces/aces.mcap", 1000.0, 90.0))
+LOT = BaseLog("Husky outdoors, 290 to 390 s", MEADOW.robot, real_log("husky-outdoor-gps/test1.bag", 290.0, 100.0), 0.5)
+ICE = BaseLog("BorealTC ice", ASPHALT.robot, boreal("ICE", "02", 0.0, 56.0), 0.25)
+A300 = BaseLog("husky_a300, laps", (ROBOTS / "husky_a300.toml").read_text(), simulated("husky_a300", "laps", 95, 5.0, 70.0))
+MINI = BaseLog("scout_mini, laps", (ROBOTS / "scout_mini.toml").read_text(), simulated("scout_mini", "laps", 96, 0.0, 75.0))
+BURGER = BaseLog(
+    "turtlebot3_burger, laps", (ROBOTS / "turtlebot3_burger.toml").read_text(), simulated("turtlebot3_burger", "laps", 97, 0.0, 75.0)
+)
+VAULT = BaseLog("vaultbot, arcs", (ROBOTS / "vaultbot.toml").read_text(), simulated("vaultbot", "preliminary", 98, 0.0, 80.0))
+
 
 def trajectories(folder: Path) -> dict[str, Trajectory]:
     """Written trajectories by estimator."""
