@@ -78,7 +78,7 @@ class SensorChecks:
 
     def correct(self, scan: Scan) -> Scan:
         """``scan`` with the times of its points as they were found to be."""
-        return self._sweep_times.correct(scan) if self._sweep_times.is_wrong and scan.is_planar else scan
+        return self._sweep_times.correct(scan) if self._sweep_times.is_wrong else scan
 
     def apply(self, step: Step, estimator: Estimator) -> Step:
         """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain; ``estimator`` has made

@@ -18,7 +18,7 @@ from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
-from localization.sensor_checks.sweep_times import NO_SWEEP, REVERSED_TIMES
+from localization.sensor_checks.sweep_times import NO_SWEEP, OTHER_UNIT, REVERSED_TIMES
 
 _FLOOR_RAD = 0.01
 """Turn of a standing robot that no model has: tyres that relax, someone who leans on it [rad]."""
@@ -85,7 +85,7 @@ CAUSES: Mapping[Pair, Causes] = {
 
 _OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_STANDING)
 _OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)
-_OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION, REVERSED_TIMES, NO_SWEEP)
+_OF_LIDAR = (LIDAR_OPPOSITE, LIDAR_DIRECTION, REVERSED_TIMES, NO_SWEEP, OTHER_UNIT)
 NAMED: Mapping[Pair, tuple[SensorFault, ...]] = {
     GYRO_WHEELS: (*_OF_GYRO, *_OF_WHEELS, CLOCKS_APART),
     LIDAR_GYRO: (*_OF_GYRO, *_OF_LIDAR),

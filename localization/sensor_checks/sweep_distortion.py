@@ -19,6 +19,8 @@ from motion_models.se2 import FloatArray, Pose2, Twist2
 
 _ITERATIONS, _SCALE_M, _MAX_DISTANCE_M, _MIN_BEARINGS = 3, 0.05, 1.0, 30
 """Gauss-Newton steps; scale of the robust loss (Cauchy) [m]; largest distance of associated points along each axis [m]; fewest of these."""
+_SAME_TIME = 0.05
+"""Largest part of the sweep in which the points of one bearing (2 degrees) are measured."""
 _NOISE_M = 0.01
 """Least noise of a range [m]."""
 
@@ -57,13 +59,20 @@ class WeightedMean:
         return math.sqrt(max(scatter, 1.0) / self._information)
 
 
-def times_derivative(profile: Profile, points: FloatArray, times: FloatArray, twist: Twist2) -> FloatArray:
-    """(180, 2) t (v + omega x p) of each bearing of ``profile`` [m], by ``points`` (N, 2) about the sensor and their ``times`` (N,) after
-    the sweep's middle [s]; ``twist`` (3,) of the body."""
-    by_bearing = np.full(BEARINGS, np.nan)
-    by_bearing[bearing_bins(points)] = times
+def times_by_bearing(points: FloatArray, times: FloatArray) -> FloatArray:
+    """(180,) time after the sweep's middle of the points of each bearing [s], by ``points`` (N, 2) about the sensor and their ``times``
+    (N,); NaN without any, and where they have several, as of a scanner that does not turn."""
+    bins, first, last = bearing_bins(points), np.full(BEARINGS, np.inf), np.full(BEARINGS, -np.inf)
+    np.minimum.at(first, bins, times)
+    np.maximum.at(last, bins, times)
+    is_one = last - first <= _SAME_TIME * np.ptp(times)
+    return np.where(is_one & np.isfinite(first), last, np.nan)
+
+
+def times_derivative(profile: Profile, times: FloatArray, twist: Twist2) -> FloatArray:
+    """(180, 2) t (v + omega x p) of each bearing of ``profile`` [m], by its ``times`` (180,); ``twist`` (3,) of the body."""
     x, y = (profile.points + profile.center).T
-    return np.asarray(by_bearing[:, None] * np.column_stack([twist[0] - twist[2] * y, twist[1] + twist[2] * x]))
+    return np.asarray(times[:, None] * np.column_stack([twist[0] - twist[2] * y, twist[1] + twist[2] * x]))
 
 
 def fit_factor(a: TimedProfile, b: TimedProfile, body_a_T_b: Pose2) -> tuple[float, float] | None:

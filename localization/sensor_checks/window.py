@@ -94,9 +94,9 @@ class Window:
         return profile_of(scan, self._mounts.get(scan.frame_id, Mount()), self._config)
 
     def points_about_lidar(self, scan: Scan) -> Points2:
-        """(N, 2) all points of a planar ``scan`` about its LiDAR, in the body's axes."""
+        """(N, 2) all points of ``scan`` about its LiDAR, in the body's axes."""
         R = self._mounts.get(scan.frame_id, Mount()).rotation
-        return np.ascontiguousarray(scan.points[:, :2] @ R[:2, :2].T)
+        return np.ascontiguousarray(scan.points @ R[:2].T)
 
 
 @dataclass
