@@ -179,15 +179,27 @@ BURGER = BaseLog(
 )
 VAULT = BaseLog("vaultbot, arcs", (ROBOTS / "vaultbot.toml").read_text(), simulated("vaultbot", "preliminary", 98, 0.0, 80.0))
 
+# of the sixth set
+ANNEX = BaseLog("fr079, 850 to 930 s", CORRIDOR.robot, real_building("fr079", "fr079.mcap", 850.0, 80.0))
+LIBRARY = BaseLog("MIT-CSAIL, 130 to 200 s", OFFICE.robot, real_building("mit-csail", "csail.mcap", 130.0, 70.0))
+LOOP = BaseLog("ACES, 420 to 500 s", HALL.robot, real_log("aces/aces.mcap", 420.0, 80.0))
+SNOW = BaseLog("BorealTC snow", ASPHALT.robot, boreal("SNOW", "03", 0.0, 35.0), 0.25)
+A300_ARCS = BaseLog("husky_a300, arcs", A300.robot, simulated("husky_a300", "preliminary", 111, 0.0, 80.0))
+ROSBOT_2 = BaseLog("rosbot, laps", (ROBOTS / "rosbot.toml").read_text(), simulated("rosbot", "laps", 112, 0.0, 70.0))
+PIONEER_2 = BaseLog("pioneer_3dx, laps", (ROBOTS / "pioneer_3dx.toml").read_text(), simulated("pioneer_3dx", "laps", 113, 0.0, 70.0))
+LEO_ARCS = BaseLog("leo, arcs", LEO.robot, simulated("leo", "preliminary", 114, 0.0, 80.0))
+
 
 def trajectories(folder: Path) -> dict[str, Trajectory]:
     """Written trajectories by estimator."""
     found = {}
     for estimator in ("odometry", "ekf"):
         (path,) = folder.glob(f"*_{estimator}.tum")
-        table = np.array([[float(v) for v in line.split()] for line in path.read_text().splitlines() if line[:1] not in "#"])
-        poses = np.column_stack([table[:, 1:3], 2.0 * np.arctan2(table[:, 6], table[:, 7])])
-        found[estimator] = Trajectory(np.round(table[:, 0] * S).astype(np.int64), poses)
+        rows = [line.split() for line in path.read_text().splitlines() if line[:1] not in "#"]
+        table = np.array([[float(v) for v in row[1:]] for row in rows])
+        poses = np.column_stack([table[:, :2], 2.0 * np.arctan2(table[:, 5], table[:, 6])])
+        stamps = [int(row[0].replace(".", "")) for row in rows]  # with nanoseconds, which a double does not resolve
+        found[estimator] = Trajectory(np.array(stamps, dtype=np.int64), poses)
     return found
 
 
@@ -231,7 +243,9 @@ def written(
     records, truth = base.load()
     changed = edit(records)
     is_ordered = getattr(edit, "keeps_order", False)
-    path = bags.write_mcap(folder / "log.mcap", changed if is_ordered else sorted(changed, key=lambda record: record[2]))
+    ordered = changed if is_ordered else sorted(changed, key=lambda record: record[2])
+    is_sqlite = getattr(edit, "is_sqlite", False)
+    path = bags.write_ros2_bag(folder / "log", ordered, "sqlite3") if is_sqlite else bags.write_mcap(folder / "log.mcap", ordered)
     (folder / "robot.toml").write_text(robot(base.robot))
     return path, folder / "robot.toml", truth
 
