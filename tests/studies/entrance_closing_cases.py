@@ -1,4 +1,4 @@
-"""A sixth set of inputs, for `entrance_commands closing`. Answers were written down before the first run, which is the one that is scored."""
+"""A sixth set of inputs, for `entrance_commands closing`; answers were written down before the first run, which is scored."""
 
 from __future__ import annotations
 
