@@ -17,6 +17,9 @@ CORRECTED = "Corrected in this run; write to the robot file:"
 """Words in sentences about what is certain, before keys of the robot file."""
 MAX_RATIO = 2.5
 """Factor by which wheels may be off without a wrong unit: slip, a wrong radius or track, as in the sensor checks."""
+_NEAR, _NEAR_M_S, _MIN_NEAR = 0.3, 0.05, 0.6
+"""Part of a speed, and speed [m/s], by which another sensor's may be off its usual multiple; least share of fast intervals that are near.
+Of fr079's corridor, whose walls are parallel, a fifth is not."""
 _DEG = math.pi / 180.0
 _GYRO_IN_DEGREES = (25.0, 130.0)
 """Factor of a gyro in deg/s (57.3), with the factor of 2.3 by which wheels may be off on loose floor."""
@@ -106,7 +109,7 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
 
 def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot) -> UnitReport:
     """Unit of the lengths of a driver's odometry, whose forward speed is ``speed`` (n,), by the speed (n,) of another sensor [m/s]."""
-    ratio = None if other is None else _ratio(speed, other)
+    ratio = None if other is None else _ratio(speed, _without_outliers(speed, other))
     if ratio is None or 1 / MAX_RATIO <= ratio <= MAX_RATIO:
         return UnitReport(robot)
     value = ratio * robot.driver.length_unit_m
@@ -114,11 +117,20 @@ def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot)
     is_named = abs(math.log(value / _LENGTHS[name])) <= _SIGMAS * _SIGMA_BY_SPEED
     exact = float(f"{_LENGTHS[name] if is_named else value:.6g}")
     text = (
-        f"its speeds are {1.0 / ratio:.3g} times those of the LiDAR: its driver publishes {name if is_named else 'another unit'}."
+        f"its speeds are {1.0 / ratio:.3g} times those of the LiDAR: its driver publishes"
+        f" {name if is_named else 'another unit'}{', or has another wheel radius' if 0.1 < ratio < 10.0 else ''}."
         f" {CORRECTED} driver.length_unit_m = {exact:g}, or let it publish metres and metres per second."
     )
     robot = replace(robot, driver=replace(robot.driver, length_unit_m=exact))
     return UnitReport(robot, (text,), {"driver.length_unit_m": f"{exact:g}"})
+
+
+def _without_outliers(speed: FloatArray, other: FloatArray) -> FloatArray:
+    """``other`` (n,), NaN where it is far from the usual multiple of ``speed`` (n,): scans that were matched to the wrong place."""
+    fast = np.abs(speed) > 0.5 * np.nanpercentile(np.abs(speed), 95.0)
+    usual = float(np.nan_to_num(np.nanmedian(other[fast] / speed[fast]))) if fast.any() else 0.0
+    is_near = np.abs(other - usual * speed) <= _NEAR * abs(usual) * np.abs(speed) + _NEAR_M_S
+    return np.where(is_near, other, np.nan) if is_near[fast].mean() >= _MIN_NEAR else other
 
 
 def _check_side_units(signals: WheelSignals, robot: Robot) -> UnitReport | None:

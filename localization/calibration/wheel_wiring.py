@@ -48,6 +48,8 @@ _MIN_CORRELATION = 0.6
 """Correlation above which a source does not contradict the robot file, as in the sensor checks: no window of healthy logs is below."""
 _SURE_CORRELATION = 0.9
 """What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
+_LIKELY_CORRELATION = 0.8
+"""Of speeds with the turns of a gyro, which are unlike the same odometry's turns."""
 _MIN_SPEED_M_S = 0.02
 """Root mean square of speeds that are compared."""
 _MIN_CLOCK_INTERVALS = 60
@@ -66,10 +68,12 @@ _MIN_TURN_PART = 1e-3
 _FASTEST_M_S = 20.0
 """Of an odometry in metres."""
 _USUAL_M_S = (0.05, 1.2)
-"""Fast speeds (95 % of all are slower) of most drives; those of an odometry outside are compared with the LiDAR's."""
+"""Fast speeds (95 % of all are slower) of most drives; those of a live odometry outside are compared with the LiDAR's, of logs all."""
 _MIN_AHEAD_M, _MIN_TURNED_RAD, _SAME_END = 0.1, 1.5, 0.25
 """LiDAR ahead of the middle or behind it [m], turns in all, and share of the sideways motion of the other end, that decide at which end it
 is: robots turn about a point up to 5 cm from the middle of their wheels."""
+_MAX_DEAD = 1e-6
+"""Part of the rates of a side's fastest wheel, up to which an encoder counts nothing."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -148,6 +152,9 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
         return _joined(found, check_wiring(open_log(log.path, clock.robot, log.overrides), is_clock_known=True))
     if not signals.joints:
         return _check_odometry(log, signals, is_clock_known)
+    dead = _without_dead(log.robot, signals)
+    if dead is not None:
+        return _joined(dead, check_wiring(open_log(log.path, dead.robot, log.overrides), is_clock_known))
     signals, found = _wiring_of(log, signals, is_clock_known)
     # as the corrected robot has them
     if found.keys:
@@ -161,6 +168,28 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     is_ambiguous = found.is_ambiguous or units.is_ambiguous
     robot = _with_unknown_signs(units.robot) if is_ambiguous else units.robot
     return WiringReport(robot, sentences, {**found.keys, **units.keys}, is_ambiguous, {**found.correlations}, units.ratios)
+
+
+def _without_dead(robot: Robot, signals: WheelSignals) -> WiringReport | None:
+    """``robot`` without the wheels whose encoders count nothing while another one of their side turns; None without any."""
+    rates = np.nan_to_num(signals.joint_rates)
+    size, is_left = np.sqrt((rates**2).mean(axis=0)), np.arange(len(signals.joints)) < signals.left
+    most = np.where(is_left, size[is_left].max(), size[~is_left].max())
+    is_kept = (size > _MAX_DEAD * most) | (most == 0.0)
+    if is_kept.all():
+        return None
+    names = np.array(signals.joints)
+    left, right = tuple(names[is_left & is_kept].tolist()), tuple(names[~is_left & is_kept].tolist())
+    keys = {
+        f"joints.{side}": _list(kept)
+        for side, kept, n in (("left", left, signals.left), ("right", right, (~is_left).sum()))
+        if len(kept) < n
+    }
+    text = (
+        f"{', '.join(names[~is_kept])}: its encoder counts nothing while another wheel of its side turns, which is used alone. Check the"
+        f" encoder. {CORRECTED} {'; '.join(f'{key} = {value}' for key, value in keys.items())}."
+    )
+    return WiringReport(replace(robot, joints=replace(robot.joints, left=left, right=right)), (text,), keys)
 
 
 @dataclass(frozen=True)
@@ -338,7 +367,7 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     assert log.sources.wheels is not None
     topic = log.sources.wheels.topic
     fastest = float(np.nan_to_num(np.nanpercentile(np.abs(signals.speeds[topic]), 95.0))) if topic in signals.speeds else 0.0
-    if fastest > 0.0 and not _USUAL_M_S[0] <= fastest <= _USUAL_M_S[1]:
+    if fastest > 0.0 and (isinstance(log, Log) or not _USUAL_M_S[0] <= fastest <= _USUAL_M_S[1]):
         signals = with_lidar(log, signals)
         units = check_length_unit(signals.speeds[topic], signals.speeds.get("LiDAR"), log.robot)
         if units.findings:
@@ -358,6 +387,14 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     offset_s = None if is_clock_known else clock_offset(turn, gyro)
     if offset_s is not None:
         return _other_clock(log, signals, offset_s)
+    way = correlation(signals.speeds[topic], gyro, MIN_TURN_RAD_S, MAX_BIAS_RAD_S) if topic in signals.speeds else None
+    if way is not None and abs(r) < _MIN_CORRELATION and abs(way) >= _LIKELY_CORRELATION:
+        text = (
+            f"{topic}: its speeds are the turns of the gyro (correlation {way:+.2f}, of its turns {r:+.2f}): one side of its wheels counts"
+            " backwards in its driver, so that it turns where the robot goes ahead. Correct the sign of that encoder or motor there; until"
+            " then nothing is corrected, and the covariance is wide."
+        )
+        return WiringReport(_with_unknown_signs(log.robot), (text,), is_ambiguous=True, correlations={f"speed of {topic} by the gyro": way})
     measured = {f"turn of {topic} by the gyro": r}
     if r > -_SURE_CORRELATION:
         return _check_multiplier(log, float(np.nansum(turn * gyro) / max(np.nansum(turn**2), 1e-12)), measured)

@@ -14,7 +14,7 @@ from localization.calibration.wheel_wiring import WiringReport, check_wiring, op
 from localization.cli import main
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot_file import load_robot, robot_toml
-from tests.helpers import entrance_drives
+from tests.helpers import bags, entrance_drives
 from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.helpers.extended import cases
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, Change, drive
@@ -51,6 +51,34 @@ def test_wiring_with_reversed_wheels_is_corrected(tmp_path: Path, kind: str, rev
     (tmp_path / "r.toml").write_text(robot_toml(report.robot))
     corrected = check_wiring(open_log(tmp_path / "log.mcap", load_robot(tmp_path / "r.toml")))
     assert corrected.findings == ()
+
+
+def test_wiring_without_an_encoder_that_counts_nothing(tmp_path: Path) -> None:
+    kept = np.array([1.0, 0.0, 1.0, 1.0])
+    report = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (kept * position, kept * velocity)))
+    assert report.robot.joints.left == LEFT[:1]
+    assert report.robot.joints.right == RIGHT
+    assert report.keys == {"joints.left": f'["{LEFT[0]}"]'}
+    assert "counts nothing" in report.findings[0]
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_wiring_of_a_driver_with_a_reversed_side_is_named(tmp_path: Path, side: float) -> None:
+    """Its ways are turns, and its turns ways: nothing of it can be used."""
+    vehicle = Vehicle(seed=71)
+
+    def circling(record: bags.Record) -> bags.Record:
+        topic, message, log = record
+        if topic != "/odom":
+            return record
+        v, w = message.twist.twist.linear.x, message.twist.twist.angular.z
+        half = 0.5 * vehicle.track
+        return topic, bags.odometry(log - bags.S // 100, 0.0, 0.0, 0.0, side * half * w, side * v / half), log
+
+    records = entrance_drives.records_of(vehicle, entrance_drives.drive(vehicle), Publishing(forms="odometry"))
+    report = check_wiring(open_log(bags.write_mcap(tmp_path / "log.mcap", map(circling, records)), vehicle.robot()))
+    assert report.is_ambiguous
+    assert "counts backwards in its driver" in report.findings[0]
 
 
 def test_wiring_with_all_reversed_needs_a_third_source(tmp_path: Path) -> None:

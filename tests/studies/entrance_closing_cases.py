@@ -110,10 +110,15 @@ WHEELS = (
         joints(lambda a, r: (a * [1, 1, 1, -1], r * [1, 1, 1, -1]), CLEARPATH_JOINTS),
         ["joints.reversed"],
     ),
+    based("wheels", "rpm of the motors, gear of 30", PIONEER_2, joints(lambda a, r: ([], 30.0 * RPM * r)), ["gear", "revolutions"]),
     based(
-        "wheels", "rpm of the motors, gear of 30", PIONEER_2, joints(lambda a, r: ([], 30.0 * RPM * r)), ["gear", "revolutions", "times"]
+        "wheels",
+        "Twist in cm/s",
+        LEO_ARCS,
+        to_twist(0.0625, 0.33, 100.0),
+        ["times too large", "times those of", "centimetres"],
+        is_open=True,
     ),
-    based("wheels", "Twist in cm/s", LEO_ARCS, to_twist(0.0625, 0.33, 100.0), ["times", "centimetres"], is_open=True),
     based("wheels", "three of ten messages lost", ROSBOT_2, with_losses("/joint_states", 0.3)),
     based(
         "wheels",

@@ -127,7 +127,7 @@ WHEELS = (
         "driver that circles, no LiDAR",
         LOT,
         changed("/husky_velocity_controller/odom", circling),
-        ["/husky_velocity_controller/odom"],
+        ["counts backwards in its driver"],
         is_open=True,
     ),
     based(
@@ -135,7 +135,7 @@ WHEELS = (
         "driver's radius 3.3 times too large",
         WING,
         both(without("/joint_states"), changed("/odom", stretched(3.3))),
-        ["times", "unit"],
+        ["times those of the LiDAR"],
         is_open=True,
     ),
     based("wheels", "degrees from 0 to 360", MINI, joints(wrapped_degrees), ["degrees"]),
