@@ -20,6 +20,7 @@ from motion_models.friction.equilibrium import Floor, Loads
 from motion_models.friction.model import FrictionModel
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from motion_models.slope import Slope
 
 balance = kernel(equilibrium.balance)
 THESIS_SECONDS = 70.0  # Ebersole 2016, Sec. 3.4
@@ -92,6 +93,11 @@ def timings(rounds: int = 15) -> list[Timing]:
         command = model.twist(wheels, 0.9 * cg, params).value[:, [0, 2]]
         inverse = median_time(lambda c=command, g=0.9 * cg: model.wheels(c, g, params), 1000, rounds)  # type: ignore[misc]
         found.append(Timing(f"friction, inverse, {where}", inverse, math.nan))
+    wheels, cg = cases(rng, 1000, arms)
+    angle, steep = rng.uniform(-math.pi, math.pi, 1000), np.tan(np.radians(rng.uniform(0.0, 10.0, 1000)))
+    slope = Slope(np.column_stack([steep * np.cos(angle), steep * np.sin(angle)]), robot.geometry.cg_height_m)
+    tilted = median_time(lambda: model.twist_on_slope(wheels, cg, params, slope), 1000, rounds)
+    found.insert(1, Timing("friction on slopes to 10 degrees, the same", tilted, math.nan))
     wheels, cg = cases(rng, 50, arms)
     for what, compiled in (("in numpy", False), ("compiled", True)):
         once = median_time(lambda k=compiled: [by_scipy(model, w, c, params, k) for w, c in zip(wheels, cg, strict=True)], 50, 5)  # type: ignore[misc]

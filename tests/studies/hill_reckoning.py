@@ -28,6 +28,9 @@ from tests.helpers.hills import HillDrive
 from tests.helpers.in_space import true_poses
 from tests.helpers.mujoco_hills import Wander, drive
 
+_STATION = 10
+"""Samples between which way and turns are summed: .2 s, in which a robot that rocks goes nowhere."""
+
 
 @dataclass(frozen=True)
 class Reckoning:
@@ -105,6 +108,8 @@ def main() -> None:
     given = parser.parse_args()
     columns = (
         "seed",
+        "way [m]",
+        "turned [rad]",
         "whole [m]",
         "by heading",
         "by attitude",
@@ -118,6 +123,7 @@ def main() -> None:
         "NEES at the end",
     )
     print(f"| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")
+    rows = []
     for seed in range(*map(int, given.seeds.split(":"))):
         made = drive(Wander(seed), given.seconds, seed=seed, softness=given.softness)
         if given.deflection is not None:
@@ -126,10 +132,24 @@ def main() -> None:
             friction = {**made.robot.models["friction"], "slip_stiffness": given.stiffness}
             made = replace(made, robot=replace(made.robot, models={**made.robot.models, "friction": friction}))
         r = reckon(made)
-        rms = [f"{np.sqrt(np.mean(np.sum(e**2, axis=1))):.2f}" for e in (r.whole, r.heading, r.attitude, r.slip, r.flat)]
-        ends = [f"{e[-1, 2]:+.2f}" for e in (r.attitude, r.slip, r.flat)]
-        heights = f"{r.whole[-1, 2]:+.2f} | {np.sqrt(np.mean(r.whole[:, 2] ** 2)):.2f}"
-        print(f"| {seed} | {' | '.join(rms)} | {heights} | {' | '.join(ends)} | {r.nees:.1f} |", flush=True)
+        rows.append(_numbers(made, r))
+        print(f"| {seed} | {_cells(rows[-1])} |", flush=True)
+    for name, of in (("mean", np.mean), ("median", np.median)):
+        print(f"| {name} | {_cells(of(rows, axis=0))} |")
+
+
+def _numbers(made: HillDrive, r: Reckoning) -> list[float]:
+    """Way [m] and turns [rad] of the drive, RMS of the position by parts [m], heights [m], NEES."""
+    stations, yaw = made.positions[::_STATION], np.unwrap(np.arctan2(made.rotations[::_STATION, 1, 0], made.rotations[::_STATION, 0, 0]))
+    way, turned = float(np.linalg.norm(np.diff(stations, axis=0), axis=1).sum()), float(np.abs(np.diff(yaw)).sum())
+    rms = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (r.whole, r.heading, r.attitude, r.slip, r.flat)]
+    height = [float(r.whole[-1, 2]), float(np.sqrt(np.mean(r.whole[:, 2] ** 2)))]
+    return [way, turned, *rms, *height, *(float(e[-1, 2]) for e in (r.attitude, r.slip, r.flat)), r.nees]
+
+
+def _cells(row: FloatArray | list[float]) -> str:
+    way, turned, *errors, nees = row
+    return f"{way:.0f} | {turned:.0f} | {' | '.join(f'{e:.2f}' for e in errors)} | {nees:.1f}"
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 """Slopes: what the flat model gets wrong and what the friction model on slopes predicts, beside measurements in MuJoCo.
 
-python -m tests.studies.hills
+python -m tests.studies.hills [law|planes|clouds|nees|ramp]
 
 The measurements are two independent sets, turning in place on inclined planes, with soft contacts (ellipsoid wheels, solref .01 to .1,
 elliptic cones, steps of 1 ms or less); nothing of the law is fitted to them. The first is of a robot of a Husky's size, 10 s, about 540
-degrees; the second gives k and the centre of rotation over all headings, mu 0.6 and contacts that slide (slip_stiffness 100). The third
-table replays wheels and IMU of drives in MuJoCo (`tests.helpers.mujoco_hills`): turns in place, and 2 min over hills; some minutes of
-computing. The last one adds a 3D LiDAR (`python -m tests.studies.hills clouds [--trees A:B] [--grass A:B]` prints it alone; `nees` the NEES
-over seeds, `ramp` a ramp with a crest). Needs the extra `mujoco`.
+degrees; the second gives k and the centre of rotation over all headings, mu 0.6 and contacts that slide (slip_stiffness 100): table `law`.
+`planes` replays wheels and IMU of turns in place, straight lines and arcs on inclined planes in MuJoCo (`tests.helpers.mujoco_hills`),
+`clouds [--trees A:B] [--grass A:B]` adds a 3D LiDAR on hills; `nees` has the NEES over seeds, `ramp` a ramp with a crest. Without a name
+`law`, `planes` and `clouds` are printed, in some minutes. Needs the extra `mujoco`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ import numpy as np
 from kiss_icp.config import load_config
 from kiss_icp.kiss_icp import KissICP
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
-from localization.events import Scan
+from localization.events import ImuSample, Scan
 from localization.lidar import Sweep
 from localization.log_replay import replay
 from localization.pipeline import ReplayConfig, Trial
@@ -35,7 +36,7 @@ from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
 from tests.helpers.hill_scans import MOUNT, SWEEP_NS, make_scene, scans
-from tests.helpers.hills import RAMP, HillDrive, with_accelerometer_bias
+from tests.helpers.hills import RAMP, HillDrive, with_accelerometer_bias, with_gyro_bias
 from tests.helpers.in_space import aligned_rms, run_in_space, true_poses
 from tests.helpers.mujoco_hills import Wander, drive, steady, turn_in_place
 
@@ -154,18 +155,41 @@ def _level(yaw: float, ways: FloatArray) -> FloatArray:
     return np.asarray(ways @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
+def print_law() -> None:
+    """The law beside both sets of measurements."""
+    print(
+        "| slope | mu | CG [m] | slid downhill: MuJoCo = flat model's error | with the law | left | turned more: MuJoCo | law |\n"
+        + "|---" * 8
+        + "|"
+    )
+    for row in TURNINGS:
+        x, _, yaw = turn(row)
+        more = yaw / _TURNED_RAD - 1.0
+        print(
+            f"| {row.slope_deg:.0f} deg | {row.mu} | {row.cg_height_m:.2f} | {row.slid_m:.2f} m | {-x:.2f} m | {-x - row.slid_m:+.2f} m "
+            f"| {row.turned_more:.1%} | {more:.1%} |"
+        )
+    print("\n| robot | slope | k: law | k: MuJoCo | x of the centre of rotation: law / MuJoCo [m] | y |\n" + "|---" * 6 + "|")
+    for seen in HEADINGS:
+        law = over_headings(seen)
+        print(
+            f"| {seen.robot} | {seen.slope_deg:.0f} deg | {law.k[0]:.3f} to {law.k[1]:.3f} | {seen.k[0]:.3f} to {seen.k[1]:.3f} "
+            f"| {law.x_m:.3f} / {seen.x_m:.3f} | {law.y_m:.3f} / {seen.y_m:.3f} |"
+        )
+
+
 def print_replays() -> None:
-    """Replays of drives in MuJoCo: wheels and IMU in, poses out."""
+    """Replays of drives on planes in MuJoCo: wheels and IMU in, poses out; `tests.studies.hill_reckoning` has those over hills."""
     print("\n| MuJoCo, replayed | estimator | model | end [m] | RMS [m] | over 10 s [m] | height at the end [m] |\n" + "|---" * 7 + "|")
     drives = {
         f"in place, {deg:.0f} deg, mu {mu}": (turn_in_place, 12.0, mu, deg)
         for deg, mu in ((5.0, 0.8), (10.0, 0.8), (5.0, 0.5), (10.0, 0.5))
     }
     drives |= {
-        f"{name}, 10 deg, mu 0.8": (steady(*c), 12.0, 0.8, 10.0)
+        f"{name}, {deg:.0f} deg, mu 0.8": (steady(*c), 12.0, 0.8, deg)
+        for deg in (5.0, 10.0)
         for name, c in (("up", (0.5, 0.0)), ("arc", (0.6, 0.2)), ("tight arc", (0.3, 0.6)))
     }
-    drives |= {f"hills, seed {seed}": (Wander(seed), 120.0, 0.8, None) for seed in (1, 2)}
     for name, how in drives.items():
         made = drive(*how)
         for estimator in ("odometry", "ekf"):
@@ -185,7 +209,7 @@ _MAX_RANGE_M, _MIN_RANGE_M = 50.0, 0.3
 def print_clouds(drives: Sequence[tuple[int, str]] = CLOUD_DRIVES, seconds: float = _CLOUD_DRIVE_S) -> None:
     """Sixteen rings on hills: the filter in space, and other front ends by their defaults, alone or started by our prediction.
 
-    Accelerometers have a bias that is drawn from its prior. GenZ-ICP and small_gicp have a row where they are installed.
+    Accelerometers have a bias that is drawn from its prior. GenZ-ICP, small_gicp and RKO-LIO have a row where they are installed.
     """
     print("\n| seed | scene | estimator | ATE [m] | greatest error [m] | mean NEES (6 expected) | s of CPU |\n" + "|---" * 7 + "|")
     for seed, scene in drives:
@@ -213,16 +237,18 @@ NEES_DRIVES = tuple((seed, "trees and walls") for seed in range(1, 15)) + tuple(
 _NEES_DRIVE_S = 25.0
 
 
-def print_nees() -> None:
-    """NEES over seeds, with accelerometers whose bias is drawn from its prior."""
+def print_nees(drives: Sequence[tuple[int, str]] = NEES_DRIVES, seconds: float = _NEES_DRIVE_S) -> None:
+    """NEES over seeds, with biases of accelerometer and gyro that are drawn from their priors."""
     print("\n| seed | scene | ATE [m] | mean NEES (6 expected) | at the end |\n" + "|---" * 5 + "|")
-    means = []
-    for seed, scene in NEES_DRIVES:
-        made = with_accelerometer_bias(drive(Wander(seed), _NEES_DRIVE_S, seed=seed), seed)
+    means, ends = [], []
+    for seed, scene in drives:
+        made = with_gyro_bias(with_accelerometer_bias(drive(Wander(seed), seconds, seed=seed), seed), seed)
         ours, _ = run_in_space(made, list(scans(made, make_scene(made, seed, *_SCENES[scene]), seed=seed)))
         means.append(ours.nees[_SETTLED:].mean())
-        print(f"| {seed} | {scene} | {ours.ate:.3f} | {means[-1]:.1f} | {ours.nees[-1]:.1f} |", flush=True)
-    print(f"\nmean over {len(means)} drives: {np.mean(means):.1f}")
+        ends.append(ours.nees[-1])
+        print(f"| {seed} | {scene} | {ours.ate:.3f} | {means[-1]:.1f} | {ends[-1]:.1f} |", flush=True)
+    band = ", ".join(f"{bound:.0f}" for bound in chi2.ppf((0.005, 0.995), 6 * len(ends)))
+    print(f"\nmean over {len(means)} drives: {np.mean(means):.1f}; sum at the end {sum(ends):.0f} (99 % of chi-square: {band})")
 
 
 def print_ramp(seeds: Sequence[int] = (1, 2, 3)) -> None:
@@ -332,54 +358,59 @@ def gicp_from_prediction(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArra
     return np.array(found), stamps
 
 
+def rko_alone(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatArray]:
+    """RKO-LIO with the IMU, which starts by gravity, else by its defaults; its poses are at the end of the sweep."""
+    from rko_lio.config import LIOConfig  # type: ignore[import-not-found]  # of tests/league/requirements.txt
+    from rko_lio.lio import LIO  # type: ignore[import-not-found]
+
+    lio = LIO(LIOConfig(initialization_phase=True, max_num_threads=1, min_range=_MIN_RANGE_M, max_range=_MAX_RANGE_M))
+    imu, base, at, found = [e for e in made.events if isinstance(e, ImuSample)], np.eye(4), 0, []
+    base[:3, 3] = made.mounts["imu_link"].x, made.mounts["imu_link"].y, made.mounts["imu_link"].z
+    ends = np.array([cloud.stamp_ns + SWEEP_NS for cloud in clouds])
+    for cloud, end_ns in zip(clouds, ends.tolist(), strict=True):
+        while at < len(imu) and imu[at].stamp_ns <= end_ns:
+            lio.add_imu_measurement(imu[at].linear_acceleration, imu[at].angular_velocity, imu[at].stamp_ns, base)
+            at += 1
+        times = cloud.stamp_ns + np.round(1e9 * cloud.offsets).astype(np.int64)
+        lio.register_scan(_in_body(cloud), times, np.eye(4), cloud.stamp_ns, end_ns)
+        found.append(lio.pose())
+    return np.array(found), ends
+
+
 FRONT_ENDS = {
     "KISS-ICP": kiss_alone,
     "KISS-ICP, our prediction": kiss_from_prediction,
     "GenZ-ICP": genz_alone,
     "small_gicp, our prediction": gicp_from_prediction,
+    "RKO-LIO": rko_alone,
 }
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("table", nargs="?", choices=("all", "clouds", "nees", "ramp"), default="all")
-    parser.add_argument("--trees", default="", metavar="A:B", help="seeds of drives among trees and walls, of the table clouds")
-    parser.add_argument("--grass", default="", metavar="A:B", help="seeds on open grass, of the table clouds")
-    parser.add_argument("--seconds", type=float, default=_CLOUD_DRIVE_S, help="length of these drives")
+    parser.add_argument("table", nargs="?", choices=("all", "law", "planes", "clouds", "nees", "ramp"), default="all")
+    parser.add_argument("--trees", default="", metavar="A:B", help="seeds of drives among trees and walls, of clouds and nees")
+    parser.add_argument("--grass", default="", metavar="A:B", help="seeds on open grass, of clouds and nees")
+    parser.add_argument("--seconds", type=float, default=0.0, help="length of these drives (40 and 25)")
     given = parser.parse_args()
-    if given.table == "nees":
-        print_nees()
-        return
     if given.table == "ramp":
         print_ramp()
         return
     named = (("trees and walls", given.trees), ("open grass", given.grass))
     drives = [(seed, scene) for scene, seeds in named if seeds for seed in range(*map(int, seeds.split(":")))]
-    if given.table == "clouds":
-        print_clouds(drives or CLOUD_DRIVES, given.seconds)
+    if given.table == "nees":
+        print_nees(drives or NEES_DRIVES, given.seconds or _NEES_DRIVE_S)
         return
-    print(
-        "| slope | mu | CG [m] | slid downhill: MuJoCo = flat model's error | with the law | left | turned more: MuJoCo | law |\n"
-        + "|---" * 8
-        + "|"
-    )
-    for row in TURNINGS:
-        x, _, yaw = turn(row)
-        more = yaw / _TURNED_RAD - 1.0
-        print(
-            f"| {row.slope_deg:.0f} deg | {row.mu} | {row.cg_height_m:.2f} | {row.slid_m:.2f} m | {-x:.2f} m | {-x - row.slid_m:+.2f} m "
-            f"| {row.turned_more:.1%} | {more:.1%} |"
-        )
-    print("\n| robot | slope | k: law | k: MuJoCo | x of the centre of rotation: law / MuJoCo [m] | y |\n" + "|---" * 6 + "|")
-    for seen in HEADINGS:
-        law = over_headings(seen)
-        print(
-            f"| {seen.robot} | {seen.slope_deg:.0f} deg | {law.k[0]:.3f} to {law.k[1]:.3f} | {seen.k[0]:.3f} to {seen.k[1]:.3f} "
-            f"| {law.x_m:.3f} / {seen.x_m:.3f} | {law.y_m:.3f} / {seen.y_m:.3f} |"
-        )
-    print_replays()
-    print_clouds()
+    if given.table == "clouds":
+        print_clouds(drives or CLOUD_DRIVES, given.seconds or _CLOUD_DRIVE_S)
+        return
+    if given.table in ("law", "all"):
+        print_law()
+    if given.table in ("planes", "all"):
+        print_replays()
+    if given.table == "all":
+        print_clouds()
 
 
 if __name__ == "__main__":
