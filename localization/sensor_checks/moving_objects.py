@@ -53,6 +53,9 @@ _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
 """Successive comparisons that show it."""
 _CALM_S = 1.0
 """Time without moving objects after which all beams are matched again [s]."""
+_CALM_M = 0.3
+"""Way by the wheels, along which wheels and estimate agree, after which what they differed by before is slip that has ended [m]: a LiDAR
+that travels elsewhere by its scans agrees with wheels that stand, or turn in place."""
 _MIN_POINTS = 30
 """Points of the still world with which a scan is matched."""
 
@@ -104,6 +107,8 @@ class MovingObjects:
         """(2, 3) poses before labels, or the distance of estimate and wheels, began to show that either happens."""
         self._suspected_s = self._shown_s = -math.inf
         """Time of the last ones that showed it, and of the last labels that showed moving objects [s]."""
+        self._suspected_at = np.zeros(3)
+        """(3,) pose by the wheels at the last one that showed it, or after which both did not agree."""
         self._since: FloatArray | None = None
         """(2, 3) poses at which wheels and estimate last agreed, while objects move."""
         self._is_apart = False
@@ -268,14 +273,15 @@ class MovingObjects:
         """Whether objects move now."""
         self._compared = view
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        _, distance = _compare_motions(view.poses, self._poses)
+        poses = self._poses
+        _, distance = _compare_motions(view.poses, poses)
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active
             unique = found.unique_share(has_turn)
             if unique >= _KEPT_UNIQUE or distance >= _MAX_OFF_M:
                 self._suspected = view.poses if self._suspected is None else self._suspected
-                self._suspected_s = now_s
+                self._suspected_s, self._suspected_at = now_s, poses[0]
                 self._shown_s = now_s if unique >= _KEPT_UNIQUE else self._shown_s
             least = _KEPT_UNIQUE if lidar.is_active else _MIN_UNIQUE if has_turn else _MIN_UNIQUE_WITHOUT_GYRO
             is_moving = unique >= least and (has_turn or moved_share >= _MIN_MOVED_WITHOUT_GYRO)
@@ -285,7 +291,10 @@ class MovingObjects:
             lidar.last_s = now_s
         again = 1 if is_standing else _AGAIN if has_turn else _AGAIN_WITHOUT_GYRO
         lidar.is_active = lidar.shown >= again or (lidar.is_active and now_s - lidar.last_s < _CALM_S)
-        if now_s - self._suspected_s >= _CALM_S:
+        if self._suspected is not None and not self._agree(view.poses):
+            self._suspected_s, self._suspected_at = now_s, poses[0]
+        has_driven = math.dist(self._suspected_at[:2], poses[0, :2]) >= _CALM_M
+        if self._faults.inflation.are_wheels_outvoted or (now_s - self._suspected_s >= _CALM_S and has_driven):
             self._suspected = None
         self._is_unsure = self._suspected is not None or distance > MIN_OFF_M
         self._window.is_scene_moving = now_s - self._shown_s < _CALM_S or lidar.is_active

@@ -15,7 +15,7 @@ from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms
 from tests.helpers.corridors import KINDS, in_corridor
-from tests.helpers.event_faults import EventFault, multiply_wheels, named_faults, without_gyro
+from tests.helpers.event_faults import EventFault, multiply_wheels, named_faults, turn_scans, without_gyro
 from tests.helpers.extended import cases
 from tests.helpers.fault_drives import in_room, run
 from tests.helpers.moving_scenes import SCENES
@@ -84,6 +84,14 @@ def test_pose_that_people_at_rest_have_moved_is_in_the_covariance() -> None:
     """The first scan after a rest fits .1 m elsewhere, before the wheels have moved by a centimetre: that is no slip."""
     outcome = run(SCENES["20 people edge away"](2))
     assert outcome.worst[0] > 0.1
+    assert not outcome.is_wrong, outcome.least_consistent
+
+
+@pytest.mark.parametrize("has_gyro", cases([True, False], usual=["False"]))
+def test_distance_from_the_wheels_stays_in_the_covariance_in_turns(has_gyro: bool) -> None:
+    """A LiDAR with a wrong yaw agrees with wheels that turn in place; it is found later, on a straight way."""
+    fault = turn_scans(90.0)
+    outcome = run(in_room(2, seed=3), fault if has_gyro else without_gyro(fault))
     assert not outcome.is_wrong, outcome.least_consistent
 
 
