@@ -139,10 +139,7 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
     rng = np.random.default_rng(config.seed)
     predictor = make_predictor(drive, model, baseline)
-    searched = _search(predictor, config)
-    for contacts in _other_contacts(searched):
-        other = _search(dataclasses.replace(predictor, unmodelled=contacts), config)
-        searched = other if _describes_better(other, searched) else searched
+    searched = _search_contacts(predictor, config)
     chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
     if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
         searched, chosen = searched._replace(linearization=searched.first), ()
@@ -184,30 +181,53 @@ class _Searched(NamedTuple):
     """What the contacts are off beside the best causes."""
 
 
+def _search_contacts(predictor: DrivePredictor, config: DiagnosisConfig) -> _Searched:
+    """The best causes about the contacts that describe the drive best: the robot file's; Coulomb's friction, where the model's error shows;
+    and contacts that creep by the speed of the slip, where these describe it better already beside the best causes so far."""
+    found = _search(predictor, config)
+    if found.error.is_shown and found.predictor.unmodelled.has_stiffness:
+        other = _with_parts(_search(dataclasses.replace(predictor, unmodelled=Unmodelled(log_stiffness=COULOMB_LOG_STIFFNESS)), config))
+        if other.chosen or not _describes_better(other, found):  # else contacts alone explain what causes seemed to
+            found = _with_parts(found)
+        found = other if _describes_better(other, found) else found
+    else:
+        found = _with_parts(found)
+    if found.predictor.unmodelled.has_stiffness and _costs_less_creeping(found):
+        other = _with_parts(_search(dataclasses.replace(predictor, unmodelled=Unmodelled(stiffness_exponent=1.0)), config))
+        found = other if _describes_better(other, found) else found
+    return found
+
+
 def _search(predictor: DrivePredictor, config: DiagnosisConfig) -> _Searched:
-    """The best causes, with the contacts of ``predictor``."""
+    """The best lasting causes, with the contacts of ``predictor``."""
     predictor, first, error = _linearize_with_model_error(predictor, config)
-    linearization, chosen = _choose_parts(predictor, first, *_choose_causes(predictor, first))
-    if error.is_shown:  # also about the best causes, not by the bent signature of a large one
-        error = find_model_error(predictor, linearization)
-    return _Searched(predictor, first, linearization, chosen, error)
+    return _with_error(_Searched(predictor, first, *_choose_causes(predictor, first), error))
 
 
-def _other_contacts(searched: _Searched) -> list[Unmodelled]:
-    """Contacts that may describe a drive better than the robot file's: of Coulomb's friction, where the model's error shows, and such that
-    creep by the speed of the slip, where these describe it better already beside the same causes."""
+def _with_parts(searched: _Searched) -> _Searched:
+    """``searched`` with causes in a part of the drive, where these explain it better."""
+    linearization, chosen = _choose_parts(searched.predictor, searched.first, searched.linearization, searched.chosen)
+    if linearization is searched.linearization:
+        return searched
+    return _with_error(searched._replace(linearization=linearization, chosen=chosen))
+
+
+def _with_error(searched: _Searched) -> _Searched:
+    """``searched`` with the error of the contacts about its causes, where it shows: the bent signature of a large cause looks like one."""
+    if not searched.error.is_shown:
+        return searched
+    return searched._replace(error=find_model_error(searched.predictor, searched.linearization))
+
+
+def _costs_less_creeping(searched: _Searched) -> bool:
+    """Whether contacts that creep describe the drive better than those of ``searched``, beside the same causes."""
     predictor, state = searched.predictor, searched.linearization
-    if not predictor.unmodelled.has_stiffness:
-        return []
-    found = [Unmodelled(log_stiffness=COULOMB_LOG_STIFFNESS)] if searched.error.is_shown else []
-    creeping = dataclasses.replace(predictor.unmodelled, stiffness_exponent=1.0)
+    creeping = dataclasses.replace(predictor.unmodelled, log_stiffness=0.0, stiffness_exponent=1.0)
     causes = tuple(state.causes[i] for i in searched.chosen)
     sizes = dict(zip(causes, (float(s) for s in state.problem.fit(searched.chosen)[0]), strict=True))
     tried = dataclasses.replace(predictor, unmodelled=creeping)
     other = dataclasses.replace(linearize(tried, state.causes, {}, TOLERANCE), noise=state.noise)
-    if refined_cost(tried, other, sizes) < refined_cost(predictor, state, sizes):
-        found.append(Unmodelled(stiffness_exponent=1.0))
-    return found
+    return refined_cost(tried, other, sizes) < refined_cost(predictor, state, sizes)
 
 
 def _describes_better(new: _Searched, old: _Searched) -> bool:
