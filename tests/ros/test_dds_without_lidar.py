@@ -1,4 +1,5 @@
-"""A node without a LiDAR over DDS: what it publishes never jumps, though the gyro's bias, found at rest, corrects the way before."""
+"""A node without a LiDAR over DDS: what it publishes never jumps, though the gyro's bias, found at rest, corrects the way before; and with
+a gyro as the robot file has it, poses and twists are the simulator's within the published covariance."""
 
 from __future__ import annotations
 
@@ -46,17 +47,36 @@ def _phases(robot, config):
     yield Rest(3.0)
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
-    path = tmp_path_factory.mktemp("without_lidar") / "drive.mcap"
-    sensors = SensorConfig(lidar="none", encoders=EncoderConfig(), imu=ImuConfig(gyro_bias_sigma=0.02))
+def simulated(folder, imu):
+    path = folder / "drive.mcap"
+    sensors = SensorConfig(lidar="none", encoders=EncoderConfig(), imu=imu)
     experiment = Experiment("weave", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
     write_simulation(path, Simulation(experiment, ROBOT, 0, {}, SimulationConfig(sensors=sensors)))
     return path
 
 
 @pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("without_lidar"), ImuConfig(gyro_bias_sigma=0.02))
+
+
+@pytest.fixture(scope="module")
 def received(drive):
+    return published_over_dds(drive)
+
+
+@pytest.fixture(scope="module")
+def usual_drive(tmp_path_factory):
+    """By a gyro whose bias is as the robot file has it."""
+    return simulated(tmp_path_factory.mktemp("usual"), ImuConfig(gyro_bias_sigma=ROBOT.gyro_noise.bias_sigma_rad_per_s))
+
+
+@pytest.fixture(scope="module")
+def usual_received(usual_drive):
+    return published_over_dds(usual_drive)
+
+
+def published_over_dds(drive):
     """Decoded messages that a node published, by topic, while the log's wheels and IMU were played in real time."""
     transport = DdsTransport(DOMAIN)
     source = open_source(drive)
@@ -121,6 +141,36 @@ def test_published_pose_without_a_lidar_never_jumps(topic, received):
     assert stamps[-1] - stamps[0] > 10.0
     assert np.diff(stamps).max() < 0.3
     assert (unexplained(stamps, poses, twists) < [_CONTINUOUS_M, _CONTINUOUS_RAD]).all()
+
+
+def truth_of(drive, stamps):
+    """Poses (n, 3) relative to the first, and twists (n, 3), of the simulator at ``stamps`` (n,) [s]."""
+    decode, messages = decoder("nav_msgs/msg/Odometry"), open_source(drive).messages(["/ground_truth/odom"])
+    at, poses, twists = path_of([decode(message.data) for message in messages])
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    poses, twists = (np.stack([np.interp(stamps, at, column) for column in table.T], axis=1) for table in (poses, twists))
+    return se2.between(poses[0], poses), twists
+
+
+@pytest.mark.parametrize("topic", [_ODOMETRY, _PREDICTED])
+def test_published_poses_and_twists_without_a_lidar_are_the_simulators(topic, usual_drive, usual_received):
+    """Each pose within the 99.9 % of its covariance (3 degrees of freedom); NEES of the twists over the drive, by 3 degrees of freedom."""
+    messages = usual_received[topic]
+    stamps, poses, twists = path_of(messages)
+    true_poses, true_twists = truth_of(usual_drive, stamps)
+    assert np.hypot(*true_poses[-1, :2]) > 3.0
+    off = se2.between(poses[0], poses) - true_poses
+    off[:, 2] = se2.wrap_angle(off[:, 2])
+    planar = np.ix_((0, 1, 5), (0, 1, 5))
+    covs, twist_covs = (
+        np.array([part.covariance.reshape(6, 6)[planar] for part in parts])
+        for parts in ([m.pose for m in messages], [m.twist for m in messages])
+    )
+    late = stamps > stamps[0] + 1.0  # the covariance of the first pose is zero
+    nees = np.einsum("ni,nij,nj->n", off[late], np.linalg.inv(covs[late]), off[late])
+    assert nees.max() < 16.3
+    off_twists = twists - true_twists
+    assert 0.1 < np.einsum("ni,nij,nj->n", off_twists, np.linalg.inv(twist_covs), off_twists).mean() / 3.0 < 2.0
 
 
 def test_transforms_without_a_lidar_are_those_of_predicted_odometry(received):
