@@ -6,6 +6,7 @@ never changed after they are made. The constructors raise `EventError` for array
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -20,10 +21,6 @@ from motion_models.se2 import FloatArray, Twist2
 
 _NS = 1e-9
 _ROUNDING = 1e-9  # of a covariance, over its largest entry
-
-
-def _no_floats() -> FloatArray:
-    return np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ class Scan:
     """Header stamp. For a LaserScan the time of the first beam; a PointCloud2 has `offsets`."""
     points: FloatArray
     """(N, 3) in the sensor's frame [m]; z = 0 for a planar scanner."""
-    offsets: FloatArray = field(default_factory=_no_floats)
+    offsets: FloatArray = field(default_factory=lambda: np.empty(0))
     """(N,) time of each point after `stamp_ns` [s], or (0,) where the log has none."""
     frame_id: str = ""
     is_planar: bool = True
@@ -280,6 +277,8 @@ def _check_shape(event: Event, name: str, shape: tuple[int, ...]) -> None:
 def _check_finite(event: Event, name: str, shape: tuple[int, ...]) -> None:
     _check_shape(event, name, shape)
     value = getattr(event, name)
+    if value.size <= 4 and all(map(math.isfinite, value.ravel().tolist())):  # quicker than numpy's, on a handful
+        return
     if not (is_finite := np.isfinite(value)).all():
         raise _refusal(event, name, f"holds {value[~is_finite][0]}", "finite")
 

@@ -36,12 +36,12 @@ class Twist:
         ``kernel(wheels (n, 2), cg (n, 2), params (k,), constants, value, d_wheels, d_cg, d_params)`` fills the last four, which start
         at zero, for each of n samples.
         """
-        lead = np.broadcast_shapes(wheels.shape[:-1], cg.shape[:-1])
+        lead = wheels.shape[:-1] if wheels.shape == cg.shape else np.broadcast_shapes(wheels.shape[:-1], cg.shape[:-1])
         n, k = math.prod(lead), params.shape[0]
         value, d_params = np.zeros((n, 3)), np.zeros((n, 3, k))
         d_wheels, d_cg = np.zeros((n, 3, 2)), np.zeros((n, 3, 2))
         # Always copies: numba would compile the kernel once more for each kind of view, and round it differently.
-        full = [a if a.shape == (*lead, 2) else np.broadcast_to(a, (*lead, 2)) for a in (wheels, cg)]  # broadcast_to takes microseconds
+        full = [a if a.shape == (*lead, 2) else np.broadcast_to(a, (*lead, 2)) for a in (wheels, cg)]  # broadcast_* take microseconds
         flat = [np.array(a, dtype=np.float64, order="C").reshape(n, 2) for a in full]
         kernel(*flat, np.array(params, dtype=np.float64), constants, value, d_wheels, d_cg, d_params)
         return cls(value.reshape(*lead, 3), d_wheels.reshape(*lead, 3, 2), d_cg.reshape(*lead, 3, 2), d_params.reshape(*lead, 3, k))

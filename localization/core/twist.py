@@ -7,9 +7,10 @@ import numpy as np
 from motion_models import se2
 from motion_models.se2 import Cov3, Pose2, Tangent2, Twist2
 
-_SLIP_LASTS_S = 1.0
+SLIP_LASTS_S = 1.0
 """Noise of the wheels is that of slip that lasts, not of single steps: over a shorter step it is the twist's noise over this time."""
-_TWIST_FLOOR = np.diag([3e-3, 3e-3, 2e-3]) ** 2
+_IDENTITY = np.eye(3)
+TWIST_FLOOR = np.diag([3e-3, 3e-3, 2e-3]) ** 2
 """Covariance added to every twist [m^2/s^2, m^2/s^2, rad^2/s^2]: a robot whose wheels stand rocks on its tyres by 1 mm/s and 1 mrad/s
 (simulated)."""
 CHANGE_SHARE = 0.5
@@ -22,14 +23,14 @@ def twist_at_end(mean: Twist2, cov: Cov3, change: Twist2, measured_over_s: float
     ``change`` (3,): of the wheels' twist from its mean over the step to its end. ``measured_over_s``: duration of a step that the wheels
     have measured alone [s]; infinite where a scan has.
     """
-    share = min(measured_over_s / _SLIP_LASTS_S, 1.0)
-    return mean + change, share * cov + np.diag((CHANGE_SHARE * change) ** 2) + _TWIST_FLOOR
+    share = min(measured_over_s / SLIP_LASTS_S, 1.0)
+    return mean + change, share * cov + _IDENTITY * (CHANGE_SHARE * change) ** 2 + TWIST_FLOOR
 
 
 def fuse_turn(twist: Tangent2, cov: Cov3, turn: float, variance: float) -> tuple[Tangent2, Cov3]:
     """``twist`` (3,), or a way along one, with ``cov`` (3, 3), updated by a measured turn (rate) and its variance."""
     gain = cov[:, 2] / (cov[2, 2] + variance)
-    return twist + gain * (turn - twist[2]), cov - np.outer(gain, cov[2])
+    return twist + gain * (turn - twist[2]), cov - gain[:, None] * cov[2]
 
 
 def mean_twist(delta: Pose2, cov: Cov3, duration: float) -> tuple[Twist2, Cov3]:

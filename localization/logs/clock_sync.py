@@ -54,8 +54,7 @@ _MAX_RATE, _MAX_DRIFT_S, _LINEAR = 0.002, 0.15, 0.1
 from a straight line. Quartzes differ by 1e-4."""
 
 
-@dataclass(frozen=True)
-class Item:
+class Item(NamedTuple):
     """An event to be merged, and the keys of its order."""
 
     log_ns: int
@@ -195,6 +194,8 @@ class TopicClock:
             self._stats.count(self._topic, Oddity.NO_STAMP)
             return [_restamped(item, item.log_ns + self._common)]
         if self._is_plausible(item):
+            if not self._pending:
+                return [self._accept(item)]
             if not self._is_continued_by(item):
                 self.drop_pending()
             self._pending.append(item)
@@ -441,7 +442,9 @@ def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterat
 def _restamped(item: Item, stamp_ns: int) -> Item:
     if stamp_ns == item.stamp_ns:
         return item
-    return dataclasses.replace(item, stamp_ns=stamp_ns, payload=dataclasses.replace(item.payload, stamp_ns=stamp_ns))
+    payload = object.__new__(type(item.payload))  # its arrays, which were checked, are not checked again
+    vars(payload).update(vars(item.payload), stamp_ns=stamp_ns)
+    return item._replace(stamp_ns=stamp_ns, payload=payload)
 
 
 def _frame(item: Item) -> str:

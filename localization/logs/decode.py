@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
@@ -195,17 +195,17 @@ def joint_decoder(joints: tuple[str, ...]) -> Callable[[Any, int], JointReading 
     """Decoder of joint states for these joints; None for a message that has none of them (an arm's)."""
 
     @lru_cache(_MAX_CACHED_NAMES)
-    def place_of(names: tuple[str, ...]) -> NDArray[np.intp] | None:
-        return np.array([names.index(joint) for joint in joints], dtype=np.intp) if set(joints) <= set(names) else None
+    def place_of(names: tuple[str, ...]) -> list[int] | None:
+        return [names.index(joint) for joint in joints] if set(joints) <= set(names) else None
 
     def decode(message: Any, stamp: int) -> JointReading | None:
         place = place_of(tuple(message.name))
         if place is None:
             return None
         position, velocity = _at(message.position, place), _at(message.velocity, place)
-        if not (np.isfinite(position).any() or np.isfinite(velocity).any()):
+        if not any(map(math.isfinite, (*position, *velocity))):
             raise UnusableError(Oddity.NOT_FINITE)
-        return JointReading(stamp, position, velocity)
+        return JointReading(stamp, np.array(position), np.array(velocity))
 
     return decode
 
@@ -239,12 +239,13 @@ def arm_decoder(
     return decode
 
 
-def _at(values: Any, place: NDArray[np.intp]) -> FloatArray:
-    array = np.asarray(values, dtype=float)
+def _at(values: Any, place: Sequence[int]) -> list[float]:
+    """Plain numbers: numpy takes longer on those of some wheels."""
+    numbers = np.asarray(values, dtype=float).tolist()
     try:
-        return array[place]
+        return [numbers[i] for i in place]
     except IndexError:
-        return np.full(len(place), np.nan)
+        return [math.nan] * len(place)
 
 
 def scan_decoder(period_s: float | None = None, count: Callable[[Oddity], None] = lambda oddity: None) -> Callable[[Any, int], Scan]:

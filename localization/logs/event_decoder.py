@@ -321,8 +321,10 @@ class JointsToWheels:
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
-        reading = self._hold_unknown(reading)
         has_angles = all(map(math.isfinite, reading.position.tolist()))
+        if not has_angles:
+            reading = self._hold_unknown(reading)
+            has_angles = bool(np.isfinite(reading.position).all())
         velocity = reading.velocity
         if any(abs(rate) * self._radius > _MAX_SPEED_M_S for rate in velocity.tolist()):
             self._stats.count(self._topic, Oddity.WHEEL_RATE)
@@ -364,7 +366,7 @@ class JointsToWheels:
     def _hold_unknown(self, reading: JointReading) -> JointReading:
         """``reading`` with the last angles of joints whose angles are NaN while others have some."""
         unknown = ~np.isfinite(reading.position)
-        if not unknown.any() or unknown.all():
+        if unknown.all():
             return reading
         last = np.zeros(len(unknown)) if self._publisher is None else self._publisher.reading.position
         return replace(reading, position=np.where(unknown, last, reading.position))
@@ -402,7 +404,7 @@ class JointsToWheels:
 
     def _accumulate(self, publisher: _PublisherState, reading: JointReading, step: FloatArray) -> _PublisherState:
         turned = publisher.turned if self._second_publisher is None else publisher.turned + sum(map(abs, step.tolist()))
-        self._has_turned |= bool(step.any())
+        self._has_turned = self._has_turned or bool(step.any())
         return _PublisherState(reading, publisher.angle + self._failing.replace(step), turned)
 
     def _corrected_step(self, known: JointReading, reading: JointReading, velocity: FloatArray) -> tuple[FloatArray, bool]:
@@ -436,9 +438,9 @@ class FailingEncoders:
 
     def replace(self, step: FloatArray) -> FloatArray:
         """Increments (n,) with those of failing joints replaced; where one is found, with what it has lost."""
-        is_turning = np.abs(step) > _STATIONARY_RAD
-        if not self.joints and (is_turning.all() or not is_turning.any()):
-            if is_turning.all():
+        is_turning = [abs(one) > _STATIONARY_RAD for one in step.tolist()]
+        if not self.joints and (all(is_turning) or not any(is_turning)):
+            if is_turning[0]:
                 self._missing[:] = self._idle[:] = 0.0
             return step
         found, before = step.copy(), frozenset(self.joints)

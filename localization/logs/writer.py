@@ -64,8 +64,8 @@ _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _STAMP_END = 2**31 * 10**9  # seconds of a ROS stamp are an int32
 _ROUNDING = 1e-12  # below this a negative variance is that of a filter that has failed, not of its last digit
-_UNKNOWN = np.diag(np.full(6, UNKNOWN_VARIANCE))
-_PLANAR = np.ix_((0, 1, 5), (0, 1, 5))  # x, y, yaw among x, y, z, roll, pitch, yaw
+_UNKNOWN = np.diag(np.full(6, UNKNOWN_VARIANCE)).ravel()
+_PLANAR = [6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)]  # x, y, yaw among x, y, z, roll, pitch, yaw
 _LATCHED_TOPIC = "/tf_static"
 
 
@@ -278,8 +278,8 @@ def six_by_six(planar: FloatArray | None) -> FloatArray:
     """(36,) row-major covariance of x, y, z, roll, pitch, yaw, from the (3, 3) of x, y, yaw."""
     full = _UNKNOWN.copy()
     if planar is not None:
-        full[_PLANAR] = planar
-    return full.ravel()
+        full[_PLANAR] = planar.ravel()
+    return full
 
 
 def _header(estimate: FusedEstimate) -> Header:

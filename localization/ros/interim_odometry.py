@@ -6,11 +6,13 @@ from collections import deque
 from collections.abc import Callable
 
 from localization.estimators import Estimate
-from localization.events import WheelSample
+from localization.events import CgSample, WheelSample
 from localization.ros.discovery import MAX_BACKLOG
 from localization.ros.live_stream import LiveStream
 from localization.ros.predictor import Predictor
 from localization.ros.transports.transport import Received
+from localization.wheel_buffer import WheelBuffer
+from motion_models.se2 import FloatArray
 
 
 class InterimOdometry:
@@ -19,9 +21,11 @@ class InterimOdometry:
     The pose starts at the origin of `odom`, as the estimator's does. A gap of the wheels ends it.
     """
 
-    def __init__(self, stream: LiveStream, predictor: Predictor, is_over: Callable[[], bool]) -> None:
-        """``stream`` and ``predictor`` are its own: those of the node begin when the estimator does, which is when ``is_over``."""
+    def __init__(self, stream: LiveStream, predictor: Predictor, cg: FloatArray, is_over: Callable[[], bool]) -> None:
+        """``stream`` and ``predictor`` are its own: those of the node begin when the estimator does, which is when ``is_over``. ``cg``: the
+        robot's centre of gravity (2,), while none comes [m]."""
         self._stream, self._predictor, self.is_over = stream, predictor, is_over
+        self._wheels = WheelBuffer(cg)
         self._has_begun = False
         self.messages: deque[Received] = deque(maxlen=MAX_BACKLOG)
 
@@ -30,11 +34,15 @@ class InterimOdometry:
         self.messages.append(received)
         newest = None
         for event in self._stream.events(received):
-            is_due = self._predictor.insert(event)
-            if isinstance(event, WheelSample) and not self._has_begun:
+            if isinstance(event, CgSample):
+                self._wheels.set_cg(event)
+            if not isinstance(event, WheelSample):
+                continue
+            self._wheels.insert(event)
+            if not self._has_begun:
                 self._has_begun = True
                 self._predictor.begin(event.stamp_ns)
-            elif is_due and (estimate := self._predictor.predict()) is not None:
+            elif self._predictor.is_due(event.stamp_ns) and (estimate := self._predictor.predict(self._wheels)) is not None:
                 self._predictor.reset(estimate, None, 0.0)
                 newest = estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False)
         return newest

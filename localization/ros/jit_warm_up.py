@@ -14,6 +14,7 @@ from localization.events import CgSample, Event, ImuSample, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
 from localization.ros.predictor import Predictor
 from localization.ros.settings import LiveRun
+from localization.wheel_buffer import WheelBuffer
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -74,25 +75,28 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
         model = arms_model(run.robot.arms, run.robot.folder)
         model.estimate(np.zeros_like(model.chain.lower))
     predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s)
-    _predict_alone(Predictor(trial.model, run.robot, run.config.step.max_hold_s))
+    _predict_alone(predictor, WheelBuffer(run.robot.center_of_gravity))
     for event in synthetic_drive(is_planar):
-        predictor.insert(event)
         for estimate in pipeline.process(event):
             pipeline.run_deferred()
             predictor.reset(estimate, pipeline.estimator.params, pipeline.estimator.clock_offset_s)
-        predictor.predict()
+        predictor.predict(pipeline.synchronizer.wheels.buffer)
     pipeline.estimator.map_points()
     pipeline.estimator.occupancy()
     pipeline.finish()
 
 
-def _predict_alone(predictor: Predictor) -> None:
+def _predict_alone(predictor: Predictor, wheels: WheelBuffer) -> None:
     """What odometry by wheels needs comes first: it does not wait for the estimator."""
     for event in itertools.islice(synthetic_drive(is_planar=True), _EVENTS_BY_WHEELS):
-        if predictor.insert(event):
-            predictor.predict()
-        elif isinstance(event, WheelSample):
+        if not isinstance(event, WheelSample):
+            continue
+        wheels.insert(event)
+        if predictor.is_due(event.stamp_ns):
+            predictor.predict(wheels)
+        else:
             predictor.begin(event.stamp_ns)
+    predictor.stop()
 
 
 def synthetic_drive(is_planar: bool) -> Iterator[Event]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from localization.estimators import Estimate, GraphFusion
-from localization.events import Event, Scan
+from localization.events import Event, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
 from localization.ros.gnss import utm_pose
 from localization.ros.live_inputs import LiveInputs
@@ -48,13 +48,15 @@ class LiveOutputs:
             self.predictor.stop()
 
     def renew_predictor(self) -> None:
-        """Predict with none of the samples so far: they were read in another way."""
+        """Predict nothing until the next estimate, and from there on by the robot as its messages are read now."""
         if self.predictor is not None:
             self.predictor = make_predictor(self._trial, self._run, self._inputs.robot)
 
-    def insert(self, event: Event) -> bool:
+    def is_prediction_due(self, event: Event) -> bool:
         """Whether ``event`` makes a prediction possible that is due and received by somebody."""
-        return self.predictor is not None and self.predictor.insert(event) and self.publisher.are_predictions_read
+        if self.predictor is None or not isinstance(event, WheelSample):
+            return False
+        return self.publisher.are_predictions_read and self.predictor.is_due(event.stamp_ns)
 
     def publish_estimate(self, event: Event, estimate: Estimate, pipeline: Pipeline) -> None:
         """Publish ``estimate``, which ``event`` has completed; predictions go on from it."""
@@ -66,7 +68,8 @@ class LiveOutputs:
 
     def publish_prediction(self, pipeline: Pipeline) -> None:
         """Publish the pose at the newest wheel sample, if it can be predicted."""
-        prediction = None if self.predictor is None else self.predictor.predict(pipeline.synchronizer.turn)
+        synchronizer = pipeline.synchronizer
+        prediction = None if self.predictor is None else self.predictor.predict(synchronizer.wheels.buffer, synchronizer.turn)
         if prediction is not None:
             by_lidar = self._inputs.has_lidar
             self.publisher.publish_prediction(prediction, self._inputs.stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=by_lidar))
@@ -98,5 +101,5 @@ class LiveOutputs:
 
 
 def make_predictor(trial: Trial, run: LiveRun, robot: Robot) -> Predictor:
-    """One for ``robot`` that has no samples yet."""
+    """One for ``robot`` that has no estimate yet."""
     return Predictor(trial.model, robot, run.config.step.max_hold_s, run.node.predict_hz)

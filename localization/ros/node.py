@@ -159,8 +159,10 @@ class Node:
                 self._checks.begin(self.session.pipeline.mounts)
             if not is_compiled():
                 self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
-                predictor = make_predictor(self._trial, self._run, self.inputs.robot)
-                self._interim = InterimOdometry(self.inputs.open_stream(MessageStats()), predictor, is_compiled)
+                robot = self.inputs.robot
+                predictor = make_predictor(self._trial, self._run, robot)
+                stream = self.inputs.open_stream(MessageStats())
+                self._interim = InterimOdometry(stream, predictor, robot.center_of_gravity, is_compiled)
             self._take_up(discovered.backlog)
             failing.pop_all()
 
@@ -271,7 +273,6 @@ class Node:
         with suppress(RobotError):
             sample = self.payloads.sample(self._times.newest_ns)
             self.session.process(sample)
-            self.outputs.insert(sample)
 
     @property
     def frames(self) -> Any:
@@ -336,7 +337,7 @@ class Node:
 
     def _process(self, event: Event, received: Received) -> bool:
         self._times.add(event.stamp_ns)
-        is_predictable = self.outputs.insert(event)
+        is_predictable = self.outputs.is_prediction_due(event)
 
         def publish(estimate: Estimate) -> None:
             self.outputs.publish_estimate(event, estimate, self.session.pipeline)

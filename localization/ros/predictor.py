@@ -7,31 +7,40 @@ from collections.abc import Callable
 
 import numpy as np
 
-from localization.core.twist import CHANGE_SHARE, fuse_turn, mean_twist, twist_at_end
+from localization.core.twist import CHANGE_SHARE, SLIP_LASTS_S, TWIST_FLOOR
 from localization.estimators import Estimate
 from localization.estimators.estimator import GyroCalibration
-from localization.events import CgSample, Event, Turn, WheelSample
+from localization.events import Turn
 from localization.wheel_buffer import WheelBuffer
-from motion_models import se2
 from motion_models.base import Motion, MotionModel
-from motion_models.preintegration import integrate_twists, noise_vector
+from motion_models.compiled import kernel, subroutine
+from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray
+from motion_models.se2 import (
+    FloatArray,
+    fill_inverse_adjoint,
+    fill_right_jacobian_inverse,
+    scalar_compose,
+    scalar_exp,
+    scalar_log,
+    triple,
+)
 
 _NS = 1e-9
 _JITTER = 0.25
 """Share of the period by which a wheel message may come early and still be predicted to."""
-_KEEP_S = 2.0
-"""Wheel samples are stored for this long [s]."""
 _MAX_HORIZON_S = 1.0
 """No prediction is published farther ahead of the last estimate [s]: without LiDAR one comes every 0.05 s, with a lost one every 0.3 s."""
 
+_NO_TURN = [math.nan] * 4
+_NO_PARAMS, _NO_CG, _UNUSED_COV = np.zeros((3, 0)), np.zeros((3, 2)), np.zeros((3, 3))
+
 
 class Predictor:
-    """``odom_T_body`` at the rate of the wheels, with the turns of the gyro. It holds copies: nothing that it does reaches the estimator,
-    so a replay gives the same numbers.
+    """``odom_T_body`` at the rate of the wheels, with the turns of the gyro. It reads what the estimator's buffers hold and changes nothing
+    there, so a replay gives the same numbers.
 
-    `insert` each event and `reset` with each estimate; `predict` then gives the pose at the newest wheel sample. At an estimate the
+    `reset` with each estimate; `predict` at each wheel sample that `is_due` then gives the pose at the newest one. At an estimate the
     predicted pose changes by that estimate's correction and by nothing else, for the same motion of wheels and gyro is applied to both.
     """
 
@@ -40,23 +49,14 @@ class Predictor:
         self._model, self._noise, self._max_hold_s = model, noise_vector(robot.wheel_noise), max_hold_s
         self._period_ns, self._due_ns = 1.0 / (max_rate_hz * _NS), -math.inf
         self._params = model.nominal
-        self._wheels = WheelBuffer(robot.center_of_gravity, _KEEP_S)
         self._last: Estimate | None = None
         self._gyro: GyroCalibration | None = None
         self._clock_offset_ns = 0
 
-    def insert(self, event: Event) -> bool:
-        """Store what ``event`` contributes; returns whether a new prediction is possible, and due."""
-        if isinstance(event, CgSample):
-            self._wheels.set_cg(event)
-        if not isinstance(event, WheelSample):
-            return False
-        self._wheels.insert(event)
-        return self._last is not None and self._is_due(event.stamp_ns)
-
-    def _is_due(self, stamp_ns: int) -> bool:
-        """Whether a period has passed, but for the jitter of the wheels' stamps; the mean rate is kept."""
-        if stamp_ns < self._due_ns - _JITTER * self._period_ns:
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether a wheel sample can be predicted to, and a period has passed since the last one that was due, but for the jitter of its
+        stamps; the mean rate is kept."""
+        if self._last is None or stamp_ns < self._due_ns - _JITTER * self._period_ns:
             return False
         self._due_ns = (self._due_ns if stamp_ns - self._due_ns < self._period_ns else stamp_ns) + self._period_ns
         return True
@@ -78,52 +78,122 @@ class Predictor:
         """Predict nothing until the next estimate."""
         self._last = None
 
-    def predict(self, measure_turn: Callable[[int, int], Turn | None] = lambda start_ns, end_ns: None) -> Estimate | None:
-        """The estimate at the newest wheel sample; None where that is not newer than the last estimate, or the wheels have a gap since.
+    def predict(
+        self, wheels: WheelBuffer, measure_turn: Callable[[int, int], Turn | None] = lambda start_ns, end_ns: None
+    ) -> Estimate | None:
+        """The estimate at the newest sample of ``wheels``; None where that is not newer than the last estimate, or they have a gap since.
 
         ``measure_turn``: the gyro's turn between two stamps [ns].
         """
-        if self._last is None or self._wheels.rates_known_until_ns is None:
+        if self._last is None or wheels.rates_known_until_ns is None:
             return None
-        begin_ns, end_ns = self._last.stamp_ns + self._clock_offset_ns, self._wheels.rates_known_until_ns
+        begin_ns, end_ns = self._last.stamp_ns + self._clock_offset_ns, wheels.rates_known_until_ns
         if not 0 < end_ns - begin_ns <= _MAX_HORIZON_S / _NS:
             return None
-        dt, rates, cg, missing = self._wheels.window(begin_ns, end_ns, self._max_hold_s)
+        dt, rates, cg, missing = wheels.window(begin_ns, end_ns, self._max_hold_s)
         if missing or not len(dt):
             return None
         by_model = self._model.twist(rates, cg, self._params)
-        motion, duration = integrate_twists(dt, by_model, self._noise), (end_ns - begin_ns) * _NS
-        mean, cov = mean_twist(motion.delta, motion.cov, duration)
-        twist, twist_cov = twist_at_end(mean, cov, by_model.value[-1] - mean, duration)
         turn = None if self._gyro is None or not rates.any() else measure_turn(self._last.stamp_ns, end_ns - self._clock_offset_ns)
+        by_gyro = _NO_TURN
         if turn is not None and self._gyro is not None:
-            way, way_cov = fuse_turn(se2.log(motion.delta), motion.cov, *self._gyro.correct_angle(turn))
-            motion = Motion(se2.exp(way), way_cov)
+            by_gyro = [*self._gyro.correct_angle(turn), *_NO_TURN[2:]]
             if (rate := self._gyro.correct_rate(turn)) is not None:
                 change, variance = _change_of_rate(dt, by_model.value[:, 2], turn.rate_age_s)
-                twist, twist_cov = fuse_turn(twist, twist_cov, rate[0] + change, rate[1] + variance)
+                by_gyro[2:] = rate[0] + change, rate[1] + variance
+        motion, twist, twist_cov = predicted_motion(dt, by_model.value, self._noise, np.array(by_gyro))
         return _propagated(self._last, motion, twist, twist_cov, end_ns - self._clock_offset_ns)
+
+
+def predicted_motion(dt: FloatArray, twists: FloatArray, noise: FloatArray, turn: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:
+    """The motion by ``twists`` (n, 3) over intervals ``dt`` (n,) [s] with ``noise`` (8,), the twist at its end (3,), its covariance.
+
+    ``turn`` (4,): angle and rate at the end by the gyro, each before its variance; NaN where not measured. These are `integrate_twists`,
+    `twist_at_end` and `fuse_turn` of the estimators, in one compiled function: numpy takes sixty calls for them.
+    """
+    delta, cov, twist, twist_cov = np.zeros(3), np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    _predict(np.ascontiguousarray(dt), twists, noise, turn, delta, cov, twist, twist_cov)
+    return Motion(delta, cov, _NO_PARAMS, _NO_CG), twist, twist_cov
+
+
+@kernel
+def _predict(
+    dt: FloatArray,
+    twists: FloatArray,
+    noise: FloatArray,
+    turn: FloatArray,
+    delta: FloatArray,
+    cov: FloatArray,
+    twist: FloatArray,
+    twist_cov: FloatArray,
+) -> None:
+    """Into the last four, of which the first two start at zero."""
+    n, duration = len(dt), dt.sum()
+    integrate(dt, twists, np.empty((n, 3, 0)), noise, delta, cov, np.empty((3, 0)))
+    way, J = np.array(scalar_log(triple(delta))), np.empty((3, 3))
+    fill_right_jacobian_inverse(triple(way), J)
+    twist_cov[:] = TWIST_FLOOR
+    _add_transformed(J, cov, min(duration / SLIP_LASTS_S, 1.0) / duration**2, twist_cov)
+    for i in range(3):
+        twist[i] = twists[n - 1, i]
+        twist_cov[i, i] += (CHANGE_SHARE * (twist[i] - way[i] / duration)) ** 2
+    if math.isfinite(turn[0]):
+        _fuse_turn(way, cov, turn[0], turn[1])
+        delta[0], delta[1], delta[2] = scalar_exp(triple(way))
+    if math.isfinite(turn[2]):
+        _fuse_turn(twist, twist_cov, turn[2], turn[3])
+
+
+@subroutine
+def _fuse_turn(way: FloatArray, cov: FloatArray, turn: float, variance: float) -> None:
+    """`fuse_turn` of the estimators, in place; the last row, which the others need, comes last."""
+    residual, S = turn - way[2], cov[2, 2] + variance
+    for i in range(3):
+        gain = cov[i, 2] / S
+        way[i] += gain * residual
+        for j in range(3):
+            cov[i, j] -= gain * cov[2, j]
 
 
 def _change_of_rate(dt: FloatArray, rates: FloatArray, age_s: float) -> tuple[float, float]:
     """How much turn ``rates`` (n,) [rad/s] of intervals ``dt`` (n,) [s] change in the last ``age_s`` [s], since the gyro's newest sample;
     and its variance, by the second differences of the rates, which are 6 times that of one."""
+    if age_s < dt[-1] or len(rates) == 1:
+        return 0.0, 0.0
     at = min(int(np.searchsorted(np.cumsum(dt[::-1]), age_s, side="right")), len(rates) - 1)
     change = float(rates[-1] - rates[-1 - at])
-    if at == 0:
-        return 0.0, 0.0
     scatter = float(np.mean(np.diff(rates, 2) ** 2)) / 3.0 if len(rates) > 2 else change**2
     return change, scatter + (CHANGE_SHARE * change) ** 2
 
 
 def _propagated(last: Estimate, motion: Motion, twist: FloatArray, twist_cov: FloatArray, stamp_ns: int) -> Estimate:
-    """``last`` moved by ``motion``: right perturbations, P' = Ad(delta^-1) P Ad(delta^-1)^T + Q (Solà et al. 2018, eq. 55)."""
-    A = se2.adjoint(se2.inverse(motion.delta))
+    """``last`` moved by ``motion``."""
 
     def moved(pose: FloatArray, cov: FloatArray | None) -> tuple[FloatArray, FloatArray | None]:
-        return se2.compose(pose, motion.delta), None if cov is None else A @ cov @ A.T + motion.cov
+        there, there_cov = np.empty(3), np.empty((3, 3))
+        _move(pose, _UNUSED_COV if cov is None else cov, motion.delta, motion.cov, there, there_cov)
+        return there, None if cov is None else there_cov
 
     pose, cov = moved(last.pose, last.covariance)
     odometry = None if last.odometry is None else moved(*last.odometry)
     in_space, in_map = (None if at is None else at.moved(motion.delta, motion.cov) for at in (last.in_space, last.in_map))
     return Estimate(stamp_ns, pose, cov, twist, twist_cov, None, odometry, last.map_T_odom, in_space, in_map)
+
+
+@kernel
+def _move(pose: FloatArray, cov: FloatArray, delta: FloatArray, Q: FloatArray, there: FloatArray, there_cov: FloatArray) -> None:
+    """Right perturbations, P' = Ad(delta^-1) P Ad(delta^-1)^T + Q (Solà et al. 2018, eq. 55), into the last two."""
+    A = np.empty((3, 3))
+    fill_inverse_adjoint(triple(delta), A)
+    there[0], there[1], there[2] = scalar_compose(triple(pose), triple(delta))
+    there_cov[:] = Q
+    _add_transformed(A, cov, 1.0, there_cov)
+
+
+@subroutine
+def _add_transformed(A: FloatArray, P: FloatArray, scale: float, out: FloatArray) -> None:
+    """``scale`` A P A^T, of (3, 3), to ``out``."""
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                out[i, j] += scale * A[i, k] * (P[k, 0] * A[j, 0] + P[k, 1] * A[j, 1] + P[k, 2] * A[j, 2])

@@ -229,8 +229,11 @@ class Session:
     def process(self, event: Event, publish: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
         """``publish`` is called with each estimate before anything else is done with it. Raises `EstimatorError`."""
         self.count += 1
+        found = self.pipeline.process(event)
+        if not found:  # of most events
+            return found
         start = self.state.start.widened(self.start_error_m)
-        estimates = [start.apply(estimate) for estimate in self.pipeline.process(event)]
+        estimates = [start.apply(estimate) for estimate in found]
         for estimate in estimates:
             publish(estimate)
         self._record(estimates)

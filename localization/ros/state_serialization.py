@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import operator
 import sys
 from array import array
 from collections import deque
@@ -124,8 +125,9 @@ class _Writer:
         if len(kinds) == 1 and (names := _frozen_fields(values[0])):
             if not isinstance(values[0], tuple) and any(len(vars(value)) != len(names) for value in values):  # something is cached in it
                 return None
-            columns = [self._column([getattr(value, name) for value in values]) for name in names]
             kind = type(values[0])
+            fields = [[*map(operator.attrgetter(name), values)] for name in names]
+            columns = [self._column(field) for field in fields]
             return None if None in columns else ["objects", kind.__module__, kind.__qualname__, names, *columns]
         if kinds == {tuple}:
             lengths = set(map(len, values))
@@ -139,9 +141,8 @@ class _Writer:
     def _column(self, values: Sequence[Any]) -> Json:
         kinds = set(map(type, values))
         if kinds == {np.ndarray}:
-            alike = {(v.dtype, v.shape, v.flags.c_contiguous, v.base is None) for v in values}
-            dtype, _, is_contiguous, is_own = next(iter(alike))
-            is_plain = len(alike) == 1 and is_contiguous and is_own and dtype.kind in KINDS
+            first, alike = values[0], {(v.dtype, v.shape, v.flags.num) for v in values}
+            is_plain = len(alike) == 1 and first.flags.c_contiguous and first.flags.owndata and first.dtype.kind in KINDS
             return ["ndarray", self._array(np.stack(values))] if is_plain else ["arrays", list(map(self.put, values))]
         for kind, dtype in ((float, "<f8"), (int, "<i8"), (bool, "|b1"), (np.float64, "<f8")):
             if kinds == {kind}:

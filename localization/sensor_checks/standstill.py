@@ -59,7 +59,9 @@ class Standstill:
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
-        self._shaking.setdefault(sample.frame_id, ShakeDetector()).insert(sample)
+        if sample.frame_id not in self._shaking:
+            self._shaking[sample.frame_id] = ShakeDetector()
+        self._shaking[sample.frame_id].insert(sample)
 
     def apply(self, step: Step, *, is_contradicted: bool) -> Step:
         """``step`` with unknown wheels where these ``is_contradicted``, or stand while another sensor shows motion."""

@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from localization.core.twist import fuse_turn, mean_twist, twist_at_end
 from localization.estimators import Estimate
 from localization.events import WheelSample
 from localization.logs.reader import open_source
 from localization.ros.discovery import TF
-from localization.ros.predictor import Predictor
+from localization.ros.predictor import Predictor, predicted_motion
 from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files
 from localization.ros.settings import NodeConfig
 from localization.trajectory import read_tum
+from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
+from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, stamp_of, track
 
@@ -161,15 +164,16 @@ def predictor_at(stamp_ns, clock_offset_s=0.0):
     return predictor
 
 
-def insert_wheels(predictor, begin_ns, count, rate=5.0, period_ns=S // 50):
+def wheels_from(begin_ns, count, rate=5.0, period_ns=S // 50):
+    wheels = WheelBuffer(ROBOT.center_of_gravity)
     for i in range(count):
-        predictor.insert(WheelSample(begin_ns + i * period_ns, np.full(2, rate), np.full(2, rate * i * period_ns * 1e-9)))
+        wheels.insert(WheelSample(begin_ns + i * period_ns, np.full(2, rate), np.full(2, rate * i * period_ns * 1e-9)))
+    return wheels
 
 
 def test_predict_straight_motion_moves_ahead_and_widens_the_covariance():
     predictor = predictor_at(S)
-    insert_wheels(predictor, S, 6)
-    found = predictor.predict()
+    found = predictor.predict(wheels_from(S, 6))
     assert found.stamp_ns == S + S // 10
     ahead = se2.between(np.array([1.0, 2.0, 0.5]), found.pose)
     speed = 5.0 * ROBOT.geometry.wheel_radius_m
@@ -180,22 +184,19 @@ def test_predict_straight_motion_moves_ahead_and_widens_the_covariance():
 
 def test_predict_uses_the_offset_of_the_wheels_clock():
     predictor = predictor_at(S, clock_offset_s=0.03)
-    insert_wheels(predictor, S, 6)
-    assert predictor.predict().stamp_ns == S + S // 10 - 3 * S // 100
+    assert predictor.predict(wheels_from(S, 6)).stamp_ns == S + S // 10 - 3 * S // 100
 
 
 @pytest.mark.parametrize(("begin_ns", "count", "period_ns"), [(0, 2, S // 50), (S, 4, S), (S, 200, S // 50)])
 def test_predict_without_recent_wheels_or_estimate_gives_none(begin_ns, count, period_ns):
     predictor = predictor_at(S)
-    insert_wheels(predictor, begin_ns, count, period_ns=period_ns)
-    assert predictor.predict() is None
+    assert predictor.predict(wheels_from(begin_ns, count, period_ns=period_ns)) is None
 
 
 def test_predict_after_stop_gives_none():
     predictor = predictor_at(S)
-    insert_wheels(predictor, S, 6)
     predictor.stop()
-    assert predictor.predict() is None
+    assert predictor.predict(wheels_from(S, 6)) is None
 
 
 def test_predictions_that_nobody_receives_are_not_written():
@@ -226,5 +227,33 @@ def test_predictions_of_fast_wheels_come_at_the_set_rate(wheels_hz, predicted_hz
     predictor = Predictor(make_model("diff_drive", ROBOT), ROBOT, 0.5, 50.0)
     predictor.reset(Estimate(0, np.zeros(3), np.zeros(3), None, None), None, 0.0)
     stamps = np.sort(np.arange(0.0, 10.0, 1.0 / wheels_hz) + rng.uniform(0.0, 0.002, round(10.0 * wheels_hz)))
-    due = [predictor.insert(WheelSample(round(t * S), np.ones(2), np.full(2, t))) for t in stamps]
+    due = [predictor.is_due(round(t * S)) for t in stamps]
     assert sum(due) / 10.0 == pytest.approx(predicted_hz, rel=0.03)
+
+
+@pytest.mark.parametrize("has_angle", [True, False])
+@pytest.mark.parametrize("has_rate", [True, False])
+def test_predicted_motion_is_that_of_the_estimators(has_angle, has_rate):
+    """By their functions, one after the other: means to the last digits, covariances by 1e-9 of themselves."""
+    rng, noise = np.random.default_rng(3), noise_vector(ROBOT.wheel_noise)
+    for _ in range(20):
+        n = int(rng.integers(1, 6))
+        dt, wheels = rng.uniform(0.005, 0.03, n), rng.uniform(-8.0, 8.0, (n, 2))
+        model = make_model("skid_steer", ROBOT)
+        by_model = model.twist(wheels, np.tile([0.05, -0.02], (n, 1)), model.nominal)
+        angle, rate = rng.normal(0.0, 0.1, 2)
+        motion = integrate_twists(dt, by_model, noise)
+        delta, cov, duration = motion.delta, motion.cov, float(dt.sum())
+        mean, mean_cov = mean_twist(delta, cov, duration)
+        twist, twist_cov = twist_at_end(mean, mean_cov, by_model.value[-1] - mean, duration)
+        if has_angle:
+            way, cov = fuse_turn(se2.log(delta), cov, angle, 1e-5)
+            delta = se2.exp(way)
+        if has_rate:
+            twist, twist_cov = fuse_turn(twist, twist_cov, rate, 1e-4)
+        turn = [*((angle, 1e-5) if has_angle else (np.nan, np.nan)), *((rate, 1e-4) if has_rate else (np.nan, np.nan))]
+        found, found_twist, found_twist_cov = predicted_motion(dt, by_model.value, noise, np.array(turn))
+        np.testing.assert_allclose(found.delta, delta, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(found.cov, cov, rtol=1e-9, atol=1e-18)
+        np.testing.assert_allclose(found_twist, twist, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(found_twist_cov, twist_cov, rtol=1e-9, atol=1e-18)

@@ -47,6 +47,8 @@ except ImportError as error:
 
 _LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
 _FASTEST_DRIFT = 1e-4  # of one clock against another
+_RARE_NS = 50_000_000
+"""Beside urgent messages, those of topics with few are looked for this often [ns]."""
 _TYPE = re.compile(r"(\w+)::(?:msg::)dds_::(\w+)_")
 _GRAPH_TOPIC, _GRAPH_TYPE = "ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo"
 
@@ -89,7 +91,7 @@ class DdsTransport(MonotonicTime):
         self._writers: dict[str, _Writer] = {}
         self._topics: dict[str, Topic[Any]] = {}
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        self._last_take_ns = time.monotonic_ns()
+        self._last_take_ns, self._next_rare_ns = time.monotonic_ns(), 0
         self._clocks: dict[str, SenderClock] = {}
         self._name, self._namespace = name, namespace
         self._graph = None if os.environ.get("ROS_DISTRO") == "humble" else self._writer(_GRAPH_TOPIC, _GRAPH_TYPE, _latched_output())
@@ -139,7 +141,9 @@ class DdsTransport(MonotonicTime):
         if not is_there:
             return []
         found: list[tuple[int, Received]] = []
-        has_rare = bool(self._rare.wait(0))
+        has_rare = False
+        if not is_urgent or self._last_take_ns >= self._next_rare_ns:
+            has_rare, self._next_rare_ns = bool(self._rare.wait(0)), self._last_take_ns + _RARE_NS
         for topic, reader, is_new, is_rare in self._readers:
             if (has_rare or not is_rare) and is_new.triggered:  # `take` costs more, and mostly one of them has messages
                 samples = [sample for sample in reader.take(1000) if isinstance(sample, _Bytes)]
