@@ -215,9 +215,9 @@ class WheelNoise:
     yaw_rad2_per_m: float = 1e-3
     """Variance of the yaw, per metre driven."""
     floor_m2_per_s: float = 1e-6
-    """Variance of each position component, per second of motion: the floor for model discrepancy."""
+    """Variance of each position component, per second: the floor for model discrepancy in motion, and for pushes at rest."""
     floor_rad2_per_s: float = 1e-6
-    """Variance of the yaw, per second of motion."""
+    """Variance of the yaw, per second."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,6 @@ ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, Evaluate
         (StepConfig, {"no_lidar_step_s": [0], "lost_speed_m_s": [-1], "lost_rate_rad_s": [0]}, "above 0"),
         (StepConfig, {"wait_s": [-1], "max_hold_s": [-1]}, "0 or more"),
         (FilterConfig, {"clock_sigma_s": [-1], "clock_walk_s_per_sqrt_s": [-1]}, "0 or more"),
-        (FilterConfig, {"standstill_m2_per_s": [-1], "standstill_rad2_per_s": [-1]}, "0 or more"),
         (LidarConfig, {"voxel_size_m": [-1, 1e-9, 1e3]}, "0, or from 0.01 to 10"),
         (LidarConfig, {"min_range_m": [60, 50]}, "below max_range_m, which is 50"),
         (LidarConfig, {"max_range_m": [0], "range_noise_m": [0, -1], "key_distance_m": [0], "key_angle_rad": [0]}, "above 0"),

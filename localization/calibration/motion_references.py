@@ -285,7 +285,7 @@ class LidarMotionReference:
         sensor = np.array([mount.x, mount.y])
         moved = []
         for step in (-_RANGE_STEP_M, _RANGE_STEP_M):
-            matcher = ScanMatcher(self._config, self._matcher.cell)
+            matcher = ScanMatcher(self._config, self._matcher.submap.cell)
             matcher.insert_key_scan(np.zeros(3), _with_longer_ranges(self._first_points, sensor, step))
             shifted = matcher.refine(_with_longer_ranges(points, sensor, step), match.pose, np.diag(_PRIOR_SIGMA**2), match)
             if shifted is None:
@@ -334,7 +334,7 @@ class LidarMotionReference:
 
     def _sweep(self, scan: Scan) -> Sweep:
         mount = self._mounts.get(scan.frame_id, Mount())
-        return Sweep.from_scan(scan, mount).within(self._config.min_range_m, self._config.max_range_m)
+        return Sweep.from_scan(scan, mount, self._config.min_range_m, self._config.max_range_m)
 
     def _deskew(self, sweep: Sweep, scan: Scan, wheels: Wheels) -> FloatArray:
         """(M, 2) what is matched in the plane, at the middle of the sweep: the wheels' mean twist within it, and their last slip."""

@@ -21,7 +21,7 @@ from localization.events import Step
 from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections
-from motion_models.robot import GyroNoise
+from motion_models.robot import GyroNoise, WheelNoise
 from motion_models.se2 import FloatArray
 
 
@@ -35,16 +35,13 @@ class FilterConfig(Settings):
     """Random walk of the clock offset."""
     wheel_radius_sigma: float = 0.03
     """Prior sigma of the radius of all wheels, relative: wear, pressure, load of tyres; 0: the robot file's. Only a LiDAR measures it."""
-    standstill_m2_per_s: float = 1e-6
-    """Variance of the position while no wheel moves, per second: a push, a slope [m^2/s]."""
-    standstill_rad2_per_s: float = 1e-6
-    """Variance of the yaw while no wheel moves, per second: a push, a slope [rad^2/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
     """Priors and process noise of all variables."""
 
+    wheels: WheelNoise
     gyro: GyroNoise
     corrections: Corrections
     config: FilterConfig
@@ -97,8 +94,8 @@ def wheel_transition(state: State, step: Step, motion: Motion, noise: NoiseModel
     if state.variance("clock"):  # else there is one clock
         Q["clock"] = np.array([[config.clock_walk_s_per_sqrt_s**2 * dt]])
     if step.is_standing:
-        rates = config.standstill_m2_per_s, config.standstill_m2_per_s, config.standstill_rad2_per_s
-        Q["pose"] = motion.cov + np.diag(rates) * dt
+        floor = noise.wheels.floor_m2_per_s, noise.wheels.floor_m2_per_s, noise.wheels.floor_rad2_per_s
+        Q["pose"] = motion.cov + np.diag(floor) * dt  # a push, a slope
     else:
         Q["corrections"] = corrections.process_noise * dt
         if state.variance("radius"):

@@ -70,7 +70,7 @@ class LidarOdometry(Estimator):
         if step.scan is not None:
             frame, c = step.scan.frame_id, self._config
             mount = self._used.setdefault(frame, self._mounts.get(frame, Mount()))
-            points = Sweep.from_scan(step.scan, mount).within(c.min_range_m, c.max_range_m).deskew(self._twist)
+            points = Sweep.from_scan(step.scan, mount, c.min_range_m, c.max_range_m).deskew(self._twist)
             if self._kiss is None:
                 voxel = c.voxel_size_m or (choose_voxel_size(points) if len(points) >= MIN_POINTS else _FALLBACK_VOXEL_M)
                 self._kiss = KissIcp(voxel, c.max_range_m)

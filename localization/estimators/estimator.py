@@ -5,10 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from localization.core.policies.clock_offset import ClocksApart
 from localization.events import PositionSample, Step, Turn
 from localization.lidar import LostScans
 from localization.lifting import Pose3, Trajectory3
@@ -99,16 +100,6 @@ class GyroCalibration(NamedTuple):
         """Angle of ``turn`` and its variance [rad, rad^2]."""
         angle, dt = (turn.angle - self.bias * turn.duration) / (1.0 + self.scale), turn.duration
         return angle, turn.variance + dt**2 * self.bias_variance + angle**2 * self.scale_variance
-
-
-class ClocksApart(NamedTuple):
-    """Offset of the wheels' stamps against another sensor's: either clock may be the one that is off."""
-
-    late_s: float
-    """What happened at t is stamped t + late_s by the wheels [s]."""
-    other: Literal["gyro", "LiDAR"]
-    is_latency: bool
-    """A driver's latency explains it, or of three sensors nothing shows which clock is off."""
 
 
 class Estimator(ABC):

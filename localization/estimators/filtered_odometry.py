@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Generic, TypeVar
 
-from localization.estimators.estimator import ClocksApart, Estimator, GyroCalibration, LearnedParameter, Residuals
+from localization.core.policies.clock_offset import ClocksApart
+from localization.estimators.estimator import Estimator, GyroCalibration, LearnedParameter, Residuals
 from localization.lidar import LostScans
 from motion_models.se2 import FloatArray
 

@@ -12,6 +12,7 @@ from localization.core.filter import Innovation, clone, inflate, inflate_both, p
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, NoiseModel, initial_state, wheel_transition
+from localization.core.policies.clock_offset import ClocksApart, clock_warnings, find_clocks_apart
 from localization.core.policies.continuous_pose import ContinuousPose
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
@@ -22,7 +23,6 @@ from localization.core.state import State
 from localization.core.twist import fuse_turn, mean_twist, twist_at_end
 from localization.estimators.estimator import (
     NO_POINTS,
-    ClocksApart,
     Estimate,
     Estimator,
     GyroCalibration,
@@ -30,7 +30,7 @@ from localization.estimators.estimator import (
     Residuals,
 )
 from localization.events import Step
-from localization.lidar import OUTLIER_SIGMAS, LostScans, ScanMatchingSensor
+from localization.lidar import LostScans, ScanMatchingSensor
 from motion_models import se2
 from motion_models.base import Motion, MotionModel
 from motion_models.online_calibration import Corrections
@@ -39,10 +39,6 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Twist2
 
 _REPEATED_S = 0.5
 """Scans from one place have the same errors: those of a robot at rest count no more from about this time on [s]."""
-_MIN_CLOCK_OFFSET_S = 0.05
-"""Smallest offset of the wheels' clock with a warning [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
-_MAX_LATENCY_S = 0.2
-"""Largest offset of the wheels' clock that is a driver's latency [s]: up to 0.18 on the way on fr079, MIT-CSAIL and the Husky outdoors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +77,8 @@ class EkfFusion(Estimator):
         """``sensor``: None without a LiDAR."""
         if "wheel_radius_scale" in corrections.names:  # one variable for it
             config = replace(config, wheel_radius_sigma=0.0)
-        self.model, self.noise, self._sensor = model, NoiseModel(robot.gyro_noise, corrections, config), sensor
+        self.model, self._sensor = model, sensor
+        self.noise = NoiseModel(robot.wheel_noise, robot.gyro_noise, corrections, config)
         self.state = initial_state(self.noise, has_lidar=sensor is not None)
         """Means and covariance at the end of the last step."""
         excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
@@ -199,12 +196,7 @@ class EkfFusion(Estimator):
     @property
     def clocks_apart(self) -> ClocksApart | None:
         """See `Estimator.clocks_apart`."""
-        offset, sigma = self.clock_offset_s, math.sqrt(self.state.variance("clock"))
-        if abs(offset) < max(_MIN_CLOCK_OFFSET_S, OUTLIER_SIGMAS * sigma):
-            return None
-        has_lidar = self._sensor is not None
-        is_latency = self._has_gyro == has_lidar or abs(offset) < _MAX_LATENCY_S
-        return ClocksApart(offset, "LiDAR" if has_lidar else "gyro", is_latency)
+        return find_clocks_apart(self.state, self._has_gyro, self._sensor is not None)
 
     @property
     def params(self) -> FloatArray:
@@ -276,18 +268,8 @@ class EkfFusion(Estimator):
         return found if self._sensor is None else {**found, **self._sensor.lost.causes}
 
     def warnings(self) -> list[str]:
-        """A long way by wheels alone, and a clock offset that is large and certain; those of two sensors that no latency explains are
-        reported by `sensor_checks.clocks`."""
-        apart = self.clocks_apart
-        if apart is None or not apart.is_latency:
-            return self._policies.open_way.warnings()
-        others = "LiDAR" if not self._has_gyro else "gyro" if self._sensor is None else "LiDAR or gyro"
-        direction = "later" if apart.late_s > 0.0 else "earlier"
-        return [
-            *self._policies.open_way.warnings(),
-            f"the wheels' stamps are {abs(apart.late_s):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize"
-            " the clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each.",
-        ]
+        """A long way by wheels alone, and a clock offset that is large and certain."""
+        return [*self._policies.open_way.warnings(), *clock_warnings(self.clocks_apart, self._has_gyro, self._sensor is not None)]
 
     def map_points(self) -> Points2:
         """(M, 2) points of the map in the world [m]; none without a LiDAR."""

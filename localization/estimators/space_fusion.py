@@ -141,7 +141,7 @@ class SpaceFusion(Estimator):
         c = self._lidar
         mount = self._mounts.get(step.scan.frame_id, Mount())
         self._lidar_position = np.array([mount.x, mount.y, mount.z])
-        sweep = Sweep.from_scan(step.scan, mount).within(c.min_range_m, c.max_range_m)
+        sweep = Sweep.from_scan(step.scan, mount, c.min_range_m, c.max_range_m)
         if len(sweep.points) < MIN_POINTS:
             self._lost.add(step.end_ns, "sparse")
             return None

@@ -1,18 +1,17 @@
 """LiDAR scan matching: scans to the submap of the last key scans, with a covariance from the scene."""
 
 from localization.lidar.deskew import Sweep
+from localization.lidar.key_scans import KeyScanError, key_scan_noise
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
 from localization.lidar.registration import OUTLIER_SIGMAS
 from localization.lidar.scan_matcher import (
     FORGETTING,
     MIN_POINTS,
-    KeyScanError,
     LidarConfig,
     ScanMatch,
     ScanMatcher,
     choose_cell,
-    key_scan_noise,
 )
 from localization.lidar.scan_sensor import ScanMatchingSensor
 

@@ -27,19 +27,19 @@ class Sweep:
     is_planar: bool = True
 
     @classmethod
-    def from_scan(cls, scan: Scan, mount: Mount) -> Sweep:
-        """``scan`` in the body frame. Points that are not finite are left out."""
+    def from_scan(cls, scan: Scan, mount: Mount, min_range_m: float = 0.0, max_range_m: float = math.inf) -> Sweep:
+        """``scan`` in the body frame. Points that are not finite are left out, and those nearer to the body's origin than ``min_range_m``
+        or farther than ``max_range_m`` [m]."""
         points, times = scan.points, scan.times_from_middle
         is_finite = np.isfinite(points).all(axis=1)
         if not is_finite.all():
             points, times = points[is_finite], times[is_finite] if len(times) else times
-        return cls(points @ mount.rotation.T + (mount.x, mount.y, mount.z), times, scan.is_planar)
-
-    def within(self, min_range_m: float, max_range_m: float) -> Sweep:
-        """The points whose distance from the body's origin is in this range [m]."""
-        r2 = np.einsum("ni,ni->n", self.points, self.points)
+        points = points @ mount.rotation.T + (mount.x, mount.y, mount.z)
+        r2 = np.einsum("ni,ni->n", points, points)
         kept = (r2 >= min_range_m**2) & (r2 <= max_range_m**2)
-        return self if kept.all() else Sweep(self.points[kept], self.times[kept] if len(self.times) else self.times, self.is_planar)
+        if not kept.all():
+            points, times = points[kept], times[kept] if len(times) else times
+        return cls(points, times, scan.is_planar)
 
     def deskew(self, twist: Twist2) -> FloatArray:
         """(N, 3) the points in the body frame at the middle of the sweep, during which the body moves with constant ``twist`` (3,).

@@ -6,7 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from localization.lidar.lost_scans import MAX_LOST_S, MAX_LOST_SHARE, MIN_LOST_S, LostScans
+from localization.lidar.lost_scans import MIN_LOST_S, LostScans
+
+MAX_LOST_SHARE = 0.05
+"""Share of the time without a matched scan, beyond which a run is not recommended: wheels alone err by 0.7 to 0.9 m in 10 m (fr079,
+MIT-CSAIL), matched scans by 0.05 to 0.09 m, so that from a twentieth of the way on the wheels' share is the larger one."""
+MAX_LOST_S = 5.0
+"""Longest stretch without a matched scan [s], beyond which a run is not recommended, whatever the share: at 0.4 m/s those wheels err by
+0.15 m in it, from where on Gauss-Newton alone may end in a wrong place."""
 
 _CAUSES: Mapping[str, tuple[str, str]] = {
     "lost": (

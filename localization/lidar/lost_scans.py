@@ -11,12 +11,6 @@ _MAX_SCAN_GAP_PERIODS = 4.0
 """Time without a scan that counts as lost in logs with few scans, in median times from scan to scan."""
 _GAPS = 51
 """Last gaps between scans of which the median is taken: silences among them do not count."""
-MAX_LOST_SHARE = 0.05
-"""Share of the time without a matched scan, beyond which a run is not recommended: wheels alone err by 0.7 to 0.9 m in 10 m (fr079,
-MIT-CSAIL), matched scans by 0.05 to 0.09 m, so that from a twentieth of the way on the wheels' share is the larger one."""
-MAX_LOST_S = 5.0
-"""Longest stretch without a matched scan [s], beyond which a run is not recommended, whatever the share: at 0.4 m/s those wheels err by
-0.15 m in it, from where on Gauss-Newton alone may end in a wrong place."""
 
 
 class LostScans:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
-from localization.lidar.correlative_search import OUTLIER_COST, LikelihoodImage, draw_image, find_place, prior_outlier_cov
+from localization.lidar.correlative_search import OUTLIER_COST, find_place, prior_outlier_cov
+from localization.lidar.key_scans import KeyScanError, KeyScans, key_scan_noise
 from localization.lidar.registration import Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
-from localization.lidar.submap import VoxelGrid, make_grid, measure_shares, voxel_means
+from localization.lidar.submap import voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
 
@@ -26,13 +27,9 @@ MIN_PLACE_OVERLAP = 0.6
 a prior (`global_localization_min_score`)."""
 _SWEEP_PARTS = 8
 """Parts of a sweep, over which slip within it is summed: 24 parts change no sigma of a bent scan by more than 3 %."""
-_MAX_OLD_SUBMAPS = 3
-"""Key scans older than the last ones, at most, in units of their number."""
 OPEN_INFORMATION = np.diag([1e-2, 1e-2, 1.0])
 """Added to the information of a match, so that an open direction has a sigma of 10 m or 1 rad, times that of the residuals
 [1/m^2, 1/m^2, 1/rad^2]."""
-_MAPPED_INFORMATION = 1e2
-"""Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/rad^2]."""
 
 
 @dataclass(frozen=True)
@@ -77,50 +74,14 @@ class ScanMatch:
     """(3, 3) to be added to the prior's covariance where the search showed that it was an outlier; else zero."""
 
 
-@dataclass(frozen=True)
-class KeyScanError:
-    """How the error of a key scan enters that of the submap around the robot: e_map' = (1 - s) e_map + s e_pose + m."""
-
-    share: float
-    """s, 0 to 1: the scan's share of its surroundings in the submap."""
-    new_cov: Cov3
-    """(3, 3) of m: places that were not mapped before have this scan alone."""
-
-
-def key_scan_noise(cov: FloatArray, new: float) -> FloatArray:
-    """(k, k) by which the noise of a scan, whose match has covariance ``cov`` (k, k), moves the submap, of which it draws the share ``new``
-    anew: not along directions that the scene leaves open."""
-    W = np.linalg.inv(np.eye(len(cov)) + cov * _MAPPED_INFORMATION)
-    return np.asarray(new * W @ cov @ W.T)
-
-
-@dataclass(frozen=True, eq=False)
-class KeyScan:
-    """A scan of the submap."""
-
-    points: Points2
-    """(N, 2) in the odometry frame [m]."""
-    pose: Pose2
-    """(3,) from which it was drawn."""
-    map_cov: Cov3
-    """(3, 3) covariance of the submap's error around it, before it was drawn; a right perturbation."""
-
-    def drift_variance(self, pose: Pose2, map_cov: Cov3, range_m: float) -> float:
-        """Variance [m^2] by which points at ``range_m`` have drifted from this scan to the submap around ``pose`` (3,)."""
-        A = se2.adjoint(se2.inverse(se2.between(self.pose, pose)))
-        grown = map_cov - A @ self.map_cov @ A.T
-        return float(grown[0, 0] + grown[1, 1] + range_m**2 * grown[2, 2])
-
-
 class ScanMatcher:
-    """The submap of the last key scans, and where scans fit into it. Poses are ``odom_T_body``, points (N, 2) of the body frame."""
+    """Where scans fit into a submap of the last key scans. Poses are ``odom_T_body``, points (N, 2) of the body frame."""
 
     def __init__(self, config: LidarConfig, cell: float) -> None:
         """``cell``: edge of the submap's voxels [m]."""
-        self._config, self.cell = config, cell
-        self._keys: list[KeyScan] = []
-        self._grid: VoxelGrid | None = None
-        self._image: LikelihoodImage | None = None
+        self._config = config
+        self.submap = KeyScans(cell, config.range_noise_m, config.key_scans)
+        """The last key scans."""
         self.is_new_place = False
         """Most of the last scan lies in unmapped space, the rest are inliers and the prior is narrow: it is a key scan."""
         self.mapped_share = 1.0
@@ -136,8 +97,7 @@ class ScanMatcher:
         convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier.
         ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search, and is tried beside it.
         """
-        assert self._grid is not None
-        fit = align_points(self._grid, points, prior, cov, prior if guess is None else guess)
+        fit = align_points(self.submap.grid, points, prior, cov, prior if guess is None else guess)
         self.mapped_share = fit.n_associated / len(points)
         self.is_new_place = fit.n_associated < 0.5 * len(points) and fit.n_inliers >= 0.5 * fit.n_associated and is_narrow(cov)
         converges, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * OUTLIER_COST
@@ -147,11 +107,11 @@ class ScanMatcher:
             start = fit.pose if fits else self._search(points, prior, cov + added, cov)
             if start is not None and not converges and mahalanobis(prior, start, cov) < 2.0 * OUTLIER_COST:
                 added = np.zeros((3, 3))  # within a prior that is wide itself
-            found = None if start is None else align_points(self._grid, points, prior, cov + added, start, self.cell)
+            found = None if start is None else align_points(self.submap.grid, points, prior, cov + added, start, self.submap.cell)
             least = MIN_PLACE_OVERLAP  # the place may not be mapped
             if is_narrow(cov):
                 least, ahead = self._config.lost_below, se2.retract(prior, offset)
-                goes_on = align_points(self._grid, points, prior, cov + added, ahead, self.cell)
+                goes_on = align_points(self.submap.grid, points, prior, cov + added, ahead, self.submap.cell)
                 if goes_on.overlap >= self._config.search_below and (found is None or _is_better(goes_on, found, prior, cov)):
                     found = goes_on
             if found is not None and found.overlap >= least and (not converges or _is_better(found, fit, prior, cov)):
@@ -160,8 +120,7 @@ class ScanMatcher:
 
     def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
-        assert self._grid is not None
-        fit = align_points(self._grid, points, prior, cov + match.outlier_cov, match.pose, 0.0)
+        fit = align_points(self.submap.grid, points, prior, cov + match.outlier_cov, match.pose, 0.0)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
     def intra_scan_slip_cov(self, points: Points2, times: FloatArray, pose: Pose2, slip_rate: Cov3) -> Cov3:
@@ -173,9 +132,8 @@ class ScanMatcher:
 
         where M_g is the information of all parts beyond gap g, seen from the middle, as a step of w there displaces them all.
         """
-        assert self._grid is not None
         order, H = np.argsort(times, kind="stable"), np.empty((_SWEEP_PARTS, 3, 3))
-        fill_informations(self._grid, points[order], triple(pose), H)
+        fill_informations(self.submap.grid, points[order], triple(pose), H)
         t = times[order[(np.arange(0.5, _SWEEP_PARTS) * len(points) / _SWEEP_PARTS).astype(np.intp)]]  # of the middle of each part
         later, earlier = H[::-1].cumsum(axis=0)[::-1][1:], H.cumsum(axis=0)[:-1]
         after, before = np.diff(np.maximum(t, 0.0)), np.diff(np.minimum(t, 0.0))  # how much of each gap is on either side of the middle
@@ -185,39 +143,12 @@ class ScanMatcher:
 
     def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None) -> KeyScanError:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
-        drawn = np.asarray(se2.transform(pose, points))
-        scan = make_grid(drawn, self.cell, self._config.range_noise_m)
-        share, new = (1.0, 1.0) if self._grid is None else measure_shares(self._grid, scan)
-        self._keys = [*self._fitting_keys(pose, points, map_cov), KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)]
-        self._draw()
-        assert self._grid is not None
-        fit = linearize(self._grid, points, pose)
-        if len(self._keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
+        share, new = self.submap.insert(pose, points, map_cov)
+        fit = linearize(self.submap.grid, points, pose)
+        if len(self.submap) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
             self._residuals += np.array([fit.sum_squares, fit.sum_squares, fit.n_inliers])
         noise = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION) * self._block_variance, dtype=float)
         return KeyScanError(share, key_scan_noise(noise, new))
-
-    def _fitting_keys(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> list[KeyScan]:
-        """The key scans that stay beside a new one: the last ones, and older ones from which the drift is within two sigmas of a range's.
-
-        These thicken no surface; the drift does not grow where the robot comes back to them.
-        """
-        n = self._config.key_scans - 1
-        recent = self._keys[max(len(self._keys) - n, 0) :]
-        if map_cov is None:
-            return recent
-        range_m, limit = float(np.median(np.hypot(points[:, 0], points[:, 1]))), (2.0 * self._config.range_noise_m) ** 2
-        older = [key for key in self._keys[: len(self._keys) - len(recent)] if key.drift_variance(pose, map_cov, range_m) < limit]
-        return [*older[-_MAX_OLD_SUBMAPS * self._config.key_scans :], *recent]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The key scans; grid and image are computed from them."""
-        return {name: value for name, value in vars(self).items() if name not in ("_grid", "_image")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _grid=None, _image=None)
-        if self._keys:
-            self._draw()
 
     @property
     def _residual_variance(self) -> float:
@@ -229,19 +160,9 @@ class ScanMatcher:
         """Mean square of the sums of residuals over blocks of neighbouring beams, which contains how these err together (batch means)."""
         return float(self._residuals[1] / self._residuals[2])
 
-    def points(self) -> FloatArray:
-        """(M, 2) of the submap, in the odometry frame [m]."""
-        return np.vstack([key.points for key in self._keys]) if self._keys else np.empty((0, 2))
-
-    def _draw(self) -> None:
-        self._grid, self._image = make_grid(self.points(), self.cell, self._config.range_noise_m), None
-
     def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
         """The best pose (3,) of ``points`` in the submap, as `find_place` returns it; None where it is ambiguous."""
-        assert self._grid is not None
-        if self._image is None:
-            self._image = draw_image(self._grid.means, self.cell)
-        return find_place(self._image, voxel_means(points, self.cell), prior, wide, cov)
+        return find_place(self.submap.image, voxel_means(points, self.submap.cell), prior, wide, cov)
 
     def _result(self, fit: Alignment, outlier_cov: Cov3) -> ScanMatch:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""

@@ -10,10 +10,11 @@ import numpy as np
 
 from localization.events import Step
 from localization.lidar.deskew import Sweep
+from localization.lidar.key_scans import KeyScanError
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
 from localization.lidar.registration import prior_error_at_points
-from localization.lidar.scan_matcher import MIN_POINTS, KeyScanError, LidarConfig, ScanMatch, ScanMatcher, choose_cell
+from localization.lidar.scan_matcher import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.lidar.scan_policies import MovedRobot, StaleScans
 from motion_models import se2
 from motion_models.robot import Mount
@@ -69,7 +70,7 @@ class ScanMatchingSensor:
         self._frame = scan.frame_id
         if self._stale.is_stale(scan, step.is_standing):
             return None, "stale"
-        sweep = Sweep.from_scan(scan, self._mount(scan.frame_id)).within(self._config.min_range_m, self._config.max_range_m)
+        sweep = Sweep.from_scan(scan, self._mount(scan.frame_id), self._config.min_range_m, self._config.max_range_m)
         deskewed = self._deskew(sweep, step.twist)
         if len(deskewed.planar) < MIN_POINTS:
             return None, "sparse"
@@ -141,7 +142,7 @@ class ScanMatchingSensor:
 
     def map_points(self) -> Points2:
         """(M, 2) the submap in the odometry frame [m]."""
-        return np.empty((0, 2)) if self._matcher is None else self._matcher.points()
+        return np.empty((0, 2)) if self._matcher is None else self._matcher.submap.points()
 
     @property
     def sweep_s(self) -> float:
@@ -151,7 +152,7 @@ class ScanMatchingSensor:
     @property
     def cell(self) -> float:
         """Edge of the submap's voxels [m]."""
-        return 0.0 if self._matcher is None else self._matcher.cell
+        return 0.0 if self._matcher is None else self._matcher.submap.cell
 
     def _deskew(self, sweep: Sweep, twist: Twist2) -> _Scan:
         points = sweep.deskew(twist)

@@ -26,8 +26,7 @@ from localization.calibration.motion_references import GyroMotionReference, Lida
 from localization.calibration.windows import WindowConfig
 from localization.estimators import Estimate
 from localization.events import Event, Scan
-from localization.lidar.losses import LidarLosses
-from localization.lidar.lost_scans import MAX_LOST_S
+from localization.lidar.losses import MAX_LOST_S, LidarLosses
 from localization.pipeline import Pipeline
 from motion_models.errors import SkidlocError
 from motion_models.robot import Mount, Robot

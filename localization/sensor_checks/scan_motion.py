@@ -96,7 +96,7 @@ def profile_of(scan: Scan, mount: Mount, config: LidarConfig) -> Profile | None:
     """Profile of the surfaces of ``scan`` that are within the LiDAR's range; None for too few points."""
     center = np.array([mount.x, mount.y])
     if not scan.is_planar:
-        sweep = Sweep.from_scan(scan, mount).within(config.min_range_m, config.max_range_m)
+        sweep = Sweep.from_scan(scan, mount, config.min_range_m, config.max_range_m)
         return make_profile(sweep.project(sweep.points) - center, center)
     points = scan.points @ mount.rotation.T
     n = _keep_within(points, (mount.x, mount.y, mount.z), config.min_range_m**2, config.max_range_m**2)

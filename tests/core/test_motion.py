@@ -30,6 +30,7 @@ from motion_models import se2
 from motion_models.base import Motion
 from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
+from motion_models.robot import WheelNoise
 from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.steps import steps
@@ -40,7 +41,7 @@ GYRO = ROBOT.gyro_noise
 MODEL = make_model("skid_steer", ROBOT)
 CORRECTED = make_corrections(MODEL, "constant")
 LIDAR = np.diag([0.004, 0.006, 0.002]) ** 2
-ROWS = initial_state(NoiseModel(GYRO, CORRECTED, FilterConfig())).layout.rows
+ROWS = initial_state(NoiseModel(WheelNoise(), GYRO, CORRECTED, FilterConfig())).layout.rows
 POSE, START, MAP, KEY = (ROWS[name] for name in ("pose", "start", "map", "key"))
 BIAS, SCALE, CLOCK, RADIUS, PARAMS = (ROWS[name].start for name in ("gyro_bias", "gyro_scale", "clock", "radius", "corrections"))
 
@@ -50,7 +51,7 @@ class Chain:
 
     def __init__(self, config):
         self.config = config
-        self.state = initial_state(NoiseModel(GYRO, CORRECTED, config))
+        self.state = initial_state(NoiseModel(WheelNoise(), GYRO, CORRECTED, config))
         self.noise, self.excitation = WheelNoiseScale(), Excitation(ROBOT.geometry.track_width_m, CORRECTED.min_track_over_radius)
         at_rest = Step(0, 1, Motion(np.zeros(3), NOTHING), np.zeros(3), np.zeros(3), True, True)
         self.noise.start_step(self.state, at_rest)
@@ -59,7 +60,7 @@ class Chain:
         motion = dataclasses.replace(step.predicted, cov=self.noise.start_step(self.state, step))
         self.excitation.is_turning = is_turning
         state = clone(self.state, "pose", "start")
-        self.state = propagate(state, wheel_transition(state, step, motion, NoiseModel(GYRO, CORRECTED, self.config)))
+        self.state = propagate(state, wheel_transition(state, step, motion, NoiseModel(WheelNoise(), GYRO, CORRECTED, self.config)))
 
     def _update(self, measurement, considered):
         self.state, innovation = update(self.state, measurement, considered)

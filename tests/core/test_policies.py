@@ -22,7 +22,8 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 
 ROBOT = load_robot("vaultbot")
-STATE = initial_state(NoiseModel(ROBOT.gyro_noise, make_corrections(make_model("skid_steer", ROBOT), "constant"), FilterConfig()))
+NOISE = NoiseModel(ROBOT.wheel_noise, ROBOT.gyro_noise, make_corrections(make_model("skid_steer", ROBOT), "constant"), FilterConfig())
+STATE = initial_state(NOISE)
 
 
 def step_of(delta, is_standing=False, has_wheels=True):

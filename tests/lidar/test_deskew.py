@@ -88,7 +88,7 @@ def test_sweep_with_infinite_points_leaves_them_out(times: bool) -> None:
 
 def test_sweep_within_keeps_points_in_range() -> None:
     points = np.array([[0.05, 0.0, 0.0], [1.0, 0.0, 0.0], [60.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
-    sweep = Sweep.from_scan(Scan(0, points, np.arange(4.0)), Mount()).within(0.1, 50.0)
+    sweep = Sweep.from_scan(Scan(0, points, np.arange(4.0)), Mount(), 0.1, 50.0)
     np.testing.assert_array_equal(sweep.points, points[[1, 3]])
     np.testing.assert_array_equal(sweep.times, [-0.5, 1.5])
 

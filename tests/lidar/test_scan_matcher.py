@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from localization.lidar import LidarConfig, ScanMatch, ScanMatcher, scan_matcher, submap
+from localization.lidar.key_scans import KeyScan
 from localization.lidar.registration import _KERNEL, linearize
-from localization.lidar.scan_matcher import KeyScan
 from localization.lidar.submap import make_grid
 from localization.simulation import world
 from motion_models import se2
@@ -297,8 +297,8 @@ def test_submap_holds_last_key_scans_only() -> None:
     rng, matcher = np.random.default_rng(0), ScanMatcher(LidarConfig(key_scans=3), CELL)
     for k in range(5):
         matcher.insert_key_scan(np.array([10.0 * k, 0.0, 0.0]), rng.uniform(-1.0, 1.0, (100, 2)))
-    assert matcher.points().shape == (300, 2)
-    assert matcher.points()[:, 0].min() > 18.0
+    assert matcher.submap.points().shape == (300, 2)
+    assert matcher.submap.points()[:, 0].min() > 18.0
 
 
 @pytest.mark.parametrize(("drift_m", "stays"), [(0.03, True), (0.05, False)])
@@ -309,8 +309,8 @@ def test_submap_keeps_old_scan_while_drift_is_small(drift_m: float, stays: bool)
         cov = np.diag([drift_m**2 * (k >= 10), 0.0, 0.0])
         matcher.insert_key_scan(np.array([10.0 * k, 0.0, 0.0]), rng.uniform(-1.0, 1.0, (100, 2)), cov)
         if k == 10:
-            assert matcher.points().shape == (100 * (8 if stays else 2), 2)
-    assert matcher.points().shape == (800, 2)
+            assert matcher.submap.points().shape == (100 * (8 if stays else 2), 2)
+    assert matcher.submap.points().shape == (800, 2)
 
 
 def test_drift_variance_of_yaw_counts_by_range() -> None:

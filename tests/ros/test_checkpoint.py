@@ -357,7 +357,7 @@ def test_serialized_submap_is_key_scans_and_matches_bit_by_bit():
         one, other = (m.match(room, prior, cov) for m in (matcher, again))
         assert one is not None
         assert all(np.array_equal(vars(one)[name], vars(other)[name]) for name in vars(one))
-    assert deserialize(*serialize(ScanMatcher(LidarConfig(), 0.1))).points().shape == (0, 2)
+    assert deserialize(*serialize(ScanMatcher(LidarConfig(), 0.1))).submap.points().shape == (0, 2)
 
 
 def test_serialize_does_not_write_shared_objects():

@@ -41,7 +41,8 @@ from localization.evaluation.consistency import pose_consistency
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
 from localization.events import Event, Scan, Step
-from localization.lidar import correlative_search, registration, scan_matcher
+from localization.lidar import correlative_search, key_scans, registration, scan_matcher
+from localization.lidar.key_scans import KeyScanError, KeyScans
 from localization.lidar.loop_detection import LoopDetector
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.lidar.scan_sensor import ScanMatchingSensor
@@ -91,7 +92,7 @@ def _independent(original: Callable[..., Any], self: EkfFusion, state: State, st
     return original(self, set_marginal(state, "map", state["map"], state.cov("map")), step)
 
 
-def _without_new(state: State, error: scan_matcher.KeyScanError) -> Transition:
+def _without_new(state: State, error: KeyScanError) -> Transition:
     return key_scan_transition(state, replace(error, new_cov=np.zeros((3, 3))))
 
 
@@ -139,7 +140,7 @@ _NO_SEARCH = (
 _ASSUMED_NOISE = (_attribute(ScanMatcher, "_residual_variance", 1.0), _attribute(ScanMatcher, "_block_variance", 1.0))
 PATCHES: Mapping[str, Patch] = {
     "old key scans that fit": _wrap(
-        ScanMatcher, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
+        KeyScans, "_fitting_keys", lambda original, self, pose, points, map_cov: original(self, pose, points, None)
     ),
     "slip that changes within a sweep": _attribute(SlipChanges, "rate", lambda *a: np.zeros((3, 3))),
     "second deskewing pass": _attribute(ScanMatchingSensor, "refine", lambda self, match, twist: match),
@@ -157,7 +158,7 @@ PATCHES: Mapping[str, Patch] = {
         _attribute(scan_matcher, "OUTLIER_COST", math.inf), _attribute(correlative_search, "OUTLIER_COST", math.inf)
     ),
     "prior in the least squares": _attribute(scan_matcher, "align_points", _align_freely),
-    "thickness of surfaces": _attribute(scan_matcher, "make_grid", _thin_grid),
+    "thickness of surfaces": _attribute(key_scans, "make_grid", _thin_grid),
     "size of the residuals": lambda: _together(*_ASSUMED_NOISE),
     "correlation of neighbouring residuals": _attribute(ScanMatcher, "_block_variance", property(lambda self: self._residual_variance)),
     "submap's error": _attribute(fusion, "key_scan_transition", lambda state, error: Transition()),
@@ -169,7 +170,7 @@ PATCHES: Mapping[str, Patch] = {
     "radius considered while the way is open": _attribute(Excitation, "considered_by_scan", lambda self, *a: self.considered()),
     "ways by wheels alone": _attribute(OpenWay, "cov", lambda self, step: np.zeros((3, 3))),
     "moving objects left out": _attribute(MovingObjects, "apply", lambda self, step, **_: step),
-    "noise of normals": _attribute(scan_matcher, "make_grid", _exact_normals),
+    "noise of normals": _attribute(key_scans, "make_grid", _exact_normals),
     "key scans of new places at once": _wrap(ScanMatcher, "match", _match_without_new_place),
 }
 GRAPH_PATCHES: Mapping[str, Patch] = {

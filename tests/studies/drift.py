@@ -24,7 +24,7 @@ from localization.core.motion import FilterConfig
 from localization.estimators import EstimatorConfig, fusion
 from localization.events import Scan
 from localization.lidar import LidarConfig
-from localization.lidar.scan_matcher import KeyScan
+from localization.lidar.key_scans import KeyScan
 from localization.log_replay import replay
 from localization.pipeline import ReplayConfig, Trial
 from localization.trajectory import Trajectory
