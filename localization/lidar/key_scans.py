@@ -59,14 +59,11 @@ class KeyScans:
     def __init__(self, cell: float, range_noise_m: float, n: int) -> None:
         """``cell``: edge of the voxels [m]; ``range_noise_m``: sigma of a range [m]; ``n`` last scans stay in any case."""
         self.cell, self._range_noise_m, self._n = cell, range_noise_m, n
-        self._keys: list[KeyScan] = []
+        self.keys: list[KeyScan] = []
+        """Those that stay, the newest last."""
         self.grid = self._make_grid()
         """Their surfaces."""
         self._image: LikelihoodImage | None = None
-
-    def __len__(self) -> int:
-        """Key scans that stay."""
-        return len(self._keys)
 
     @property
     def image(self) -> LikelihoodImage:
@@ -77,7 +74,7 @@ class KeyScans:
 
     def points(self) -> FloatArray:
         """(M, 2) in the odometry frame [m]."""
-        return np.vstack([key.points for key in self._keys]) if self._keys else np.empty((0, 2))
+        return np.vstack([key.points for key in self.keys]) if self.keys else np.empty((0, 2))
 
     def insert(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> tuple[float, float]:
         """Draw the scan ``points`` (N, 2) of the body frame from ``pose`` (3,); returns its shares, as `measure_shares` does.
@@ -88,7 +85,7 @@ class KeyScans:
         scan = make_grid(drawn, self.cell, self._range_noise_m)
         shares = measure_shares(self.grid, scan)
         key = KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)
-        self._keys = [*self._fitting_keys(pose, points, map_cov), key]
+        self.keys = [*self._fitting_keys(pose, points, map_cov), key]
         self.grid, self._image = self._make_grid(), None
         return shares
 
@@ -97,11 +94,11 @@ class KeyScans:
 
         These thicken no surface; the drift does not grow where the robot comes back to them.
         """
-        recent = self._keys[max(len(self._keys) - self._n + 1, 0) :]
+        recent = self.keys[max(len(self.keys) - self._n + 1, 0) :]
         if map_cov is None:
             return recent
         range_m, limit = float(np.median(np.hypot(points[:, 0], points[:, 1]))), (2.0 * self._range_noise_m) ** 2
-        older = [key for key in self._keys[: len(self._keys) - len(recent)] if key.drift_variance(pose, map_cov, range_m) < limit]
+        older = [key for key in self.keys[: len(self.keys) - len(recent)] if key.drift_variance(pose, map_cov, range_m) < limit]
         return [*older[-_MAX_OLD_SUBMAPS * self._n :], *recent]
 
     def _make_grid(self) -> VoxelGrid:

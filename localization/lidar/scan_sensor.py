@@ -26,8 +26,12 @@ _MIN_DISPLACEMENT_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """The scan at hand, deskewed."""
+    """The scan at hand, deskewed, and where it was looked for."""
 
+    prior: Pose2
+    """(3,) ``odom_T_body``."""
+    cov: Cov3
+    """(3, 3) of the prior against the submap."""
     sweep: Sweep
     twist: Twist2
     """(3,) with which it was deskewed."""
@@ -49,8 +53,6 @@ class ScanMatchingSensor:
         self._kiss: KissIcp | None = None
         self._scan: _Scan | None = None
         self._frame = ""  # of the last scan
-        self._prior, self._cov = np.zeros(3), np.eye(3)
-        self._last_key: FloatArray | None = None
         self._stale, self.moved, self.lost = StaleScans(), MovedRobot(), LostScans()
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, offset: Tangent2) -> ScanMatch | None:
@@ -58,12 +60,12 @@ class ScanMatchingSensor:
 
         The sweep is deskewed with the wheels' twist at its middle. ``offset`` (3,): see `ScanMatcher.match`.
         """
-        self._scan, self._prior, self._cov = None, prior, cov
-        found, cause = self._measure(step, offset)
+        self._scan = None
+        found, cause = self._measure(step, prior, cov, offset)
         self.lost.add(step.end_ns, cause)
         return found
 
-    def _measure(self, step: Step, offset: Tangent2) -> tuple[ScanMatch | None, str]:
+    def _measure(self, step: Step, prior: Pose2, cov: Cov3, offset: Tangent2) -> tuple[ScanMatch | None, str]:
         """The match, and why the scan is lost; "" where it is not, also of the first scan."""
         scan = step.scan
         assert scan is not None
@@ -71,7 +73,7 @@ class ScanMatchingSensor:
         if self._stale.is_stale(scan, step.is_standing):
             return None, "stale"
         sweep = Sweep.from_scan(scan, self._mount(scan.frame_id), self._config.min_range_m, self._config.max_range_m)
-        deskewed = self._deskew(sweep, step.twist)
+        deskewed = self._deskew(sweep, step.twist, prior, cov)
         if len(deskewed.planar) < MIN_POINTS:
             return None, "sparse"
         self._scan = deskewed
@@ -81,8 +83,8 @@ class ScanMatchingSensor:
             return None, ""
         guess = None
         if self._kiss is not None:
-            guess = self._kiss.align(deskewed.points, self._prior, prior_error_at_points(deskewed.planar, self._cov))
-        found = self._matcher.match(deskewed.planar, self._prior, self._cov, guess, offset)
+            guess = self._kiss.align(deskewed.points, prior, prior_error_at_points(deskewed.planar, cov))
+        found = self._matcher.match(deskewed.planar, prior, cov, guess, offset)
         if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
             self._scan, self._matcher.is_new_place = None, False
             return None, "moved"
@@ -95,12 +97,13 @@ class ScanMatchingSensor:
 
     def refine(self, match: ScanMatch, twist: Twist2) -> ScanMatch:
         """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
-        assert self._scan is not None
+        scan = self._scan
+        assert scan is not None
         assert self._matcher is not None
-        if self._scan.sweep.displacement(twist - self._scan.twist) < _MIN_DISPLACEMENT_M:
+        if scan.sweep.displacement(twist - scan.twist) < _MIN_DISPLACEMENT_M:
             return match
-        self._scan = self._deskew(self._scan.sweep, twist)
-        return self._matcher.refine(self._scan.planar, self._prior, self._cov, match) or match
+        self._scan = scan = self._deskew(scan.sweep, twist, scan.prior, scan.cov)
+        return self._matcher.refine(scan.planar, scan.prior, scan.cov, match) or match
 
     def intra_scan_slip_cov(self, match: ScanMatch, slip_rate: Cov3) -> Cov3:
         """(3, 3) of the ``match`` of the scan at hand by slip within the sweep, a random walk of ``slip_rate`` (3, 3) a second."""
@@ -110,26 +113,25 @@ class ScanMatchingSensor:
 
     def is_key(self, pose: Pose2) -> bool:
         """Whether the scan at hand, taken from ``pose`` (3,), is to enter the submap."""
-        if self._scan is None:
+        if self._scan is None or self._matcher is None:
             return False
-        if self._last_key is None or (self._matcher is not None and self._matcher.is_new_place):
+        keys = self._matcher.submap.keys
+        if not keys or self._matcher.is_new_place:
             return True
-        moved = se2.between(self._last_key, pose)
-        c = self._config
+        moved, c = se2.between(keys[-1].pose, pose), self._config
         return bool(math.hypot(moved[0], moved[1]) > c.key_distance_m or abs(moved[2]) > c.key_angle_rad)
 
     def insert_key_scan(self, pose: Pose2, map_cov: Cov3) -> KeyScanError:
         """Draw the scan at hand from ``pose`` (3,), where the submap's error has covariance ``map_cov`` (3, 3)."""
         assert self._scan is not None
         assert self._matcher is not None
-        self._last_key = pose
         if self._kiss is not None:
             self._kiss.insert(self._scan.points, pose)
         return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
 
     def begin_submap(self) -> None:
         """Drop the submap: the next scan begins another one."""
-        self._matcher, self._kiss, self._last_key = None, None, None
+        self._matcher, self._kiss = None, None
 
     def scan_points(self) -> Points2:
         """(M, 2) the scan at hand in the body frame, or (0, 2)."""
@@ -154,9 +156,9 @@ class ScanMatchingSensor:
         """Edge of the submap's voxels [m]."""
         return 0.0 if self._matcher is None else self._matcher.submap.cell
 
-    def _deskew(self, sweep: Sweep, twist: Twist2) -> _Scan:
+    def _deskew(self, sweep: Sweep, twist: Twist2, prior: Pose2, cov: Cov3) -> _Scan:
         points = sweep.deskew(twist)
-        return _Scan(sweep, twist, points, *sweep.project_with_times(points))
+        return _Scan(prior, cov, sweep, twist, points, *sweep.project_with_times(points))
 
     def _begin(self, scan: _Scan) -> None:
         """The first scan sets the size of the voxels."""
