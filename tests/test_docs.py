@@ -117,3 +117,14 @@ def test_classes_named_in_a_document_exist(path: Path) -> None:
         unknown + [member for _, member in named if member and not re.search(rf"def {member}\(|^    {member}:", source, flags=re.MULTILINE)]
         == []
     )
+
+
+def test_docstrings_begin_with_their_subject() -> None:
+    """An editor shows them alone: one that begins with "Of" continues a sentence that stands elsewhere."""
+    found = [
+        f"{path.relative_to(ROOT)}: {beginning}"
+        for package in ("localization", "motion_models", "skidloc")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        for beginning in re.findall(r'^ *"""((?:Of|The same,|The same (?:of|for)) .*)', path.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert not found

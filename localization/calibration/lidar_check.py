@@ -134,7 +134,7 @@ class LidarCheck:
         self.is_done |= is_late or self._scans > _MAX_SCANS
 
     def _travel_of(self, scan: Scan) -> _Travel:
-        """Of the sensor of ``scan``; a planar one whose plane stands on edge by its transform is taken as level."""
+        """Travel of the sensor of ``scan``; a planar one whose plane stands on edge by its transform is taken as level."""
         frame = scan.frame_id
         mount = self._mounts.get(frame)
         if frame not in self._travels and mount is not None and scan.is_planar and abs(mount.rotation[2, 2]) < _MIN_LEVEL:

@@ -135,7 +135,7 @@ def _odd_clock(wheels: _Offset, scans: _Offset) -> tuple[Sensor, float]:
 
 
 def _offset(turns: FloatArray, heading: Track, edges: NDArray[np.float64]) -> _Offset:
-    """Of ``turns`` (N,) over ``edges`` (N, 2) of stamps [s] that are late."""
+    """Offset of ``turns`` (N,) over ``edges`` (N, 2) of stamps [s] that are late."""
     offsets = np.arange(-round(_MAX_LATE_S / _STEP_S), round(_MAX_LATE_S / _STEP_S) + 1) * _STEP_S
     found = np.array([_likeness(_turns(heading, edges, late), turns) for late in offsets])
     best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])

@@ -21,7 +21,7 @@ _MIN_OFF_S, _MAX_LATENCY_S = 0.15, 0.1
 """Least time of recording less stamp, of either sign, of a clock that may be off, and largest of one that is not: the latency of drivers,
 as of the LiDAR's check."""
 _MIN_CORRELATION, _CLEARER = 0.9, 2.0
-"""Of turns with the corrected clock, and how many times nearer to 1 than without."""
+"""Correlation of turns with the corrected clock, at least, and how many times nearer to 1 than without."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class _Suspect:
     topic: str
     key: str
     value: float
-    """Of that entry of `Clock`."""
+    """Value of that entry of `Clock`."""
     why: str
 
 

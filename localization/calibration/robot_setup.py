@@ -43,7 +43,7 @@ from motion_models.text_files import read_text
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _OPEN_SIDES = "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."
 _SURE_CORRELATION = 0.9
-"""Of the wheels' turns with those of gyro or LiDAR, as in `wheel_wiring`."""
+"""Correlation of the wheels' turns with those of gyro or LiDAR, as in `wheel_wiring`."""
 _LEAST_DRIVEN_K = 0.8
 """k = track / effective track of two driven wheels and a caster is 1 within 2 %; of four wheels 0.43 to 0.77."""
 

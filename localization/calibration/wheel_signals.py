@@ -36,7 +36,7 @@ _MIN_COMPARED = 12
 MIN_TURN_RAD_S = 0.03
 """Root mean square of turns that are compared."""
 MAX_BIAS_RAD_S = 0.05
-"""Of a gyro, at rest."""
+"""Rate of a gyro at rest, at most [rad/s]."""
 _MIN_SCAN_INTERVALS = 12
 """With a motion from scan to scan; fewer are of scans that do not match."""
 _MOVED = 0.02

@@ -49,7 +49,7 @@ _MIN_CORRELATION = 0.6
 _SURE_CORRELATION = 0.9
 """What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
 _LIKELY_CORRELATION = 0.8
-"""Of speeds with the turns of a gyro, which are unlike the same odometry's turns."""
+"""Correlation of speeds with the turns of a gyro, which are unlike the same odometry's turns."""
 _MIN_SPEED_M_S = 0.02
 """Root mean square of speeds that are compared."""
 _MIN_CLOCK_INTERVALS = 60
@@ -66,7 +66,7 @@ _MAX_UNSHIFTED = 0.85
 _MIN_TURN_PART = 1e-3
 """Least root mean square of the sides' difference, of the largest of all wirings'."""
 _FASTEST_M_S = 20.0
-"""Of an odometry in metres."""
+"""Speed of an odometry in metres, at most [m/s]."""
 _USUAL_M_S = (0.05, 1.2)
 """Fast speeds (95 % of all are slower) of most drives; those of a live odometry outside are compared with the LiDAR's, of logs all."""
 _MIN_AHEAD_M, _MIN_TURNED_RAD, _SAME_END = 0.1, 1.5, 0.25

@@ -150,10 +150,11 @@ def _reset_jacobian(state: State, means: Mapping[str, FloatArray]) -> FloatArray
     """
     G, rows, groups = np.eye(len(state.P)), state.layout.rows, state.layout.groups
     for name, group in groups.items():
-        if isinstance(group, Perturbation) and means[group.of] is not state[group.of]:
-            pose = groups[group.of]
-            A = pose.adjoint(pose.compose(pose.inverse(means[group.of]), state[group.of]))
-            G[rows[name], rows[name]], G[rows[group.of], rows[name]] = A, A - np.eye(group.dim)
+        if isinstance(group, Perturbation):
+            pose, before, after = groups[group.of], state[group.of], means[group.of]
+            if after is not before:
+                A = pose.adjoint(pose.compose(pose.inverse(after), before))
+                G[rows[name], rows[name]], G[rows[group.of], rows[name]] = A, A - np.eye(group.dim)
     return G
 
 

@@ -195,7 +195,7 @@ def _check(predictor: DrivePredictor, search: Search, reader: Reader | None) -> 
         return None
 
     def relative_sigma(used: NDArray[np.bool_]) -> float:
-        """Of the term that these windows measure worst, over its size on the whole drive."""
+        """Sigma of the term that these windows measure worst, over its size on the whole drive."""
         measured = sizes_on(predictor, search, used[predictor.batch.owner])[1]
         return max(t.sigma / abs(whole.term.value) for t, whole in zip(measured, search.terms, strict=True))
 

@@ -347,7 +347,7 @@ def _noise_beside_terms(predictor: DrivePredictor, state: Linearization, design:
 
 
 def _twice_log_determinant(noise: Noise) -> float:
-    """Of its standard deviations: less twice the log-likelihood of a drive by its own noise, but for a constant."""
+    """Twice the sum of the logarithms of its sigmas: less twice the log-likelihood of a drive by its own noise, but for a constant."""
     return 2.0 * float(np.log(noise.sigmas[noise.known]).sum())
 
 

@@ -52,9 +52,9 @@ class LastStep:
     is_turning: bool
     """Whether it excites the corrections."""
     turn: Innovation | None = None
-    """Of the gyro."""
+    """Innovation of the gyro."""
     scan: Innovation | None = None
-    """Of the matched scan, as if the prior were no outlier."""
+    """Innovation of the matched scan, as if the prior were no outlier."""
 
 
 @dataclass(eq=False)

@@ -77,7 +77,7 @@ class LastKeyframe:
     matched: int = 0
     """Number of the last keyframe with a matched scan, this one or one before."""
     lost_variance: float = 0.0
-    """Of the position in the odometry's frame, if it had no matched scan [m^2]."""
+    """Variance of the position in the odometry's frame, if it had no matched scan [m^2]."""
 
 
 @dataclass(eq=False)

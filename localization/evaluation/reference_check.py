@@ -37,8 +37,9 @@ _SAME_RUN = 0.9
 short to be sure: another run of the same robot on the same way has 0.4 to 0.94, the same run 0.99, or 0.93 where wheels slip and the
 reference is coarse."""
 _SAME_PATH = 0.97
-"""The same, of that or of the turns of the path: the same maneuvers of other lengths have at most 0.96 of both (20 drives of three robots),
-the same run more of one of them (windows of 25 and 40 s of fr079 and MIT-CSAIL)."""
+"""Correlation without an offset or of the turns of the path, over the best one, from where on a reference is of the same run: the same
+maneuvers of other lengths have at most 0.96 of both (20 drives of three robots), the same run more of one of them (windows of 25 and
+40 s of fr079 and MIT-CSAIL)."""
 _MIRRORED = -0.35
 """Correlation of turns of opposite sign; GPS of 2 m noise has +0.44 in a healthy log."""
 _MIN_OFFSET_S = 0.3

@@ -93,14 +93,15 @@ class ScanMatcher:
     ) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
-        Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where the prior is wider than the basin of
-        convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an outlier.
-        ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search, and is tried beside it.
+        Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where what the scan takes off the prior is wider than
+        the basin of convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an
+        outlier. ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search, and is tried beside it.
         """
         fit = align_points(self.submap.grid, points, prior, cov, prior if guess is None else guess)
         self.mapped_share = fit.n_associated / len(points)
         self.is_new_place = fit.n_associated < 0.5 * len(points) and fit.n_inliers >= 0.5 * fit.n_associated and is_narrow(cov)
-        converges, agrees = _is_within_basin(fit, cov), mahalanobis(prior, fit.pose, cov) < 2.0 * OUTLIER_COST
+        taken_off = cov - np.linalg.inv(np.linalg.inv(cov) + fit.information)  # little along directions that the scene leaves open
+        converges, agrees = is_narrow(taken_off), mahalanobis(prior, fit.pose, cov) < 2.0 * OUTLIER_COST
         fits = converges and fit.overlap >= self._config.search_below
         if not (fits and agrees):
             added = prior_outlier_cov(cov) + np.outer(offset, offset)
@@ -145,7 +146,7 @@ class ScanMatcher:
         """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
         share, new = self.submap.insert(pose, points, map_cov)
         fit = linearize(self.submap.grid, points, pose)
-        if len(self.submap) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
+        if len(self.submap.keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
             self._residuals += np.array([fit.sum_squares, fit.sum_squares, fit.n_inliers])
         noise = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION) * self._block_variance, dtype=float)
         return KeyScanError(share, key_scan_noise(noise, new))
@@ -175,13 +176,6 @@ class ScanMatcher:
 def choose_cell(config: LidarConfig, points: Points2) -> float:
     """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame: at least two sigma of a range."""
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), 2.0 * config.range_noise_m)
-
-
-def _is_within_basin(fit: Alignment, cov: Cov3) -> bool:
-    """Whether Gauss-Newton from a prior with ``cov`` (3, 3) converges to the right pose: what the scan takes off the prior is within its
-    basin. Along directions that the scene leaves open, the prior may be of any width.
-    """
-    return is_narrow(cov - np.linalg.inv(np.linalg.inv(cov) + fit.information))
 
 
 def _is_better(found: Alignment, fit: Alignment, prior: Pose2, cov: Cov3) -> bool:

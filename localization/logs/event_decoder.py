@@ -429,7 +429,7 @@ class FailingEncoders:
     """
 
     def __init__(self, left: int, n: int) -> None:
-        """Of ``n`` joints the first ``left`` are the left side's."""
+        """The first ``left`` of ``n`` joints are the left side's."""
         self._sides = (np.arange(left), np.arange(left, n))
         self._missing = np.zeros(n)  # what the others have turned on average since a joint last turned [rad]
         self._idle = np.zeros(n)  # the sizes of their steps

@@ -112,7 +112,7 @@ _UNKNOWN_SIGMA_M = 2.5
 """Sigma of a position by a source without covariance [m]: a GPS receiver without corrections (GPS Standard Positioning Service, 2020: 95 %
 within 8 m)."""
 _UNKNOWN_HEIGHT_SIGMA_M = 6.6
-"""The same of the height (95 % within 13 m) [m]."""
+"""Sigma of a height without covariance (95 % within 13 m) [m]."""
 _MIN_SIGMA_M = 0.01
 """Smallest sigma of a receiver, whatever its covariance [m]."""
 

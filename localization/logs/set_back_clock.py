@@ -21,7 +21,7 @@ COMPARED = 200
 """Messages before and after a step in which topics are compared: 1 s of a robot's sensors."""
 _MIN_OF_TOPIC = 3
 _SMALL_BYTES = 50_000_000
-"""Of files whose chunks are all read: 0.3 s. Chunks of larger ones hold a second or less, or hours are recorded."""
+"""Size of files whose chunks are all read [bytes]: 0.3 s. Chunks of larger ones hold a second or less, or hours are recorded."""
 MAX_CANDIDATES = 100
 """Steps of a chunk that are compared; more are no clock that was set, but times that mean nothing."""
 Times = Sequence[tuple[int, int]]
@@ -33,9 +33,9 @@ class SetBack:
     """The recorder's clock was set back."""
 
     position: int
-    """Of the chunk in the file."""
+    """Where the chunk is in the file."""
     index: int
-    """Of the first message of that chunk after it."""
+    """Number of the first message of that chunk after it."""
     at_ns: int
     """Last time of recording before it."""
     by_ns: int

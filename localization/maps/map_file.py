@@ -68,7 +68,7 @@ _SPACE_SHAPES: Mapping[str, tuple[str, tuple[str | int, ...]]] = {
     "edge_deltas": ("<f8", ("E", 4, 4)),
     "edge_information": ("<f8", ("E", 6, 6)),
 }
-"""As `_SHAPES`, of a `SpaceMap`."""
+"""Types and shapes of the arrays of a `SpaceMap`."""
 _SHAPES_OF = {PLANAR: _SHAPES, SPACE: _SPACE_SHAPES}
 _ORTHONORMAL = 1e-6
 """Largest entry of R^T R - I of a rotation."""

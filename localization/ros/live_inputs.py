@@ -97,7 +97,7 @@ class LiveInputs:
         self.payloads.loads, self.payloads.mounts = loads, mounts
 
     def wiring_check(self, mounts: Mapping[str, Mount], *, is_clock_known: bool) -> LiveWiring | None:
-        """Of wheels against gyro and LiDAR; None where nothing can contradict the wheels: neither each other, nor a gyro their driver's
+        """Check of the wheels against gyro and LiDAR; None where nothing can contradict them: neither each other, nor a gyro their driver's
         odometry."""
         wheels = self.sources.wheels
         if wheels is None or (wheels.kind != "joint_states" and self.sources.imu is None):
@@ -105,7 +105,7 @@ class LiveInputs:
         return LiveWiring(LiveSensors(self.robot, self.sources, mounts), self.discovered.parts.joints, is_clock_known)
 
     def lidar_check(self, mounts: Mapping[str, Mount], *, is_clock_known: bool) -> LidarCheck | None:
-        """Of the LiDAR's mount and clock against wheels and gyro on the first metres; None without wheels or LiDAR."""
+        """Check of the LiDAR's mount and clock against wheels and gyro on the first metres; None without wheels or LiDAR."""
         lidar, has_gyro = self.sources.lidar, self.sources.imu is not None
         if lidar is None or self.sources.wheels is None:
             return None

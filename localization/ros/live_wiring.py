@@ -20,7 +20,7 @@ _AGREE = 0.95
 """Correlation of a turn from where on wheels are as the robot file has them, and no more is read: healthy drives have more."""
 _LIDAR_S = 60.0
 _MAX_POINTS = 2_000_000
-"""Of the scans that are kept; bounds the memory to 100 MB."""
+"""Points of the scans that are kept, at most: they bound the memory to 100 MB."""
 
 
 class LiveWiring:

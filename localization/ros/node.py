@@ -57,7 +57,7 @@ class DriveTimes:
     """Stamps of a node's events [ns]."""
 
     begin_ns: int | None = None
-    """Of the first one."""
+    """Stamp of the first event."""
     newest_ns: int = 0
     caught_up_ns: int | None = None
     """When the messages of the start were processed: the latency of scans counts from there on."""

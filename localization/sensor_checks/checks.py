@@ -1,51 +1,29 @@
-"""The checks, in the order in which they are applied."""
+"""The checks of sensors: of each step before or after the estimator has it (`step_checks`), and of its estimate."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
-import numpy as np
-
-from localization.estimators import Estimate, Estimator, Residuals
+from localization.estimators import Estimate, Estimator
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
 from localization.sensor_checks.clocks import ClockCheck
-from localization.sensor_checks.contradictions import Contradictions
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.gyro_rate import GyroRate, rate_off
+from localization.sensor_checks.gyro_rate import rate_off
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
-from localization.sensor_checks.lidar_tilt import LidarTilt
-from localization.sensor_checks.moving_objects import MAX_NIS, MIN_OFF_M, MovingObjects
-from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.path_uncertainty import PathUncertainty, lever_of_unknown_front
+from localization.sensor_checks.records import Record, Records
 from localization.sensor_checks.sensor_consistency import SensorConsistency
-from localization.sensor_checks.standstill import Standstill
-from localization.sensor_checks.sweep_times import SweepTimes
-from localization.sensor_checks.window import Window
+from localization.sensor_checks.step_checks import StepChecks
 from localization.synchronizer import StepConfig
 from localization.trajectory import Trajectory
-from motion_models import se2
 from motion_models.robot import Mount, Robot
-from motion_models.se2 import Pose2
 
 _TOGETHER_S = 0.5
 """Steps of this time are examined together while no check acts [s]. Faults are found by windows of 2.5 s and more."""
-
-
-class _Record(NamedTuple):
-    """A step, and what the estimator has made of it."""
-
-    step: Step
-    estimate: Estimate
-    pose: Pose2
-    """(3,) of the estimate, by sensors alone: without what loops have moved it by."""
-    residuals: Residuals | None
-    is_compared: bool
-    """Its sensors were compared before the estimator had it."""
 
 
 class SensorChecks:
@@ -60,40 +38,36 @@ class SensorChecks:
         """``robot``: whose clocks and front may not be known for sure; None where they are."""
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation, PathUncertainty(lever_of_unknown_front(robot, mounts)))
-        self._window = window = Window(mounts, config)
-        self._moving, self._sweep_times = MovingObjects(faults, window), SweepTimes(faults)
-        self._own_body, self._contradictions, self._gyro_rate = OwnBody(faults), Contradictions(faults), GyroRate(faults)
-        self._standstill = Standstill(faults, window, step_config)
-        self._consistency, self._places, self._tilt = SensorConsistency(faults), KnownPlaces(faults), LidarTilt(mounts)
+        self._steps = StepChecks(faults, mounts, config, step_config)
+        self._consistency, self._places = SensorConsistency(faults), KnownPlaces(faults)
         self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
         self._mounts, self._is_lidar_placed = mounts, True
-        self._records: list[_Record] = []
-        self._by_wheels = np.zeros(3)
-        self._examined = np.zeros((2, 3)), np.zeros((2, 3))  # poses by wheels and estimate at the last examination but one, and at the last
+        self._records = Records()
         self._is_acting = True
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
-        self._standstill.insert_imu(sample)
+        self._steps.standstill.insert_imu(sample)
 
     def correct(self, scan: Scan) -> Scan:
         """``scan`` with the times of its points as they were found to be."""
-        return self._sweep_times.correct(scan) if self._sweep_times.is_wrong else scan
+        times = self._steps.sweep_times
+        return times.correct(scan) if times.is_wrong else scan
 
     def apply(self, step: Step, estimator: Estimator) -> Step:
         """``step`` without the sensors that are faulty, and with a wide covariance where the wheels are uncertain; ``estimator`` has made
         the estimates so far."""
         if not math.isfinite(step.predicted.delta.sum()):
             return step  # the estimator refuses it
-        if self._own_body.is_found:
-            step = self._own_body.remove(step)
+        if self._steps.own_body.is_found:
+            step = self._steps.own_body.remove(step)
         if not (self._is_acting or step.is_standing or (step.turn is not None and rate_off(step))):
             return step
         self._examine_records(estimator)
         self._is_acting = True
-        step = self._compare(step, is_to_come=True)
-        if self._moving.is_led_away:
-            step = self._moving.lead_back(step)
+        step = self._steps.compare(step, is_to_come=True)
+        if self._steps.moving.is_led_away:
+            step = self._steps.moving.lead_back(step)
         if self._faults.is_map_wrong:
             self._faults.is_map_wrong = False
             step = replace(step, restarts_map=True)  # without the scans that had the fault
@@ -106,10 +80,7 @@ class SensorChecks:
         """``estimate`` of ``estimator`` after ``step`` with the covariance of what faulty sensors have done to it; unchanged without one
         (LiDAR alone)."""
         pose = estimate.pose if estimate.odometry is None or estimate.map_T_odom is None else estimate.odometry[0]
-        self._records.append(_Record(step, estimate, pose, estimator.residuals, self._is_acting))
-        by_wheels = self._by_wheels = se2.compose(self._by_wheels, step.predicted.delta)
-        x, y, _ = np.subtract(*se2.between(self._examined[0], (by_wheels, pose)))
-        contradicts = math.hypot(x, y) > MIN_OFF_M or not (estimate.nis is None or estimate.nis < MAX_NIS)
+        contradicts = self._records.add(Record(step, estimate, pose, estimator.residuals, self._is_acting))
         if self._is_acting or contradicts:
             estimate = self._examine_records(estimator) or estimate
         path = self._faults.path
@@ -117,72 +88,51 @@ class SensorChecks:
 
     def examine(self, estimator: Estimator, *, is_last: bool = False) -> None:
         """Examine the steps that ``estimator`` has published, once there are enough, or none ``is_last``."""
-        records = self._records
+        records = self._records.waiting
         if records and (is_last or (records[-1].step.end_ns - records[0].step.start_ns) * 1e-9 >= _TOGETHER_S):
             self._examine_records(estimator)
 
     def _examine_records(self, estimator: Estimator) -> Estimate | None:
         """Examine the records, and decide whether a check has to act from here on; the last estimate with its covariance."""
-        if not self._records:
+        if not self._records.waiting:
             return None
-        records, self._records = self._records, []
-        self._examined = self._examined[1], np.array([self._by_wheels, records[-1].pose])
+        records = self._records.take()
         for record in records:
             if not record.is_compared:
-                self._compare(record.step, is_to_come=False)
+                self._steps.compare(record.step, is_to_come=False)
             self._compare_estimate(record, estimator)
-        self._own_body.report()  # of steps up to here, whose sensors are compared
+        self._steps.own_body.report()  # of steps up to here, whose sensors are compared
         inflated = self._inflate(records[-1], estimator)
         is_led_away = self._faults.is_map_wrong or self._faults.have_scans_led_away
-        is_step_changed = self._gyro_rate.is_acting or self._contradictions.is_acting or self._moving.is_acting
-        self._is_acting = is_led_away or is_step_changed or self._inflation.is_acting
+        self._is_acting = is_led_away or self._steps.is_acting or self._inflation.is_acting
         return inflated
 
-    def _compare(self, step: Step, *, is_to_come: bool) -> Step:
-        """``step`` without what contradicts the other sensors, for the estimator, for which it ``is_to_come``, or was."""
-        self._faults.start_step(step)
-        if not self._own_body.is_found:
-            step = self._own_body.remove(step)
-        if step.scan is not None and not step.scan.is_planar:
-            self._tilt.add(step.scan)
-        if self._window.add(step, self._faults.now_s):
-            self._sweep_times.compare(self._window)
-            if self._contradictions.compare(self._window) and self._sweep_times.are_likely_right:
-                self._inflation.restart()
-        excluded = self._contradictions.excluded if self._faults.declared and is_to_come else ()
-        step = self._gyro_rate.apply(step)
-        step = replace(step, turn=None) if "gyro" in excluded else step
-        step = step.without_scan() if "LiDAR" in excluded else step
-        step = self._standstill.apply(step, is_contradicted="wheels" in excluded)
-        self._inflation.reckoning.predict(step)
-        return self._moving.apply(step)
-
-    def _compare_estimate(self, record: _Record, estimator: Estimator) -> None:
+    def _compare_estimate(self, record: Record, estimator: Estimator) -> None:
         """Compare innovations and learned parameters with their covariances.
 
         Parameters that are learned from a LiDAR without a mount, as the centre of rotation, are not those of the robot file.
         """
         step, estimate, pose, residuals, _ = record
         self._inflation.reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
-        self._moving.keep_view()
+        self._steps.moving.keep_view()
         if estimate.nis is not None:
-            self._standstill.restart()
+            self._steps.standstill.restart()
         if residuals is not None:
             if step.scan is not None:
                 self._is_lidar_placed = step.scan.frame_id in self._mounts
             self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)
         if estimate.covariance is not None:
-            self._moving.compare_estimate(estimate.nis)
+            self._steps.moving.compare_estimate(estimate.nis)
             self._consistency.compare_estimate(estimate.nis)
 
-    def _inflate(self, record: _Record, estimator: Estimator) -> Estimate:
+    def _inflate(self, record: Record, estimator: Estimator) -> Estimate:
         """The estimate with the covariance of the distances from dead reckonings, and of clocks that are apart."""
         scan, estimate = record.step.scan, record.estimate
         if estimate.covariance is None:
             return estimate
         self._clocks.add(estimator)
         inflated = self._inflation.inflate(estimate)
-        if scan is not None and self._places.update(lambda: self._window.profile(scan), record.pose):
+        if scan is not None and self._places.update(lambda: self._steps.window.profile(scan), record.pose):
             self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on
         return inflated
 
@@ -192,12 +142,12 @@ class SensorChecks:
 
     def counts(self) -> Mapping[str, int]:
         """Number of scans in which objects moved, if there were any."""
-        scans = self._moving.report.scans
+        scans = self._steps.moving.report.scans
         return {"scans_with_moving_objects": scans} if scans else {}
 
     def warnings(self) -> list[str]:
         """Problems so far."""
-        return [*self._tilt.warnings(), *self._faults.warnings()]
+        return [*self._steps.tilt.warnings(), *self._faults.warnings()]
 
     @property
     def found(self) -> Mapping[SensorFault, DetectedFault]:

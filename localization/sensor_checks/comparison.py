@@ -35,7 +35,7 @@ SLIDE_RAD = math.radians(12.0)
 _CONFIDENCE = 0.999
 """Confidence of a direction's one-sided bound: windows overlap, so that one of a thousand is one of some minutes."""
 _QUANTILES = [math.inf, *stdtrit(np.arange(1, WINDOW_BINS - 1), _CONFIDENCE).tolist()]
-"""Of Student's distribution at `_CONFIDENCE`, by its degrees of freedom."""
+"""Quantiles of Student's distribution at `_CONFIDENCE`, by its degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,9 @@ class Quantity:
     """What several sensors measure in each bin, and by what they differ without a fault."""
 
     columns: Mapping[Sensor, slice]
-    """Of `Bins.rows`: one of a turn, two of a way."""
+    """Columns of `Bins.rows` by sensor: one of a turn, two of a way."""
     offset_column: int
-    """Of `Bins.rows`: what the offset is proportional to."""
+    """Column of `Bins.rows` that the offset is proportional to."""
     offset_sigma: float
     """Standard deviation of the offset: of a bias [rad/s], of a slide [m/rad]."""
     noise: float
@@ -83,7 +83,7 @@ class Gain(NamedTuple):
 
 
 UNKNOWN = Gain(0.0, 0.0, math.inf, is_equal=False)
-"""Of a sensor that has measured nothing."""
+"""Gain of a sensor that has measured nothing."""
 
 
 class Comparison(NamedTuple):

@@ -43,7 +43,8 @@ _MAX_SLIP_M, _MAX_TURN_SLIP_RAD = 0.15, 0.2
 """Distance of the estimate from the motion by the wheels since that view, up to which the wheels slip as they do without moving objects
 [m, rad]: a way of .6 m, along which fr079's robot slides by up to 14 deg."""
 _STILL_M, _SLIP_SHARE, _SLIP_M_PER_RAD = 0.03, 0.25, 0.1
-"""The same for shorter ways: noise of two scans, share of the way, and of turns, in which the centre of rotation is elsewhere by 10 cm."""
+"""Distance from the motion by the wheels up to which they slip as usual on short ways: noise of two scans [m], share of the way, and of
+turns, in which the centre of rotation is elsewhere by 10 cm [m/rad]."""
 MAX_NIS = 16.3
 """NIS of a matched scan that contradicts the wheels: one of 1,000 by chance (chi^2 of 3 degrees of freedom)."""
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2

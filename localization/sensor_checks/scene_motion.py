@@ -74,7 +74,7 @@ class SceneComparison:
     """A scan, and one from before under the motion by the wheels."""
 
     reference: Profile
-    """Of the one before."""
+    """Profile of the scan before."""
     profile: Profile
     points: Points2
     scene: SceneMotion

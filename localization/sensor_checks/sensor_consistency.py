@@ -62,7 +62,7 @@ class _Episode(NamedTuple):
     poses: FloatArray
     """(5, 3) at its begin, as `Reckoning` has them."""
     row: int
-    """Of these, that of the dead reckoning that the estimate is compared with."""
+    """Row of the dead reckoning that the estimate is compared with."""
     is_by_lidar: bool = False
     """The LiDAR's stamps explain the difference: matched scans do not decide."""
 

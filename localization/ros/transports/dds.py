@@ -231,7 +231,7 @@ class _Reader(NamedTuple):
     is_new: dds.ReadCondition
     """Triggered while there are messages that were not taken."""
     is_rare: bool
-    """Of a topic with few messages: it is only asked when one of these has some."""
+    """The topic has few messages: it is only asked when one of these has some."""
 
 
 def _write(writer: _Writer, data: bytes) -> None:
