@@ -26,7 +26,8 @@ from localization.maps.localizer import LIKELY, Localizer
 from localization.maps.place_search import CELL_M, PlaceMap
 from motion_models import se2
 from tests.studies.buildings import BUILDINGS
-from tests.studies.localization import COV, MAP_STRIDE, MAPPED_SCORE, STEP_M, STEP_RAD, dense_map, halves, off
+from tests.studies.localization import COV, STEP_M, STEP_RAD
+from tests.studies.localization_halves import MAP_STRIDE, MAPPED_SCORE, dense_map, halves, off
 
 _PIECE_CELLS = 10
 """Walls are changed by pieces of 1 m."""

@@ -34,7 +34,8 @@ from localization.maps.grid import Grid
 from localization.maps.localizer import LIKELY
 from motion_models import se2
 from tests.studies.buildings import BUILDINGS
-from tests.studies.localization import COV, MAP_STRIDE, MAPPED_SCORE, dense_map, halves, off, run_start, ways
+from tests.studies.localization import COV, run_start, ways
+from tests.studies.localization_halves import MAP_STRIDE, MAPPED_SCORE, dense_map, halves, off
 from tests.studies.localization_reliability import RecordedSearches
 from tests.studies.localization_simulated import Guess, ParticleFilter, heaviest_place
 
