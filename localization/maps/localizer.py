@@ -72,6 +72,9 @@ _TRACKED_SCANS = 4
 """Scans that are searched near a tracked pose: 2 m of way, so that those of space that is not mapped are soon behind."""
 _JOINED_M = 0.8 * CELL_M
 """Voxel of joined scans [m]."""
+_BEAMS = 600
+"""Beams of the joined scans that places are compared with, at most."""
+_IN_THE_MIDDLE = np.zeros(2)
 _STAYED_M, _STAYED_RAD = 1.0, 0.8
 """A place this near to where the odometry leads confirms it, however wide that is: in a building of 20 m it is there by chance once in
 a thousand times."""
@@ -157,9 +160,9 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
             return np.asarray(self._cov + self.places.map_cov(self.pose))
         return self._cov if self._initial_left else np.asarray(self._cov + self.places.extent_cov)
 
-    def add(self, points: Points2, delta: Pose2, cov: Cov3) -> None:
-        """A keyframe with the scan ``points`` (N, 2) of the body frame [m]: moved by ``delta`` (3,) with covariance ``cov`` (3, 3) since
-        the one before."""
+    def add(self, points: Points2, delta: Pose2, cov: Cov3, sensor: FloatArray = _IN_THE_MIDDLE) -> None:
+        """A keyframe with the scan ``points`` (N, 2) of the body frame [m], by a LiDAR at ``sensor`` (2,) of it: moved by ``delta`` (3,)
+        with covariance ``cov`` (3, 3) since the one before."""
         delta, cov = self._recent.move(RecentMotion(delta, cov), points)
         if not is_narrow(cov):  # carried, or driven blind: scans before and after do not belong together
             self._running, self.hypotheses = None, ()
@@ -175,7 +178,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
             if self._is_tracking and not _is_trackable(self._cov):
                 self._reckon()
             return
-        self._recent.add(points)
+        self._recent.add(points, sensor)
         if self._is_tracking and _is_trackable(self._cov):
             self._track(points)
         elif self._is_tracking or self._is_reckoned:
@@ -186,7 +189,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
             self._start_search()
 
     def _take(self, search: PlanarSearch) -> None:
-        self._conclude(search.result(), search.n_points, search.is_by_fix, search.moved, search.cov)
+        self._conclude(search.result(), search.n_points, search.moved, search.cov)
 
     @property
     def grid(self) -> Grid:
@@ -219,7 +222,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         self._track_odds = min(self._track_odds + evidence, log_odds(LIKELY) if self._is_one_view else _MAX_LOG_ODDS)
         self._is_tracking = self._track_odds > -_MAX_LOG_ODDS
         if self.state == "localized" and sigmoid(self._track_odds) < _LOST:
-            self._lose(points)
+            self._lose()
         elif self.state == "lost" and sigmoid(self._track_odds) >= LIKELY:
             self.state = "localized"
         measured, R = _measurement(place)
@@ -249,7 +252,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
             return self.places.align(points, self.pose, self._cov)
         joined = self._recent.joined(_JOINED_M, _TRACKED_SCANS)
         found = self.places.search(joined, self.pose, _three_sigma(self._cov))
-        return found[0] if found and weigh(found, len(joined), NEAR_WEIGHTS, is_narrowed=True)[0].probability >= LIKELY else None
+        return found[0] if found and weigh(found, len(joined), NEAR_WEIGHTS)[0].probability >= LIKELY else None
 
     def _reckon(self) -> None:
         """The pose is too wide to align scans: search about it, or everywhere where it is wider than that."""
@@ -259,12 +262,11 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         is_near = np.trace(self._cov[:2, :2]) < _NEAR_M**2 and self._cov[2, 2] < _NEAR_RAD**2
         self.state = "searching" if is_near else "lost"
 
-    def _lose(self, points: Points2) -> None:
-        """The place was wrong, or the map is: search anywhere, by ``points`` (N, 2) and the scans from now on."""
+    def _lose(self) -> None:
+        """The place was wrong, or the map is: search anywhere, by the last scan and those from now on."""
         self.state, self._is_reckoned, self.hypotheses, self._search_odds = "lost", False, (), -MAX_SEARCH_ODDS
         self._failures = self._wait = 0
-        self._recent.clear()
-        self._recent.add(points)
+        self._recent.keep_last()
 
     def _start_search(self) -> None:
         """Search the merged scans of the last keyframes."""
@@ -275,15 +277,17 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
         is_near = self._initial_left > 0 or (self._is_reckoned and self.state == "searching")
         near = (self.pose, _three_sigma(self._cov)) if is_near else self._near_fix()
-        is_by_fix, self._is_whole_searched = near is not None and not is_near, near is None
+        self._is_whole_searched = near is None
         if self._initial_left:
             self._initial_left -= 1
             self._cov = self._cov if self._initial_left else np.zeros((3, 3))
-        points, self._searched_m = self._recent.joined(_JOINED_M), self._recent.way_m
+        points, beams, self._searched_m = self._recent.joined(_JOINED_M), self._recent.beams(_BEAMS), self._recent.way_m
         if self._is_background:
-            self._running = PlanarSearch(self.places, points, near, is_by_fix)
+            self._running = PlanarSearch(self.places, points, near, beams)
         else:
-            self._conclude(self.places.search(points, *(near or ())), len(points), is_by_fix, np.zeros(3), np.zeros((3, 3)))
+            pose, half = near or (None, None)
+            found = self.places.search(points, pose, half, beams)
+            self._conclude(found, len(points), np.zeros(3), np.zeros((3, 3)))
 
     def _near_fix(self) -> tuple[Pose2, FloatArray] | None:
         """Where a measured position has the robot: pose (3,), and half the window (3,) about it; None where it narrows nothing."""
@@ -292,12 +296,12 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         radius = 3.0 * math.sqrt(float(np.trace(self._fix.cov)))
         return np.array([*self._fix.position, 0.0]), np.array([radius, radius, math.pi])
 
-    def _conclude(self, places: Sequence[Place], n_points: int, is_by_fix: bool, moved: Pose2, moved_cov: Cov3) -> None:
+    def _conclude(self, places: Sequence[Place], n_points: int, moved: Pose2, moved_cov: Cov3) -> None:
         """Take the best of ``places``, which ``n_points`` have found before the robot ``moved`` (3,), if it is probable and the search
         before agrees, or if nothing else in the map is like it: then the probability is at most `LIKELY` until scans from elsewhere fit."""
         before, since_cov = self.hypotheses, self._since_search
         self._since_search = moved_cov
-        found = [replace(place, pose=se2.compose(place.pose, moved)) for place in weigh(places, n_points, self._weights, is_by_fix)]
+        found = [replace(place, pose=se2.compose(place.pose, moved)) for place in weigh(places, n_points, self._weights)]
         self.hypotheses = found if self._fix is None else with_fix(found, self._fix)
         self._search_odds = -MAX_SEARCH_ODDS
         if not found:

@@ -73,7 +73,7 @@ def run_start(
         if last is not None and math.hypot(delta[0], delta[1]) < STEP_M and abs(delta[2]) < STEP_RAD:
             continue
         begin, n_before = time.process_time(), len(places.found)
-        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else COV)
+        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else COV, keyframes.sensors[k])
         spent += time.process_time() - begin if math.isnan(after) else 0.0
         last = truth = pose
         measured.append(k)

@@ -33,8 +33,10 @@ class RecordedSearches(PlaceMap):
         super().__init__(keyframes, range_noise_m)
         self.found: list[tuple[Sequence[Place], int]] = []
 
-    def search(self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None) -> list[Place]:
-        places = super().search(points, near, half)
+    def search(
+        self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None, beams: FloatArray | None = None
+    ) -> list[Place]:
+        places = super().search(points, near, half, beams)
         if near is None and places:
             self.found.append((places, len(points)))
         return places
