@@ -105,11 +105,6 @@ class Synchronizer:
         """By the gyro's samples so far, as `GyroBuffer.turn`; changes nothing."""
         return self.inertial.gyro.turn(start_ns, end_ns, by_wheels=0.0) if end_ns > start_ns else None
 
-    @property
-    def stored_samples(self) -> int:
-        """Samples of wheels and gyro, and scans, that are stored; bounded."""
-        return len(self.wheels.buffer) + len(self.inertial.gyro) + len(self.scans.waiting)
-
     def warnings(self) -> list[str]:
         """Problems of the sensors so far."""
         scans = self.scans

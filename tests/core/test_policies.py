@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.core.filter import inflate
+from localization.core.filter import inflate, set_marginal
 from localization.core.motion import FilterConfig, NoiseModel, initial_state
+from localization.core.policies.clock_offset import clock_warnings, find_clocks_apart
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import PriorOutlier
@@ -100,3 +101,23 @@ def test_open_way_of_a_robot_at_rest_or_of_short_stretches_adds_nothing():
     assert not policy.cov(resting).any()
     policy.cov(step_of([0.1, 0.0, 0.0]))
     assert policy.warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "sigma_s", "has_gyro", "has_lidar", "apart"),
+    [
+        (0.04, 1e-3, True, True, None),  # small
+        (0.10, 3e-2, True, True, None),  # uncertain
+        (-0.30, 1e-3, True, True, ("LiDAR", True)),  # of three sensors nothing shows whose clock it is
+        (0.10, 1e-3, False, True, ("LiDAR", True)),  # a driver's latency
+        (0.30, 1e-3, False, True, ("LiDAR", False)),
+        (0.30, 1e-3, True, False, ("gyro", False)),
+    ],
+)
+def test_clocks_apart_are_large_and_certain_and_latency_warns(offset_s, sigma_s, has_gyro, has_lidar, apart):
+    state = set_marginal(STATE, "clock", np.array([offset_s]), np.array([[sigma_s**2]]))
+    found = find_clocks_apart(state, has_gyro, has_lidar)
+    assert (None if found is None else found[1:]) == apart
+    warned = clock_warnings(found, has_gyro, has_lidar)
+    assert len(warned) == (apart is not None and apart[1])
+    assert all(f"{abs(offset_s):.2f} s {'later' if offset_s > 0.0 else 'earlier'}" in warning for warning in warned)
