@@ -20,6 +20,8 @@ from motion_models.se2 import FloatArray
 _MIN_OFF_S, _MAX_LATENCY_S = 0.15, 0.1
 """Least time of recording less stamp, of either sign, of a clock that may be off, and largest of one that is not: the latency of drivers,
 as of the LiDAR's check."""
+_OF_THREE_S = 1.4
+"""Largest offset of one of three sensors, whose clocks the LiDAR's check compares to hundredths of a second."""
 _MIN_CORRELATION, _CLEARER = 0.9, 2.0
 """Correlation of turns with the corrected clock, at least, and how many times nearer to 1 than without."""
 
@@ -49,8 +51,11 @@ class _Suspect:
 def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSignals], FloatArray]) -> RecordedClock | None:
     """The first clock of ``log`` that is off by the times of recording, where turns of another sensor agree better with it corrected.
 
+    Where turns agree with neither, an offset is named, and in the covariance.
+
     ``signals``: of ``log``; ``turn``: (n,) by the wheels, up to a scale.
     """
+    undecided = None
     for suspect in _suspects(log):
         clock = replace(log.robot.clock, **{suspect.key: suspect.value})
         corrected = open_log(log.path, replace(log.robot, clock=clock), log.overrides)
@@ -58,6 +63,8 @@ def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSi
         if after_signals is None:
             continue
         before, after = _agreement(log, signals, suspect, turn), _agreement(corrected, after_signals, suspect, turn)
+        if before is not None and after is not None and max(before, after) < _MIN_CORRELATION and undecided is None:
+            undecided = suspect
         if before is None or after is None or after < _MIN_CORRELATION or 1.0 - before < _CLEARER * (1.0 - after):
             continue
         value = f"{suspect.value:.4g}"
@@ -68,7 +75,15 @@ def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSi
             " synchronize the clocks."
         )
         return RecordedClock(corrected.robot, text, {f"clock.{suspect.key}": value})
-    return None
+    if undecided is None or not undecided.key.endswith("_time_offset_s"):
+        return None
+    text = (
+        f"{undecided.topic}: {undecided.why}: its clock is off, or it waits in a queue with stamps that are right, which the turns of this"
+        f" drive do not show. The covariance has the way in that time. Synchronize the clocks, or write clock.{undecided.key} ="
+        f" {undecided.value:g}, if it is the clock."
+    )
+    late_s = abs(undecided.value - getattr(log.robot.clock, undecided.key))
+    return RecordedClock(replace(log.robot, clock=replace(log.robot.clock, sigma_s=late_s)), text, {})
 
 
 def _suspects(log: Log) -> Iterator[_Suspect]:
@@ -81,10 +96,11 @@ def _suspects(log: Log) -> Iterator[_Suspect]:
         value = round(getattr(clock, key) + rate, 5)
         way = "faster" if rate > 0.0 else "slower"
         yield _Suspect(sensors[topic], topic, key, value, f"its stamps run {abs(rate):.2%} {way} than the times of recording")
+    least = _OF_THREE_S if len({*sensors.values()}) > 2 else _MIN_OFF_S
     behind = {topic: late for topic, late in log.behind_s.items() if topic in sensors}
     for topic, late in behind.items():
         others = [abs(other) for name, other in behind.items() if sensors[name] != sensors[topic]]
-        if abs(late) < _MIN_OFF_S or not others or max(others) > _MAX_LATENCY_S:
+        if abs(late) < least or not others or max(others) > _MAX_LATENCY_S:
             continue
         key = f"{sensors[topic]}_time_offset_s"
         value = round(getattr(clock, key) - late, 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from localization.calibration.wheel_wiring import WiringReport, check_wiring
@@ -65,3 +66,20 @@ def test_recorded_clock_of_another_rate_is_corrected(tmp_path: Path, topic: str,
 def test_recorded_clock_of_stamps_that_are_right_is_left(tmp_path: Path, late_s: Callable[[float], float]) -> None:
     """A queue delivers late what was stamped as it was measured."""
     assert report_of(tmp_path, GYRO, queued("/imu/data", late_s)).keys == {}
+
+
+def test_recorded_clock_that_turns_do_not_show_is_named(tmp_path: Path) -> None:
+    """Of wheels that slip so much that they agree with the gyro at no offset."""
+    rng = np.random.default_rng(7)
+    late = restamped("/imu/data", lambda t: -0.4)
+
+    def edit(record: Record) -> Record:
+        topic, message, log = late(record)
+        if topic == "/imu/data":
+            message.angular_velocity.z += 0.8 * rng.normal() + 0.8 * np.sin(0.9 * (log - START) / S)
+        return topic, message, log
+
+    report = report_of(tmp_path, GYRO, edit)
+    assert report.keys == {}
+    assert "waits in a queue" in report.findings[0]
+    assert report.robot.clock.sigma_s == pytest.approx(0.41, abs=0.03)

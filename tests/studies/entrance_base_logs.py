@@ -314,3 +314,40 @@ def referred(
         return judge_scores(code, text, folder / "m.json", words, wanted, noise_m)
 
     return Case("references", name, judge)
+
+
+def recommended(name: str, base: BaseLog, cut: tuple[float, float], has_reference: bool) -> Case:
+    """Scans are missing for a while.
+
+    Right where, by a reference, the run of the smallest error is called best; without one, no run that lost its LiDAR.
+    """
+
+    def drop(records: list[Record]) -> list[Record]:
+        return [r for r in records if r[0] != "/scan" or not START + cut[0] * S < r[2] < START + cut[1] * S]
+
+    def judge(folder: Path) -> Found:
+        log, robot, _ = written(folder, base, drop)
+        known = healthy(base).reference
+        rows = np.column_stack(
+            [known.poses[:, :2], np.zeros((len(known.poses), 3)), np.sin(known.poses[:, 2] / 2), np.cos(known.poses[:, 2] / 2)]
+        )
+        lines = (f"{stamp / S:.7f} " + " ".join(f"{v:.7f}" for v in row) for stamp, row in zip(known.stamps_ns.tolist(), rows, strict=True))
+        (folder / "reference.tum").write_text("\n".join(lines) + "\n")
+        model = "diff_drive" if 'drive = "diff_drive"' in base.robot else "skid_steer"
+        options = ["--reference", str(folder / "reference.tum")] if has_reference else []
+        given = ["--model", model, "--estimator", "odometry,lidar,ekf,graph", "--json", str(folder / "m.json")]
+        code, text = run_command("replay", str(log), "--robot", str(robot), "--out", str(folder / "out"), *given, *options)
+        flat = " ".join(text.split())
+        if code:
+            return Found("misnamed", f"[exit {code}] {text}")
+        if not has_reference:
+            is_right = "is best" not in flat and "Not recommended" in flat and "ekf" in flat.split("Not recommended")[1].lower()
+            return Found("right" if is_right else "misnamed", text)
+        found = {r["estimator"]: r["ate_rmse_m"] for r in json.loads((folder / "m.json").read_text())["results"]}
+        sentence = next((s for s in flat.split(". ") if "is best" in s or "has the smallest error" in s), "")
+        best = min(found, key=lambda k: found[k])
+        words = {"ekf": "EKF", "graph": "graph", "lidar": "LiDAR", "odometry": "dead reckoning"}
+        is_right = words[best].lower() in sentence.split(" is best")[0].split(" has the")[0].lower() and "Not recommended" not in flat
+        return Found("right" if is_right else "misnamed", f"[{found}] {text}")
+
+    return Case("recommendation", name, judge)

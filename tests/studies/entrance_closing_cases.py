@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
-
-import numpy as np
 
 from localization.trajectory import Trajectory
-from tests.helpers import bags
-from tests.helpers.bags import Record, S
 from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.studies.entrance_base_logs import (
     A300_ARCS,
@@ -21,64 +16,32 @@ from tests.studies.entrance_base_logs import (
     PIONEER_2,
     ROSBOT_2,
     SNOW,
-    BaseLog,
     based,
-    healthy,
     referred,
 )
-from tests.studies.entrance_command_cases import both, changed, q, shifted, stamp_of, topic_per_wheel, without
-from tests.studies.entrance_commands import Case, Edit, clouded, initialized
+from tests.studies.entrance_command_cases import both, changed, q, shifted, topic_per_wheel, without
+from tests.studies.entrance_commands import Case, clouded, initialized
+from tests.studies.entrance_edits import (
+    RPM,
+    filter_alone,
+    in_namespace,
+    in_sqlite,
+    inverted_imu,
+    joints,
+    laser_edge,
+    mocap_in,
+    queued,
+    restarting,
+    rotated,
+    set_back,
+    table,
+    to_twist,
+    with_losses,
+)
 from tests.studies.entrance_hostile_cases import each
-from tests.studies.entrance_last_cases import in_namespace, inverted_imu
-from tests.studies.entrance_other_cases import joints, laser_edge, rotated, set_back, table, to_twist
 from tests.studies.entrances import cylinder, urdf_of
 
 ROSBOT_IMU, CLEARPATH_JOINTS, CLEARPATH_IMU = "/imu_broadcaster/imu", "/platform/joint_states", "/sensors/imu_0/data"
-RPM = 60.0 / math.tau
-
-
-def in_sqlite(edit: Edit) -> Edit:
-    """Recorded to a .db3 file, in the order of ``edit``."""
-
-    def stored(records: list[Record]) -> list[Record]:
-        return edit(records)
-
-    stored.keeps_order = stored.is_sqlite = True  # type: ignore[attr-defined]
-    return stored
-
-
-def with_losses(topic: str, share: float) -> Edit:
-    """A part of the messages never arrives."""
-    rng = np.random.default_rng(77)
-    return changed(topic, lambda m: None if rng.random() < share else m)
-
-
-def restarting(at_s: float) -> Edit:
-    """The driver is started anew on the way: angles begin at zero again."""
-    origin: list[np.ndarray] = []
-
-    def change(m: Any, t: float) -> Any:
-        if t < at_s:
-            return m
-        if not origin:
-            origin.append(np.array(m.position))
-        return bags.joint_state(stamp_of(m), m.name, np.array(m.position) - origin[0], m.velocity)
-
-    return each("/joint_states", change)
-
-
-def mocap_in(unit: float, base: BaseLog) -> Edit:
-    """A PoseStamped of the truth, 5 Hz."""
-
-    def edit(records: list[Record]) -> list[Record]:
-        track = healthy(base).reference
-        more = [
-            ("/vrpn_client_node/base/pose", bags.pose_stamped(int(t), unit * x, unit * y, a), int(t) + S // 100)
-            for t, (x, y, a) in zip(track.stamps_ns[::4], track.poses[::4].tolist(), strict=True)
-        ]
-        return [*records, *more]
-
-    return edit
 
 
 CLOCKS = (
@@ -98,7 +61,12 @@ CLOCKS = (
         ["/joint_states"],
     ),
     based("clocks", "IMU .5 s behind on snow", SNOW, shifted(("/imu/data",), lambda t: -0.5), ["/imu/data"]),
-    based("clocks", "robot's clock 5 s ahead of the recorder's", A300_ARCS, shifted((), lambda t: 5.0)),
+    based(
+        "clocks",
+        "robot's clock 5 s ahead of the recorder's",
+        A300_ARCS,
+        queued((CLEARPATH_JOINTS, CLEARPATH_IMU, "/scan"), lambda t: -5.0),
+    ),
     based("clocks", "scans stamped .25 s late", LEO_ARCS, shifted(("/scan",), lambda t: 0.25), ["/scan"]),
 )
 
@@ -141,20 +109,6 @@ MOUNTS = (
         ["joints.reversed"],
     ),
 )
-
-
-def filter_alone(base: BaseLog) -> Edit:
-    """The filter's odometry and the IMU."""
-
-    def edit(records: list[Record]) -> list[Record]:
-        track = healthy(base).reference
-        more = [
-            ("/odometry/filtered", bags.odometry(int(t), *p.tolist(), 0.3, 0.0), int(t) + S // 50)
-            for t, p in zip(track.stamps_ns[::2], track.poses[::2], strict=True)
-        ]
-        return [*without("/joint_states")(records), *more]
-
-    return edit
 
 
 TOPICS = (

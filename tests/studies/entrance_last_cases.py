@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from tests.helpers import bags
-from tests.helpers.bags import Record, S
-from tests.helpers.entrance_drives import Vehicle, with_times
+from tests.helpers.bags import S
+from tests.helpers.entrance_drives import Vehicle
 from tests.studies.entrance_base_logs import (
     FLOORING,
     JACKAL,
@@ -21,78 +19,37 @@ from tests.studies.entrance_base_logs import (
     ROVER,
     STAIRS,
     WARTHOG,
-    BaseLog,
     based,
-    healthy,
+    recommended,
     referred,
 )
-from tests.studies.entrance_command_cases import both, changed, q, shifted, stamp_of
-from tests.studies.entrance_commands import Edit, clouded, initialized
-from tests.studies.entrance_hostile_cases import each
-from tests.studies.entrance_other_cases import (
+from tests.studies.entrance_command_cases import both, changed, q, shifted
+from tests.studies.entrance_commands import clouded, initialized
+from tests.studies.entrance_edits import (
     NAMES,
     arm_beside,
     by_axes,
+    in_namespace,
+    inverted_imu,
     joints,
     laser_edge,
     moved,
     odometry_in,
-    recommended,
     renamed,
     rotated,
     set_back,
+    split,
     table,
+    then,
+    unstamped,
     upside_down,
 )
+from tests.studies.entrance_hostile_cases import each
 from tests.studies.entrances import link, urdf_of
 
 CLEARPATH_JOINTS, CLEARPATH_IMU = "/platform/joint_states", "/sensors/imu_0/data"
 """Topics of the jackal and of the warthog."""
-RPM = 60.0 / math.tau
 TICKS = 1632.0 / math.tau
-
-
-def then(first: Edit, second: Edit) -> Edit:
-    """Both, the second of which leaves the order of the file."""
-
-    def edit(records: list[Record]) -> list[Record]:
-        return second(first(records))
-
-    edit.keeps_order = True  # type: ignore[attr-defined]
-    return edit
-
-
-def unstamped(*topics: str) -> Edit:
-    return both(*(changed(topic, lambda m: with_times(m, lambda ns: 0)) for topic in topics))
-
-
-def split(message: Any) -> list[tuple[str, Any]]:
-    """A topic for each wheel, rates in revolutions per minute."""
-    return [
-        (f"/{name}/feedback", bags.joint_state(stamp_of(message) + i * S // 1000, [name], [], [RPM * float(message.velocity[i])]))
-        for i, name in enumerate(message.name)
-    ]
-
-
-def inverted_imu(message: Any, t: float) -> Any:
-    """The IMU is mounted upside down: y and z point the other way."""
-    w, a = message.angular_velocity, message.linear_acceleration
-    w.y, w.z, a.y, a.z = -w.y, -w.z, -a.y, -a.z
-    return message
-
-
-def in_namespace(base: BaseLog, name: str) -> Edit:
-    """All topics but /tf in a namespace, beside a filter's odometry there."""
-
-    def edit(records: list[Record]) -> list[Record]:
-        track = healthy(base).reference
-        more = [
-            (f"/{name}/odometry/filtered", bags.odometry(int(t), *pose.tolist(), 0.3, 0.0), int(t) + S // 50)
-            for t, pose in zip(track.stamps_ns[::2], track.poses[::2], strict=True)
-        ]
-        return [*((t if t.startswith("/tf") else f"/{name}{t}", m, log) for t, m, log in records), *more]
-
-    return edit
 
 
 LORRY = Vehicle(0.25, 0.8, 0.6, 0.6, 0.5, 0.8, wheels_hz=30.0, imu_hz=0.0, room=(16.0, 12.0), seed=401)

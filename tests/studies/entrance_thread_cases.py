@@ -6,107 +6,39 @@ For `entrance_commands threads`. All answers were written down before the first 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
-
-from localization.trajectory import Trajectory
-from tests.helpers import bags
-from tests.helpers.bags import START, Record, S
-from tests.helpers.entrance_drives import Publishing, Vehicle, with_times
-from tests.studies.entrance_base_logs import A300, BURGER, GALLERY, ICE, LOT, MINI, STUDIOS, VAULT, WING, BaseLog, based, referred
-from tests.studies.entrance_command_cases import both, changed, q, shifted, stamp_of, without
-from tests.studies.entrance_commands import Case, Edit, clouded, initialized
-from tests.studies.entrance_other_cases import beside, joints, latched, rotated, table
+from tests.helpers.bags import S
+from tests.helpers.entrance_drives import Publishing, Vehicle
+from tests.studies.entrance_base_logs import A300, BURGER, GALLERY, ICE, LOT, MINI, STUDIOS, VAULT, WING, based, referred
+from tests.studies.entrance_command_cases import both, changed, q, shifted, without
+from tests.studies.entrance_commands import Case, clouded, initialized
+from tests.studies.entrance_edits import (
+    NAMES,
+    beside,
+    circling,
+    commands_alone,
+    dead_encoder,
+    exchanged,
+    in_pairs,
+    joints,
+    latched,
+    one_axle,
+    plot_of_rostopic,
+    plotjuggler,
+    prefixed,
+    queued,
+    rotated,
+    shuffled,
+    stretched,
+    table,
+    visual_odometry_alone,
+    wrapped_degrees,
+)
 from tests.studies.entrances import urdf_of
 
 CLEARPATH_JOINTS, CLEARPATH_IMU = "/platform/joint_states", "/sensors/imu_0/data"
 """Topics of the husky_a300."""
-
-
-def queued(topics: tuple[str, ...], late_s: Callable[[float], float]) -> Edit:
-    """Delivered and recorded late; stamps are those of the measurement."""
-
-    def edit(records: list[Record]) -> list[Record]:
-        return [(t, m, log + round(late_s((log - START) / S) * S) if t in topics else log) for t, m, log in records]
-
-    return edit
-
-
-def in_pairs(topic: str) -> Edit:
-    """Two messages of a bus transfer have the stamp of the second."""
-    last: list[Any] = []
-
-    def change(message: Any) -> Any:
-        last.append(message)
-        if len(last) % 2:
-            return None
-        first = with_times(last[-2], lambda ns: stamp_of(message) - 1)
-        return [(topic, first), (topic, message)]
-
-    return changed(topic, change)
-
-
-def circling(message: Any) -> Any:
-    """The driver's odometry has the right encoder reversed: ways are turns, and turns ways."""
-    v, w = message.twist.twist.linear.x, message.twist.twist.angular.z
-    half = 0.5 * 0.55 * 1.875
-    return bags.odometry(stamp_of(message), 0.0, 0.0, 0.0, -w * half, -v / half)
-
-
-def stretched(factor: float) -> Callable[[Any], Any]:
-    """The driver's wheel radius is too large: ways and turns."""
-
-    def change(m: Any) -> Any:
-        place, twist = m.pose.pose.position, m.twist.twist
-        place.x, place.y, twist.linear.x = factor * place.x, factor * place.y, factor * twist.linear.x
-        return m
-
-    return change
-
-
-def wrapped_degrees(position: np.ndarray, velocity: np.ndarray) -> tuple[Any, Any]:
-    return np.degrees(position) % 360.0, []
-
-
-def one_axle(message: Any) -> Any:
-    """Encoders on the rear axle alone."""
-    rear = [i for i, name in enumerate(message.name) if "rear" in name]
-    return bags.joint_state(
-        stamp_of(message), [message.name[i] for i in rear], np.array(message.position)[rear], np.array(message.velocity)[rear]
-    )
-
-
-def shuffled(message: Any) -> Any:
-    """Joints in another order in each message."""
-    order = np.roll(np.arange(len(message.name)), stamp_of(message) // 1_000_000 % len(message.name))
-    return bags.joint_state(
-        stamp_of(message), [message.name[i] for i in order], np.array(message.position)[order], np.array(message.velocity)[order]
-    )
-
-
-def prefixed(message: Any) -> Any:
-    return bags.joint_state(stamp_of(message), [f"a300_00000/{name}" for name in message.name], message.position, message.velocity)
-
-
-def commands_alone(message: Any) -> list[tuple[str, Any]]:
-    """The commanded twist in place of any measurement of wheels."""
-    v = 0.16 * float(np.mean(message.velocity))
-    twist = bags.T["geometry_msgs/msg/Twist"](linear=bags.vector(v), angular=bags.vector(z=0.1))
-    return [("/cmd_vel", twist)]
-
-
-def dead_encoder(position: np.ndarray, velocity: np.ndarray) -> tuple[Any, Any]:
-    """Of the rear left wheel."""
-    keep = np.array([1.0, 0.0, 1.0, 1.0])
-    return keep * position, keep * velocity
-
-
-def exchanged(position: np.ndarray, velocity: np.ndarray) -> tuple[Any, Any]:
-    """Rates as positions, and angles as velocities."""
-    return velocity, position
 
 
 CLOCKS = (
@@ -153,38 +85,11 @@ MOUNTS = (
 )
 
 
-def visual_odometry_alone(base: BaseLog, topic: str) -> Edit:
-    return both(without("/joint_states"), beside(base, topic))
-
-
 TOPICS = (
     based("topics", "camera's odometry alone", MINI, visual_odometry_alone(MINI, "/camera/odom/sample"), ["no wheels"], refused=True),
     based("topics", "visual odometry beside wheels", VAULT, beside(VAULT, "/zed2/zed_node/odom", "/rtabmap/odom")),
     based("topics", "fast_lio's odometry beside the driver's, real", WING, beside(WING, "/Odometry")),
 )
-
-
-def plot_of_rostopic(track: Trajectory) -> str:
-    """As `rostopic echo -p` writes a PoseStamped."""
-    head = (
-        "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.pose.position.x,field.pose.position.y,field.pose.position.z"
-    )
-    head += ",field.pose.orientation.x,field.pose.orientation.y,field.pose.orientation.z,field.pose.orientation.w"
-    lines = [head]
-    for i, (stamp, (x, y, a)) in enumerate(zip(track.stamps_ns.tolist(), track.poses.tolist(), strict=True)):
-        values = ",".join(f"{v:.7f}" for v in (x, y, 0.0, *q(a)))
-        lines.append(f"{stamp},{i},{stamp},map,{values}")
-    return "\n".join(lines) + "\n"
-
-
-def plotjuggler(track: Trajectory) -> str:
-    return table(
-        track,
-        lambda t, x, y, a: (t, x, y, a),
-        "__time,/ground_truth/pose/pose/position/x,/ground_truth/pose/pose/position/y,/ground_truth/pose/pose/orientation/yaw",
-        ",",
-        1,
-    )
 
 
 REFERENCES = (
@@ -222,7 +127,6 @@ POINTS = (
 )
 
 TUB = Vehicle(0.1, 0.5, 0.35, 0.55, 0.5, 0.9, wheels_hz=30.0, imu_hz=60.0, room=(12.0, 10.0), seed=602)
-NAMES = (*TUB.left, *TUB.right)
 TUTORIAL = (
     '<gazebo><plugin filename="libgazebo_ros_diff_drive.so" name="d"><left_joint>front_left_wheel</left_joint>'
     "<right_joint>front_right_wheel</right_joint><wheel_separation>0.38</wheel_separation><wheel_diameter>0.2</wheel_diameter></plugin></gazebo>"
