@@ -19,7 +19,7 @@ from tests.core.test_structure import ROOT, usual_files
 
 _NO_TUNING = {"_NS", "GRAVITY", "_SQRT2", "HIDDEN", "STILL", "MOVED"}
 """Names of units, of numbers of physics, and of labels."""
-_SHAPES = {"np.zeros", "np.empty"}
+_SHAPES = {"np.zeros", "np.empty", "np.eye"}
 """Calls whose numbers are shapes."""
 _NUMERIC_CALLS = {"math", "np", "max", "min", "float", "int"}
 
