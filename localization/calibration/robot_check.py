@@ -142,6 +142,7 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
         *_imu_rows(log),
         _reference_row(log, [] if signals is None else [dead_reckon(log, signals)], reference),
     ]
+    rows[:0] = [CheckRow("file", "not whole, or changed", "", "cannot be seen", text) for text in log.damage()]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
     model = make_model(model_of(log.robot), log.robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}

@@ -174,7 +174,7 @@ class Ros1Bag:
                 if file.tell() <= end:
                     whole = file.tell()
         except DamagedError as error:
-            reason = f"{reason}; {error}"
+            reason = reason if str(error) == reason else f"{reason}; {error}"
         count = sum(sum(c.counts.values()) for c in self._chunks)
         lost = end - whole
         self.warnings.append(

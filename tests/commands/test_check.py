@@ -39,6 +39,14 @@ def test_check_of_healthy_robot_has_no_contradiction(tmp_path: Path) -> None:
     assert "vyaw" in (tmp_path / "out" / "robot_localization.yaml").read_text()
 
 
+def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
+    whole = (CASES / "base-log" / "log.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 7 // 10])
+    (row,) = (row for row in check(tmp_path, tmp_path / "cut.mcap")["rows"] if row["quantity"] == "file")
+    assert "cut.mcap" in row["advice"]
+    assert "its end is missing" in row["advice"]
+
+
 def test_check_with_inverted_side_writes_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = check(tmp_path, CASES / "H06-right-side-inverted" / "log.mcap")
     assert quantities(found, "contradiction") == {"wheels and gyro"}
