@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -33,8 +34,8 @@ class PathUncertainty:
 
     def widen(self, estimate: Estimate, pose: Pose2) -> Estimate:
         """``estimate`` with this covariance; ``pose`` (3,) since the start by sensors alone."""
-        estimate, twist = estimate.widened(self._of_pose(pose)), estimate.twist
-        return estimate if not self.late_s or twist is None else estimate.widened(twist[:, None] * twist * self.late_s**2)
+        spread, twist = self._of_pose(pose), estimate.twist
+        return estimate.widened(spread if twist is None else spread + self.late_s**2 * twist[:, None] * twist)
 
     def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the covariance as it is at its end."""
@@ -51,12 +52,13 @@ class PathUncertainty:
     def _of_pose(self, pose: Pose2) -> Cov3:
         """Covariance (3, 3) of a ``pose`` since the start, of which scale and front are unsure. A robot that may drive backwards may be as
         far away on the other side, and a sensor ahead of its middle behind it."""
-        x, y, _ = se2.inverse(pose)
-        start = np.array([x, y, 0.0])
-        factor, lever = self.scale**2, 0.0
+        x, y, yaw = pose.tolist()
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        way = np.array([cos * x + sin * y, cos * y - sin * x, 0.0])  # from the start, along the body's axes
+        spread: Cov3 = self.scale**2 * way[:, None] * way
         if self.turned_about_m is not None:
-            factor, lever = factor + 4.0, (2.0 * self.turned_about_m) ** 2
-        return np.asarray(factor * np.outer(start, start) + np.diag([lever, lever, 0.0]))
+            spread += 4.0 * way[:, None] * way + (2.0 * self.turned_about_m) ** 2 * np.diag([1.0, 1.0, 0.0])
+        return spread
 
 
 def _way_in(trajectory: Trajectory, seconds: float) -> np.ndarray:
