@@ -26,7 +26,6 @@ class LostScans:
         check)."""
         self.silences = 0
         """Gaps between scans that count as lost."""
-        self._is_silent = False
         self._gaps_ns: deque[int] = deque(maxlen=_GAPS)
         self._lost_ns = 0
         self._longest: tuple[int, int] = (0, 0)  # length and start [ns]
@@ -39,7 +38,7 @@ class LostScans:
             self.add_no_scan(stamp_ns)
             self._gaps_ns.append(stamp_ns - self._scan_ns)
         self.scans += 1
-        self._scan_ns, self._is_silent = stamp_ns, False
+        self._scan_ns = stamp_ns
         if cause:
             self.causes[cause] = self.causes.get(cause, 0) + 1
         else:
@@ -56,8 +55,8 @@ class LostScans:
         gap_ns = stamp_ns - self._scan_ns
         if gap_ns <= MIN_LOST_S * 1e9 or gap_ns <= _MAX_SCAN_GAP_PERIODS * self._period_ns:
             return
-        self.silences += not self._is_silent
-        self._is_silent, self._last_ns = True, max(stamp_ns, self._last_ns)
+        self.silences += self._last_ns <= self._scan_ns  # else it lasts
+        self._last_ns = max(stamp_ns, self._last_ns)
 
     @property
     def share(self) -> float:
