@@ -39,7 +39,14 @@ from localization.diagnosis.linearization import (
     linearize,
     make_predictor,
 )
-from localization.diagnosis.model_error import COULOMB_LOG_STIFFNESS, MissingSlips, find_model_error, size_error, unmodelled_by
+from localization.diagnosis.model_error import (
+    COULOMB_LOG_STIFFNESS,
+    MissingSlips,
+    find_model_error,
+    response_error,
+    size_error,
+    unmodelled_by,
+)
 from localization.diagnosis.noise import Noise, count_sigmas, slip_sigmas, slow_turn_sigmas
 from localization.diagnosis.selection import (
     aliases_of,
@@ -485,7 +492,7 @@ def _make_findings(
     found: list[tuple[float, Finding]] = []
     for n, i in enumerate(chosen):
         cause, size = causes[i], float(sizes[n])
-        sigma = math.hypot(math.sqrt(cov[n, n]), _SYSTEMATIC_SHARE * cause.negligible)
+        sigma = math.hypot(math.sqrt(cov[n, n]), _SYSTEMATIC_SHARE * cause.negligible, response_error(predictor, cause, size))
         if cause.id == "encoder_dropout":  # spells of random length: the share is as certain as they are many
             sigma = math.hypot(sigma, size * math.sqrt(2.0 / max(predictor.dropout_count, 2)))
         others = tuple(j for j in chosen if j != i)

@@ -12,7 +12,7 @@ from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.corrected_robot import correct_robot, held_shares
 from localization.diagnosis.diagnose import diagnose
-from localization.diagnosis.drive_predictor import DrivePredictor, Unmodelled, mirrored, rolling_column
+from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, Unmodelled, mirrored, rolling_column
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.linearization import regression
 from localization.diagnosis.model_error import cg_error_sigmas
@@ -34,6 +34,18 @@ def test_diagnose_contacts_that_creep_by_rate_are_no_cause() -> None:
     found = diagnosed(_CREEPING, 3)
     assert not found.findings
     assert found.verdict == "consistent"
+
+
+def test_diagnose_grip_beside_a_healthy_drive_has_the_error_of_the_response() -> None:
+    """A healthy drive does not show how contacts respond: in MuJoCo the centre of rotation moves by 4 to 18 % less than by the model."""
+    drive, split = law_drive("husky_a200"), 0.3
+    model = make_model("friction", drive.robot)
+    hypothesis = CAUSES["split_friction"].inject(Hypothesis(), split)
+    moved = measured_under(drive, model, hypothesis, np.random.default_rng(4), has_inertia=True)
+    first, beside = (diagnose(moved, model, baseline=baseline).findings[0] for baseline in (None, Baseline(windows=20.0)))
+    assert first.cause == beside.cause == "split_friction"
+    assert first.sigma < 0.1 * split
+    assert 0.1 * split < beside.sigma < 0.2 * split
 
 
 def test_predictor_about_stiff_contacts_predicts_as_they_move_and_writes_none_of_them() -> None:
