@@ -517,7 +517,7 @@ def rolls_for(vx: float, wz: float, load: Loads, floor: Floor) -> tuple[float, f
     angle, drift, share, found = _solve(angle, drift, share, to_x, to_w, unit, load, floor)
     if not found:
         angle, drift, share, found = _enclosed(to_x, to_w, load, floor)
-        if found and (unit != 0.0 or load.slope_x != 0.0 or load.slope_y != 0.0):
+        if found and unit != 0.0:
             angle, drift, share, found = _pulled(angle, drift, share, to_x, to_w, unit, load, floor)
     if not found:
         return math.nan, math.nan
@@ -589,11 +589,11 @@ def _step(b: Balance, c: float, s: float, v: float, r: float, to_x: float, to_w:
 def _pulled(
     angle: float, drift: float, share: float, to_x: float, to_w: float, unit: float, load: Loads, floor: Floor
 ) -> tuple[float, float, float, bool]:
-    """`_solve` by continuation, from the solution without a centripetal force and the pull of a slope."""
+    """`_solve` by continuation, from the solution without a centripetal force."""
     reached, step = 0.0, 0.3
     while reached < 1.0:
         trial = min(reached + step, 1.0)
-        a, v, r, found = _solve(angle, drift, share, to_x, to_w, trial * unit, reduced(load, trial, load.pull), floor)
+        a, v, r, found = _solve(angle, drift, share, to_x, to_w, trial * unit, load, floor)
         if found:
             angle, drift, share, reached = a, v, r, trial
             step *= 2.0
@@ -606,8 +606,11 @@ def _pulled(
 
 @subroutine
 def _enclosed(to_x: float, to_w: float, load: Loads, floor: Floor) -> tuple[float, float, float, bool]:
-    """Angle, vy and share without a centripetal force and the pull of a slope, by enclosing the angle."""
-    still = reduced(load, 0.0, 0.0)
+    """Angle, vy and share without a centripetal force, by enclosing the angle.
+
+    That force alone depends on the speed: friction and a slope's pull are those of any wheels at the same angle.
+    """
+    still = reduced(load, 1.0, 0.0)
     goal = math.atan2(floor.half_track * to_w, to_x)
 
     # Enclose: from a robot whose wheels slip away half of the turn, towards the goal until beyond it.

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from motion_models.errors import CgError, ModelError
@@ -97,6 +97,9 @@ def test_slope_derivatives_equal_differences(wheels, centripetal):
 
 
 @given(st.floats(-1, 1), st.floats(-2, 2), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+@example(-0.375, -1.25, 0.0, 0.21875)  # the left wheels all but stand, and friction turns round
+@example(0.5625, 1.8125, 0.0, 0.21875)
+@example(0.11219578, 0.21908915, 0.24748486, 0.02540118)
 @settings(max_examples=200, deadline=None)
 def test_slope_wheels_give_the_command(vx, wz, a_x, a_y):
     command, slope = np.array([vx, wz]), Slope(np.array([a_x, a_y]), HEIGHT)
