@@ -89,10 +89,17 @@ class BackgroundSearcher(ABC, Generic[Search]):
 class PlanarSearch(BackgroundSearch[Place]):
     """`PlaceMap.search` of merged scans; `move` by each keyframe meanwhile."""
 
-    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None, beams: FloatArray | None = None) -> None:
+    def __init__(
+        self,
+        places: PlaceMap,
+        points: Points2,
+        near: tuple[Pose2, FloatArray] | None,
+        beams: FloatArray | None = None,
+        way_m: float = 0.0,
+    ) -> None:
         """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
-        ``beams`` (M, 4) from x, y to x, y [m]."""
-        self.n_points = len(points)
+        ``beams`` (M, 4) from x, y to x, y [m]. ``way_m``: way from the first to the last of the scans [m]."""
+        self.n_points, self.way_m, self.is_whole = len(points), way_m, near is None
         self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
         """(3,) motion since the scans, with its covariance (3, 3)."""
         super().__init__(places, points, *(near or (None, None)), beams, due_s=places.search_s)
