@@ -115,9 +115,9 @@ class _Sums(NamedTuple):
     """(4,) way [m] and turn [rad] in the window, turn by the wheels as difference of the sides' angles, and its agreement with the gyro."""
 
 
-def scale_of_force(size: float, named: str) -> tuple[float, str]:
-    """Factor to m/s^2 of an accelerometer, ``named`` so, by the size of the mean of its first samples, which is gravity's; 0 where it
-    measures none, and what is the matter ("" where there is no accelerometer)."""
+def scale_of_force(size: float, name: str) -> tuple[float, str]:
+    """Factor to m/s^2 of an accelerometer whose first samples have a mean of ``size``, which is gravity at rest; and its problem, as a
+    sentence about ``name``. The factor is 0 with a problem, and where all samples are zero (no accelerometer, no problem)."""
     if is_gravity(size):
         return 1.0, ""
     if _IN_G[0] < size < _IN_G[1]:
@@ -125,8 +125,8 @@ def scale_of_force(size: float, named: str) -> tuple[float, str]:
     if not size:
         return 0.0, ""
     if size < _NO_GRAVITY:
-        return 0.0, f"{named} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it."
-    return 0.0, f"{named} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g."
+        return 0.0, f"{name} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it."
+    return 0.0, f"{name} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g."
 
 
 class AttitudeFilter:

@@ -26,7 +26,7 @@ _MIN_DISPLACEMENT_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """The scan at hand, deskewed, and where it was looked for."""
+    """The last scan, deskewed, and the prior pose that it is matched with."""
 
     prior: Pose2
     """(3,) ``odom_T_body``."""

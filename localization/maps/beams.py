@@ -12,9 +12,9 @@ from motion_models import se2
 from motion_models.compiled import threaded_kernel
 from motion_models.se2 import FloatArray, Pose2
 
-_NEAREST_M = 0.8
+_MIN_LENGTH_M = 0.8
 """Length from which on a beam counts [m]."""
-_END_M = 0.4
+_IGNORED_END_M = 0.4
 """The last part of a beam, which is beside the wall that it ends on [m]."""
 _BEHIND_M = 0.3
 """How far behind the wall a beam is in unknown space [m]: one along a wall has cells of it on its way."""
@@ -34,11 +34,11 @@ def _share_behind(cells: NDArray[np.int8], begin: FloatArray, end: FloatArray, c
     for i in range(begin.shape[0]):
         dx, dy = end[i, 0] - begin[i, 0], end[i, 1] - begin[i, 1]
         length = math.hypot(dx, dy)
-        if length < _NEAREST_M:
+        if length < _MIN_LENGTH_M:
             continue
         n += 1
         wall_m = np.inf
-        for step in range(int((length - _END_M) / cell_m)):
+        for step in range(int((length - _IGNORED_END_M) / cell_m)):
             way_m = step * cell_m
             column = math.floor((begin[i, 0] + dx * way_m / length) / cell_m)
             row = math.floor((begin[i, 1] + dy * way_m / length) / cell_m)

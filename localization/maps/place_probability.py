@@ -22,7 +22,8 @@ MAX_SEARCH_ODDS = 5.0
 _RIVALRY = 20.0
 """Decay of a place's probability with its score, exp(-20 (best - score)): 0.11 below the best it is one tenth as probable."""
 _MAX_MARGIN, _POINTS = 0.3, 200.0
-"""Margin over the next place, at most: one that is by rivals with beams through walls, or whose window leaves out rivals, says no more."""
+"""Largest margin over the next place that counts: a larger one comes from rivals with beams through walls, or outside of the window of the
+search, and is no further evidence. Number of points at which their term is zero."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,7 +112,7 @@ class RecentScans:
         return voxel_means(self._seen_from(self._pose, n), cell_m)
 
     def beams(self, n: int) -> FloatArray:
-        """(M, 4) about ``n`` of the beams at most, from x, y to x, y as seen from the last scan [m]."""
+        """(M, 4) evenly chosen beams, ``n`` and one for each scan at most, from x, y to x, y as seen from the last scan [m]."""
         every = max(math.ceil(sum(len(key.points) for key in self._keys) / n), 1)
         found = []
         for key in self._keys:

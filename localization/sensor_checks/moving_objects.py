@@ -55,8 +55,8 @@ _AGAIN, _AGAIN_WITHOUT_GYRO = 2, 4
 _CALM_S = 1.0
 """Time without moving objects after which all beams are matched again [s]."""
 _CALM_M = 0.3
-"""Way by the wheels, along which wheels and estimate agree, after which what they differed by before is slip that has ended [m]: a LiDAR
-that travels elsewhere by its scans agrees with wheels that stand, or turn in place."""
+"""Distance of the wheels' pose from where wheels and estimate last disagreed, from which on what they differed by is slip that has ended
+[m]: a LiDAR that travels elsewhere by its scans agrees with wheels that stand, or turn in place."""
 _MIN_POINTS = 30
 """Points of the still world with which a scan is matched."""
 

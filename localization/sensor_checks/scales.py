@@ -5,8 +5,8 @@ has the factor as well. Then the whole path is too long by it, from the start on
 
 The difference m of both scales is that of the wheels' error less that of the ranges', of which the wheels' has the standard deviation s_w a
 priori and the ranges' s_r. By Bayes the square of the ranges' error is w m^2 in the mean, w = s_r^2 / (s_r^2 + s_w^2), where m itself shows
-how large such errors are: its mean is w m, its variance w (1 - w) m^2. What m is beyond its own error is so in the covariance. From
-`_MIN_PRIOR_SIGMAS` on it is too large for the wheels: all of it is.
+how large such errors are: its mean is w m, its variance w (1 - w) m^2. The covariance has w times what m^2 is beyond the
+variance of m. From `_MIN_PRIOR_SIGMAS` on, m is too large for an error of the wheels alone, and the covariance has all of it.
 """
 
 from __future__ import annotations

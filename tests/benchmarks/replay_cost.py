@@ -40,8 +40,8 @@ def kiss_seconds() -> float:
     """KISS-ICP's register_frame on all scans of ACES, and nothing else."""
     config = LidarConfig()
     log = open_log(ACES, load_robot("aces"))
-    sweeps = (Sweep.from_scan(event, Mount()) for event in log.events() if isinstance(event, Scan))
-    clouds = [sweep.within(config.min_range_m, config.max_range_m).points for sweep in sweeps]
+    ranges = config.min_range_m, config.max_range_m
+    clouds = [Sweep.from_scan(event, Mount(), *ranges).points for event in log.events() if isinstance(event, Scan)]
     kiss = KissIcp(choose_voxel_size(clouds[0]), config.max_range_m)
     begin = time.perf_counter()
     for cloud in clouds:

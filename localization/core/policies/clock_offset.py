@@ -1,4 +1,4 @@
-"""An offset of the wheels' clock that is large and certain, and what to say about it."""
+"""Warning of a large and certain offset of the wheels' clock."""
 
 from __future__ import annotations
 
