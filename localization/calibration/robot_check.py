@@ -30,7 +30,6 @@ from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
 from localization.logs.topic_roles import CHOSEN_BY
 from localization.pipeline import Trial
-from localization.trajectory import Trajectory
 from motion_models.errors import RobotError
 from motion_models.prior import scaling_sigma
 from motion_models.registry import make_model
@@ -43,6 +42,8 @@ _STANDING_S = 3.0
 """Before the first motion, for the gyro's bias [s]."""
 _REPLAYED_S = 75.0
 """Length of the drive that the filter is run on [s]: a minute of driving and what stands before it."""
+_REFERENCE_S = 600.0
+"""Length of the drive that a reference is compared with where the first minute is too even [s]."""
 _SAME_SCALE = 0.15
 """Relative difference of a radius from the measured one: tyres under load and slip straight ahead change it by up to 7 %, and motion from
 scan to scan errs by some percent."""
@@ -140,7 +141,7 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     rows += [
         *_filter_rows(log, run),
         *_imu_rows(log),
-        _reference_row(log, [] if signals is None else [dead_reckon(log, signals)], reference),
+        _reference_row(log, signals, reference),
     ]
     rows[:0] = [CheckRow("file", "not whole, or changed", "", "cannot be seen", text) for text in log.damage()]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
@@ -169,20 +170,22 @@ def _with_scaling(robot: Robot, params: Sequence[float], sigmas: dict[str, float
     return replace(robot, models={**robot.models, "skid_steer": {**robot.models.get("skid_steer", {}), "k_0": float(f"{params[0]:.4g}")}})
 
 
-def _replayed(log: Log, mounts: Mapping[str, Mount], estimator: str, signals: WheelSignals | None) -> Run | None:
-    """Result of ``estimator`` on the first minute of driving; None where nothing corrects the wheels."""
+def _replayed(
+    log: Log, mounts: Mapping[str, Mount], estimator: str, signals: WheelSignals | None, duration_s: float = _REPLAYED_S
+) -> Run | None:
+    """Result of ``estimator`` on the first ``duration_s`` of driving; None where nothing corrects the wheels."""
     if signals is None or (log.sources.lidar is None and log.sources.imu is None):
         return None
     start_ns = signals.first_ns + int((signals.start_s - _STANDING_S) * 1e9)
     trial = Trial(make_model(model_of(log.robot), log.robot), estimator)
     try:
-        return replay(_first_minute(log, start_ns), [trial], log.robot, mounts, log.sources.lidar is not None)[0]
+        return replay(_first(log, start_ns, duration_s), [trial], log.robot, mounts, log.sources.lidar is not None)[0]
     except LogError:
         return None
 
 
-def _first_minute(log: Log, start_ns: int) -> Iterator[Event]:
-    end_ns = start_ns + int(_REPLAYED_S * 1e9)
+def _first(log: Log, start_ns: int, duration_s: float) -> Iterator[Event]:
+    end_ns = start_ns + int(duration_s * 1e9)
     return (event for event in takewhile(lambda event: event.stamp_ns <= end_ns, log.events()) if event.stamp_ns >= start_ns)
 
 
@@ -402,15 +405,18 @@ def _imu_rows(log: Log) -> list[CheckRow]:
     return [CheckRow("axes of IMU", value, second, "contradiction", f"{what}: correct roll and pitch of '{frame}' in /tf_static.")]
 
 
-def _reference_row(log: Log, tracks: Sequence[Trajectory], given: str | None) -> CheckRow:
-    """Clock, scale and axes of the reference by the motion of the sensors."""
+def _reference_row(log: Log, signals: WheelSignals | None, given: str | None) -> CheckRow:
+    """Clock, scale and axes of the reference by the motion of the sensors: of the first minute, or of more where that is too even."""
     topic = given or log.reference_topic
     if topic is None:
         return CheckRow("reference", "none", "", "cannot be seen", "none is needed; with one (mocap, GPS, map) errors can be measured.")
     found = load_reference(log, topic)
     if isinstance(found, Relations):
         return CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")
-    compared = compare_reference(tracks, found)
+    compared = None if signals is None else compare_reference([dead_reckon(log, signals)], found)
+    if compared is None and signals is not None:
+        run = _replayed(log, log.mounts, "odometry", signals, _REFERENCE_S)
+        compared = None if run is None else compare_reference([run.trajectory], found)
     if compared is None:
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)
     second = f"speed and turns of the sensors: correlation {compared.unshifted:.2f}, way {compared.scale:.4g} times theirs"

@@ -15,6 +15,8 @@ from motion_models.robot_file import load_robot
 from tests.helpers.extended import cases
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, drive
 
+DATA = Path(__file__).parents[1] / "data"
+
 
 def check(tmp_path: Path, log: Path, *options: str) -> dict[str, Any]:
     """The JSON of a check."""
@@ -37,6 +39,15 @@ def test_check_of_healthy_robot_has_no_contradiction(tmp_path: Path) -> None:
     assert robot.models["skid_steer"]["k_0"] == pytest.approx(0.55, abs=0.01)
     assert "wheel_separation_multiplier: 1.8" in (tmp_path / "out" / "diff_drive_controller.yaml").read_text()
     assert "vyaw" in (tmp_path / "out" / "robot_localization.yaml").read_text()
+
+
+@pytest.mark.extended
+def test_check_compares_gps_where_the_first_minute_is_too_even(tmp_path: Path) -> None:
+    """The Husky outdoors drives its first minute at an even speed; ways of six minutes by wheels and by GPS agree."""
+    found = check(tmp_path, DATA / "husky-outdoor-gps" / "test1.bag", "--robot", "husky_a200")
+    (row,) = (row for row in found["rows"] if row["quantity"] == "reference")
+    assert row["verdict"] == "ok"
+    assert 0.97 < float(row["second_source"].split("way ")[1].split()[0]) < 1.03
 
 
 def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
