@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from localization.errors import EventError
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.se2 import FloatArray, Twist2
 
 _NS = 1e-9

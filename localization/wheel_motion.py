@@ -10,9 +10,10 @@ import numpy as np
 from localization.attitude import Tilt
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
-from motion_models.base import Motion, MotionModel, Twist
+from motion_models.base import MotionModel
 from motion_models.extended_model import SampleSeries, in_series, needs_series
 from motion_models.friction.slope_effect import SlopeEffect, SlopeMotion
+from motion_models.motion import Motion, Twist
 from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Twist2

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from motion_models.base import Motion, MotionModel, Twist
+    from motion_models.base import MotionModel
     from motion_models.calibration.cross_validation import HeldOut, Interval, cross_validate, root_mean, root_mean_gain
     from motion_models.calibration.fit import Fit, FitConfig, fit
     from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_text
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from motion_models.friction.dynamics import FrictionDynamics
     from motion_models.full_linear import FullLinear
     from motion_models.icr import Icr
+    from motion_models.motion import Motion, Twist
     from motion_models.preintegration import preintegrate
     from motion_models.prior import SkidPrior, geometric_scaling, prior_notes, skid_prior
     from motion_models.registry import MODELS, make_model
@@ -116,7 +117,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "motion_models.base": "Motion MotionModel Twist",
+    "motion_models.base": "MotionModel",
     "motion_models.calibration.cross_validation": "HeldOut Interval cross_validate root_mean root_mean_gain",
     "motion_models.calibration.fit": "Fit FitConfig fit",
     "motion_models.calibration.maneuvers": "Maneuver read_windows windows_text",
@@ -134,6 +135,7 @@ _MODULES = {
     "motion_models.friction.dynamics": "FrictionDynamics",
     "motion_models.full_linear": "FullLinear",
     "motion_models.icr": "Icr",
+    "motion_models.motion": "Motion Twist",
     "motion_models.preintegration": "preintegrate",
     "motion_models.prior": "SkidPrior geometric_scaling prior_notes skid_prior",
     "motion_models.registry": "MODELS make_model",

@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import ModelBase, Twist
+from motion_models.base import ModelBase
 from motion_models.compiled import kernel
+from motion_models.motion import Twist
 from motion_models.param import TURNING_SIGMA, Free, Param
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray

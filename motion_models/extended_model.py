@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from motion_models.base import FieldPrior, ModelWrapper, MotionModel, Twist, prior_sigmas
+from motion_models.base import FieldPrior, ModelWrapper, MotionModel, prior_sigmas
 from motion_models.errors import ModelError
+from motion_models.motion import Twist
 from motion_models.param import Free, Param
 from motion_models.se2 import FloatArray
 from motion_models.terms import COMPONENTS, Term

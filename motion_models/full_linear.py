@@ -14,9 +14,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import ModelBase, Twist
+from motion_models.base import ModelBase
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
+from motion_models.motion import Twist
 from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, JointCorrection, Param, Traits
 from motion_models.prior import slip_at_speed
 from motion_models.robot import DIFF_DRIVE, Robot

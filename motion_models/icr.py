@@ -13,8 +13,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import ModelBase, Twist
+from motion_models.base import ModelBase
 from motion_models.compiled import kernel
+from motion_models.motion import Twist
 from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray

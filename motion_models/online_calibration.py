@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motion_models.base import ModelWrapper, MotionModel, Twist, prior_sigmas
+from motion_models.base import ModelWrapper, MotionModel, prior_sigmas
 from motion_models.errors import ModelError
+from motion_models.motion import Twist
 from motion_models.param import Free, Param
 from motion_models.registry import MODELS, params_of, traits_of
 from motion_models.se2 import FloatArray

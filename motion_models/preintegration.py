@@ -10,9 +10,10 @@ import math
 
 import numpy as np
 
-from motion_models.base import Motion, MotionModel, Twist
+from motion_models.base import MotionModel
 from motion_models.compiled import kernel
 from motion_models.linear_equations import multiply_affine
+from motion_models.motion import Motion, Twist
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray, fill_inverse_adjoint, fill_right_jacobian, scalar_exp, scalar_transform, triple
 

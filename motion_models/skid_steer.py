@@ -7,8 +7,9 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from motion_models.base import FieldPrior, ModelBase, Twist
+from motion_models.base import FieldPrior, ModelBase
 from motion_models.compiled import kernel, subroutine
+from motion_models.motion import Twist
 from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, TURNING_SIGMA, Free, Param, Traits
 from motion_models.prior import skid_prior
 from motion_models.robot import Robot

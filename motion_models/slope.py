@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motion_models.base import Twist
+from motion_models.motion import Twist
 from motion_models.se2 import FloatArray
 
 GRAVITY = 9.81

@@ -26,7 +26,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from motion_models.base import ModelBase, Twist
+from motion_models.base import ModelBase
+from motion_models.motion import Twist
 from motion_models.param import Free, Param
 
 

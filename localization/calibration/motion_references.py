@@ -17,7 +17,8 @@ from localization.lidar import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, 
 from localization.trajectory import BoolArray, Trajectory
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
-from motion_models.base import Motion, MotionModel
+from motion_models.base import MotionModel
+from motion_models.motion import Motion
 from motion_models.preintegration import preintegrate
 from motion_models.robot import GyroNoise, Mount, WheelNoise
 from motion_models.se2 import FloatArray

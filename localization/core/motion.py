@@ -19,7 +19,7 @@ from localization.core.filter import Transition
 from localization.core.state import SE2, Group, Layout, Perturbation, State, Vector
 from localization.events import Step
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections
 from motion_models.robot import GyroNoise, WheelNoise
 from motion_models.se2 import FloatArray

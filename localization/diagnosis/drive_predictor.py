@@ -16,13 +16,14 @@ from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
 from motion_models import se2
-from motion_models.base import MotionModel, Twist
+from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
 from motion_models.calibration.prediction import predict, series_of
 from motion_models.compiled import kernel, subroutine
 from motion_models.diff_drive import DiffDrive
 from motion_models.extended_model import in_series
 from motion_models.friction import FrictionModel
+from motion_models.motion import Twist
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY

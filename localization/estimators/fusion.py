@@ -32,7 +32,8 @@ from localization.estimators.estimator import (
 from localization.events import Step
 from localization.lidar import LostScans, ScanMatchingSensor
 from motion_models import se2
-from motion_models.base import Motion, MotionModel
+from motion_models.base import MotionModel
+from motion_models.motion import Motion
 from motion_models.online_calibration import Corrections
 from motion_models.robot import Robot
 from motion_models.se2 import Cov3, FloatArray, Points2, Twist2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.online_calibration import Corrections
 from motion_models.se2 import FloatArray, Pose2
 

@@ -12,8 +12,9 @@ from localization.estimators import Estimate
 from localization.estimators.estimator import GyroCalibration
 from localization.events import Turn
 from localization.wheel_buffer import WheelBuffer
-from motion_models.base import Motion, MotionModel
+from motion_models.base import MotionModel
 from motion_models.compiled import kernel, subroutine
+from motion_models.motion import Motion
 from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import Robot
 from motion_models.se2 import (

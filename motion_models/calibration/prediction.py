@@ -11,11 +11,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from motion_models import se2
-from motion_models.base import Twist
 from motion_models.calibration.chords import chord_jacobians, chord_poses
 from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.compiled import kernel
 from motion_models.extended_model import SampleSeries, in_series
+from motion_models.motion import Twist
 from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray

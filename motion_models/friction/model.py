@@ -20,7 +20,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motion_models.base import ModelBase, ModelWrapper, MotionModel, Twist
+from motion_models.base import ModelBase, ModelWrapper, MotionModel
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import CgError, ModelError
 from motion_models.friction.contact import CREEP, SATURATION, loads, tyre
@@ -37,6 +37,7 @@ from motion_models.friction.equilibrium import (
     sensitivities,
 )
 from motion_models.linear_equations import Matrix3, solve_3x3
+from motion_models.motion import Twist
 from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, Free, Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Triple

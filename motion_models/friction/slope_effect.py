@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from motion_models.base import MotionModel, Twist
+from motion_models.base import MotionModel
 from motion_models.friction.model import BoolArray, FrictionModel
+from motion_models.motion import Twist
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope

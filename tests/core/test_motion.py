@@ -27,7 +27,7 @@ from localization.events import Scan, Step, Turn, WheelSample
 from localization.lidar import KeyScanError
 from localization.synchronizer import Synchronizer
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise

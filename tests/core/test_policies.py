@@ -17,7 +17,7 @@ from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.events import Step
 from localization.lidar import ScanMatch
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot

@@ -18,7 +18,7 @@ from localization.core.space import (
 from localization.core.state import State
 from localization.events import BodyTurn, Gravity, Step
 from motion_models import se3
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.robot import GyroNoise
 from motion_models.slope import GRAVITY
 

@@ -15,9 +15,9 @@ from localization.evaluation.consistency import mean_band
 from localization.events import Step
 from localization.pipeline import Pipeline, Trial
 from motion_models import se2
-from motion_models.base import Motion
 from motion_models.errors import CgError, ModelError
 from motion_models.friction import CorrectedFriction, FrictionModel
+from motion_models.motion import Motion
 from motion_models.online_calibration import add_correction_parameters, check_forms, make_corrections
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model

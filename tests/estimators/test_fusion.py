@@ -21,7 +21,7 @@ from localization.log_replay import Run
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.simulation import world
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.registry import make_model
 from motion_models.robot import Mount, WheelNoise
 from motion_models.se2 import FloatArray

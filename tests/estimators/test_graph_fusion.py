@@ -28,7 +28,7 @@ from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.online_calibration import add_correction_parameters, make_corrections
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise

@@ -13,7 +13,7 @@ from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from tests.helpers.rooms import ANGLES, ranges
 
 S = 1_000_000_000

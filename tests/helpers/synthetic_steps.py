@@ -18,7 +18,7 @@ from localization.events import Scan, Step, Turn
 from localization.lidar import LostScans, ScanMatch
 from localization.lidar.scan_policies import MovedRobot
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.online_calibration import Corrections, make_corrections
 from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.registry import make_model

@@ -7,7 +7,7 @@ import pytest
 
 from localization.events import Scan, Step
 from localization.lidar.scan_policies import MOVED_COV, MovedRobot, StaleScans
-from motion_models.base import Motion
+from motion_models.motion import Motion
 
 
 def scan(seed: int, n: int = 5) -> Scan:

@@ -8,7 +8,7 @@ import pytest
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig, ScanMatchingSensor
 from localization.simulation import world
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.robot import Mount
 from tests.helpers import rooms
 

@@ -8,7 +8,7 @@ import pytest
 from localization.events import Step
 from localization.sensor_checks.faults import DetectedFault, Evidence, FaultLog, SensorFault
 from localization.sensor_checks.inflation import CovarianceInflation
-from motion_models.base import Motion
+from motion_models.motion import Motion
 
 S = 1_000_000_000
 

@@ -10,7 +10,7 @@ from localization.events import Scan, Step
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY, OwnBody
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from tests.helpers import checked_drive, rooms
 from tests.helpers.event_faults import named_faults, without_gyro
 from tests.helpers.fault_drives import in_room, run

@@ -23,7 +23,7 @@ from localization.sensor_checks.reckoning import ESTIMATE
 from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency
 from localization.sensor_checks.sweep_times import OTHER_UNIT, REVERSED_TIMES
 from motion_models import se2
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.registry import make_model
 from tests.helpers import bags, entrance_drives
 from tests.helpers.entrance_drives import Publishing, Vehicle

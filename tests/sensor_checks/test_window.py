@@ -8,7 +8,7 @@ import pytest
 from localization.events import Scan, Step, Turn
 from localization.lidar import LidarConfig
 from localization.sensor_checks.window import MIN_BINS, WINDOW_BINS, Window
-from motion_models.base import Motion
+from motion_models.motion import Motion
 
 S = 1_000_000_000
 STEP_S = 0.1

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motion_models.base import Twist
 from motion_models.friction import FrictionModel
+from motion_models.motion import Twist
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY
 

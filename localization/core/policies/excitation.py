@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from localization.core.state import State
-from motion_models.base import Motion
+from motion_models.motion import Motion
 from motion_models.se2 import Cov3
 
 
