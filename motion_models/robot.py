@@ -63,11 +63,11 @@ class Clock:
     gyro_time_offset_s: float = 0.0
     """By how much the IMU's stamps are late [s]."""
     wheel_rate_error: float = 0.0
-    """By how much faster the wheels' clock runs than the recorder's [s/s], from the start of a log on."""
+    """By how much faster the wheels' clock runs than the recorder's [s/s], from the start of a log on; a live node does not use it."""
     lidar_rate_error: float = 0.0
-    """By how much faster the LiDAR's clock runs than the recorder's [s/s], from the start of a log on."""
+    """By how much faster the LiDAR's clock runs than the recorder's [s/s], from the start of a log on; a live node does not use it."""
     gyro_rate_error: float = 0.0
-    """By how much faster the IMU's clock runs than the recorder's [s/s], from the start of a log on."""
+    """By how much faster the IMU's clock runs than the recorder's [s/s], from the start of a log on; a live node does not use it."""
     sigma_s: float = 0.0
     """By how much all stamps, so corrected, may be off [s]: the poses' covariance has the way in that time."""
 

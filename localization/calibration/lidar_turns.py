@@ -23,7 +23,7 @@ _MAX_LATE_S, _MIN_LATE_S, _STEP_S = 1.5, 0.15, 0.01
 step [s]. Clocks that are further apart are set by the times of recording."""
 _SAME_CLOCK_S = 0.1
 """Largest offset between two sensors that agree."""
-_CLEARER = 3.0
+_MIN_GAIN = 3.0
 """How many times nearer to 1 the correlation with an offset is than that without, or that with any other one."""
 _MIN_APART_S = 0.2
 """Smallest offset of two sensors alone that is named [s], and from which on offsets are others: smaller ones the filter learns without an
@@ -140,7 +140,7 @@ def _offset(turns: FloatArray, heading: Track, edges: NDArray[np.float64]) -> _O
     found = np.array([_likeness(_turns(heading, edges, late), turns) for late in offsets])
     best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])
     others = np.abs(found)[np.abs(offsets - offsets[best]) > _MIN_APART_S]
-    is_clear, is_only = (1.0 - other > _CLEARER * (1.0 - abs(found[best])) for other in (abs(at_zero), others.max()))
+    is_clear, is_only = (1.0 - other > _MIN_GAIN * (1.0 - abs(found[best])) for other in (abs(at_zero), others.max()))
     return _Offset(float(offsets[best]), float(found[best]), is_clear, bool(is_only))
 
 

@@ -20,18 +20,18 @@ from motion_models.se2 import FloatArray
 _MIN_OFF_S, _MAX_LATENCY_S = 0.15, 0.1
 """Least time of recording less stamp, of either sign, of a clock that may be off, and largest of one that is not: the latency of drivers,
 as of the LiDAR's check."""
-_OF_THREE_S = 1.4
-"""Largest offset of one of three sensors, whose clocks the LiDAR's check compares to hundredths of a second."""
-_MIN_CORRELATION, _CLEARER = 0.9, 2.0
+_MIN_OFF_OF_THREE_S = 1.4
+"""Least offset, where there are three sensors, whose smaller ones the LiDAR's check measures by turns [s]."""
+_MIN_CORRELATION, _MIN_GAIN = 0.9, 2.0
 """Correlation of turns with the corrected clock, at least, and how many times nearer to 1 than without."""
 
 
 @dataclass(frozen=True)
 class RecordedClock:
-    """A sensor's clock that is off."""
+    """A sensor's clock that is off, or may be."""
 
     robot: Robot
-    """With the corrected clock."""
+    """With the corrected clock, or, where nothing confirms it, with its offset as `clock.sigma_s`."""
     text: str
     keys: Mapping[str, str]
     """Entries to write to the robot file."""
@@ -63,9 +63,10 @@ def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSi
         if after_signals is None:
             continue
         before, after = _agreement(log, signals, suspect, turn), _agreement(corrected, after_signals, suspect, turn)
-        if before is not None and after is not None and max(before, after) < _MIN_CORRELATION and undecided is None:
+        is_open = before is not None and after is not None and max(before, after) < _MIN_CORRELATION
+        if is_open and undecided is None and suspect.key.endswith("_time_offset_s"):
             undecided = suspect
-        if before is None or after is None or after < _MIN_CORRELATION or 1.0 - before < _CLEARER * (1.0 - after):
+        if before is None or after is None or after < _MIN_CORRELATION or 1.0 - before < _MIN_GAIN * (1.0 - after):
             continue
         value = f"{suspect.value:.4g}"
         other = "other sensor" if suspect.sensor == "wheel" else "wheels"
@@ -75,7 +76,7 @@ def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSi
             " synchronize the clocks."
         )
         return RecordedClock(corrected.robot, text, {f"clock.{suspect.key}": value})
-    if undecided is None or not undecided.key.endswith("_time_offset_s"):
+    if undecided is None:
         return None
     text = (
         f"{undecided.topic}: {undecided.why}: its clock is off, or it waits in a queue with stamps that are right, which the turns of this"
@@ -92,11 +93,13 @@ def _suspects(log: Log) -> Iterator[_Suspect]:
     if len({*sensors.values()}) < 2:
         return
     for topic, rate in log.rate_errors().items():
+        if topic not in sensors:
+            continue  # the centre of gravity, arms
         key = f"{sensors[topic]}_rate_error"
         value = round(getattr(clock, key) + rate, 5)
         way = "faster" if rate > 0.0 else "slower"
         yield _Suspect(sensors[topic], topic, key, value, f"its stamps run {abs(rate):.2%} {way} than the times of recording")
-    least = _OF_THREE_S if len({*sensors.values()}) > 2 else _MIN_OFF_S
+    least = _MIN_OFF_OF_THREE_S if len({*sensors.values()}) > 2 else _MIN_OFF_S
     behind = {topic: late for topic, late in log.behind_s.items() if topic in sensors}
     for topic, late in behind.items():
         others = [abs(other) for name, other in behind.items() if sensors[name] != sensors[topic]]

@@ -36,7 +36,7 @@ from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE, Mount, Robot
 from motion_models.se2 import FloatArray
 
-CheckVerdict = Literal["ok", "contradiction", "cannot be seen"]
+CheckVerdict = Literal["ok", "contradiction", "cannot be seen", "note"]
 
 _STANDING_S = 3.0
 """Before the first motion, for the gyro's bias [s]."""
@@ -104,9 +104,10 @@ class RobotCheck:
         """What was found, in one sentence."""
         wrong = [row.quantity for row in self.rows if row.verdict == "contradiction"]
         unseen = [row.quantity for row in self.rows if row.verdict == "cannot be seen"]
-        text = f"{self.count('ok')} of {len(self.rows)} quantities agree with their second source"
+        text = f"{self.count('ok')} of {len(self.rows) - self.count('note')} quantities agree with their second source"
         text += f"; contradictions: {', '.join(dict.fromkeys(wrong))}" if wrong else "; no contradiction"
-        return f"{text}; cannot be seen: {', '.join(dict.fromkeys(unseen))}." if unseen else f"{text}."
+        text += f"; cannot be seen: {', '.join(dict.fromkeys(unseen))}" if unseen else ""
+        return f"{text}; the log file is damaged, incomplete or corrected." if self.count("note") else f"{text}."
 
 
 def model_of(robot: Robot) -> str:
@@ -143,7 +144,7 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
         *_imu_rows(log),
         _reference_row(log, signals, reference),
     ]
-    rows[:0] = [CheckRow("file", "not whole, or changed", "", "cannot be seen", text) for text in log.damage()]
+    rows[:0] = [CheckRow("log file", "damaged, incomplete or corrected", "", "note", text) for text in log.damage()]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
     model = make_model(model_of(log.robot), log.robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}

@@ -128,7 +128,8 @@ def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot)
 def _without_outliers(speed: FloatArray, other: FloatArray) -> FloatArray:
     """``other`` (n,), NaN where it is far from the usual multiple of ``speed`` (n,): scans that were matched to the wrong place."""
     fast = np.abs(speed) > 0.5 * np.nanpercentile(np.abs(speed), 95.0)
-    usual = float(np.nan_to_num(np.nanmedian(other[fast] / speed[fast]))) if fast.any() else 0.0
+    ratios = other[fast] / speed[fast]
+    usual = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
     is_near = np.abs(other - usual * speed) <= _NEAR * abs(usual) * np.abs(speed) + _NEAR_M_S
     return np.where(is_near, other, np.nan) if is_near[fast].mean() >= _MIN_NEAR else other
 

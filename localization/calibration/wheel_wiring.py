@@ -48,8 +48,8 @@ _MIN_CORRELATION = 0.6
 """Correlation above which a source does not contradict the robot file, as in the sensor checks: no window of healthy logs is below."""
 _SURE_CORRELATION = 0.9
 """What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
-_LIKELY_CORRELATION = 0.8
-"""Correlation of speeds with the turns of a gyro, which are unlike the same odometry's turns."""
+_MIN_REVERSED_SIDE_CORRELATION = 0.8
+"""Correlation of a driver's speeds with the gyro's turns from which on one side is reversed."""
 _MIN_SPEED_M_S = 0.02
 """Root mean square of speeds that are compared."""
 _MIN_CLOCK_INTERVALS = 60
@@ -171,7 +171,9 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
 
 
 def _without_dead(robot: Robot, signals: WheelSignals) -> WiringReport | None:
-    """``robot`` without the wheels whose encoders count nothing while another one of their side turns; None without any."""
+    """``robot`` without the wheels whose encoders count nothing, or that have no data, while another one of their side turns; None without
+    any."""
+    is_measured = np.isfinite(signals.joint_rates).any(axis=0)
     rates = np.nan_to_num(signals.joint_rates)
     size, is_left = np.sqrt((rates**2).mean(axis=0)), np.arange(len(signals.joints)) < signals.left
     most = np.where(is_left, size[is_left].max(), size[~is_left].max())
@@ -185,10 +187,15 @@ def _without_dead(robot: Robot, signals: WheelSignals) -> WiringReport | None:
         for side, kept, n in (("left", left, signals.left), ("right", right, (~is_left).sum()))
         if len(kept) < n
     }
-    text = (
-        f"{', '.join(names[~is_kept])}: its encoder counts nothing while another wheel of its side turns, which is used alone. Check the"
-        f" encoder. {CORRECTED} {'; '.join(f'{key} = {value}' for key, value in keys.items())}."
-    )
+    still, silent = names[~is_kept & is_measured].tolist(), names[~is_kept & ~is_measured].tolist()
+    texts = []
+    if still:
+        its = "its encoder counts" if len(still) == 1 else "their encoders count"
+        texts.append(f"{', '.join(still)}: {its} nothing while another wheel of the side turns, which is used alone. Check the encoder.")
+    if silent:
+        have = "has" if len(silent) == 1 else "have"
+        texts.append(f"{', '.join(silent)}: {have} no data in this log; another wheel of the side is used alone. Record all wheels.")
+    text = f"{' '.join(texts)} {CORRECTED} {'; '.join(f'{key} = {value}' for key, value in keys.items())}."
     return WiringReport(replace(robot, joints=replace(robot.joints, left=left, right=right)), (text,), keys)
 
 
@@ -388,7 +395,7 @@ def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: 
     if offset_s is not None:
         return _other_clock(log, signals, offset_s)
     way = correlation(signals.speeds[topic], gyro, MIN_TURN_RAD_S, MAX_BIAS_RAD_S) if topic in signals.speeds else None
-    if way is not None and abs(r) < _MIN_CORRELATION and abs(way) >= _LIKELY_CORRELATION:
+    if way is not None and abs(r) < _MIN_CORRELATION and abs(way) >= _MIN_REVERSED_SIDE_CORRELATION:
         text = (
             f"{topic}: its speeds are the turns of the gyro (correlation {way:+.2f}, of its turns {r:+.2f}): one side of its wheels counts"
             " backwards in its driver, so that it turns where the robot goes ahead. Correct the sign of that encoder or motor there; until"

@@ -24,7 +24,7 @@ from motion_models.calibration.ros_export import diff_drive_controller_yaml, rob
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot, relocated, robot_toml
 
-_COLOURS = {"ok": "green", "contradiction": "red", "cannot be seen": "yellow"}
+_COLOURS = {"ok": "green", "contradiction": "red", "cannot be seen": "yellow", "note": "yellow"}
 
 
 @dataclass(frozen=True)

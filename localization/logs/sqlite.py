@@ -11,7 +11,7 @@ import heapq
 import itertools
 import sqlite3
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
@@ -152,7 +152,7 @@ class SqliteFile:
                 found, last = found + 1, stamp
                 yield RawMessage(stamp, *wanted[key], decompress_message(data))
         if self._rest is None:
-            self._rest = RecoveredSqlite(self._path, reason)
+            self._rest = RecoveredSqlite(self._path, reason, self._set_backs)
             self.warnings += self._rest.warnings
         yield from (message for message in self._rest.messages(topics) if message.log_ns > last)
 
@@ -170,13 +170,14 @@ class SqliteFile:
 class RecoveredSqlite:
     """As many rows of a .db3 file as can be read, in the order in which they were recorded. Raises `LogError` if there are none.
 
-    ``reason`` is why SQLite cannot read the file: it is part of the warning or the error.
+    ``reason`` is why SQLite cannot read the file: it is part of the warning or the error. ``set_backs``: of the recorder's clock, by
+    which later rows are moved.
     """
 
     is_ros1 = False
 
-    def __init__(self, path: Path, reason: str) -> None:
-        self._path = path
+    def __init__(self, path: Path, reason: str, set_backs: Sequence[SetBack] = ()) -> None:
+        self._path, self._set_backs = path, set_backs
         try:
             with closing(_connect(path)) as database:
                 # SQLite refuses a file that is shorter than its header states, unless the schema is declared writable.
@@ -209,7 +210,8 @@ class RecoveredSqlite:
             for number in range(1, pages.count):
                 page = pages.read(number)
                 rows = _leaf_rows(pages, page) if page[:1] == bytes([_TABLE_LEAF]) else ()
-                yield from (row for row in rows if row[0] in self._topics)
+                known = ((index, row) for index, row in rows if row[0] in self._topics)
+                yield from ((key, log_ns + later_ns(self._set_backs, 0, index), data) for index, (key, log_ns, data) in known)
 
 
 class _Pages:
@@ -237,16 +239,17 @@ class _Pages:
         return self.read(number - 1)
 
 
-def _leaf_rows(pages: _Pages, page: bytes) -> Iterator[Row]:
+def _leaf_rows(pages: _Pages, page: bytes) -> Iterator[tuple[int, Row]]:
+    """Messages of a leaf page, each with its row's number."""
     count = int.from_bytes(page[3:5], "big")
     for i in range(min(count, len(page) // 4)):
         at = int.from_bytes(page[8 + 2 * i : 10 + 2 * i], "big")
         length, at = _varint(page, at)
-        _, at = _varint(page, at)
+        index, at = _varint(page, at)
         payload = _payload(pages, page, at, length)
         row = _message_row(payload) if payload is not None else None
         if row is not None:
-            yield row
+            yield index, row
 
 
 def _payload(pages: _Pages, page: bytes, at: int, length: int) -> bytes | None:

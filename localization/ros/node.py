@@ -43,7 +43,7 @@ from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, Transport
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
-from motion_models.robot import Mount
+from motion_models.robot import Clock, Mount
 
 _POLL_S = 0.2
 _COMPILING_S = 3.0
@@ -130,7 +130,8 @@ class Node:
         trial = run.make_trial(sources.lidar is not None)
         if trial.prior is not None:
             trial.prior.check_lidar(sources.has_clouds, bool(run.config.step.planar))
-        for warning in (*prior_notes(run.robot, [trial.model.name]), *discovered.parts.warnings):
+        notes = prior_notes(run.robot, [trial.model.name])
+        for warning in (*notes, *_notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report)
         node._open_session(discovered, view, is_compiled)
@@ -434,6 +435,15 @@ class Node:
             self._report("/tf_static now has the mount of the LiDAR: its scans are placed by that from here on.")
         if self.session.view is not None:
             self.session.view.begin(self.inputs.robot, pipeline.mounts)
+
+
+def _notes_on_clocks(clock: Clock) -> list[str]:
+    """Entries of the robot file that a node leaves out: live, a clock's rate has no start of a log from which it counts."""
+    keys = [f"clock.{name}_rate_error" for name in ("wheel", "lidar", "gyro") if getattr(clock, f"{name}_rate_error")]
+    if not keys:
+        return []
+    hold, them = ("holds", "it") if len(keys) == 1 else ("hold", "them")
+    return [f"{' and '.join(keys)} {hold} for logs alone, and the node does not use {them}; synchronize the clocks."]
 
 
 class StopSignal:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from localization.calibration import recorded_clocks
+from localization.calibration.wheel_signals import read_signals
 from localization.calibration.wheel_wiring import WiringReport, check_wiring
 from localization.logs import open_log
 from tests.helpers import bags
@@ -66,6 +68,36 @@ def test_recorded_clock_of_another_rate_is_corrected(tmp_path: Path, topic: str,
 def test_recorded_clock_of_stamps_that_are_right_is_left(tmp_path: Path, late_s: Callable[[float], float]) -> None:
     """A queue delivers late what was stamped as it was measured."""
     assert report_of(tmp_path, GYRO, queued("/imu/data", late_s)).keys == {}
+    assert "/imu/data" in {suspect.topic for suspect in recorded_clocks._suspects(open_log(tmp_path / "log.mcap", GYRO.robot()))}
+
+
+def test_recorded_clock_of_the_center_of_gravity_is_none_of_a_sensor(tmp_path: Path) -> None:
+    records = [*records_of(GYRO, drive(GYRO), Publishing())]
+    records += [
+        ("/center_of_gravity", bags.point_stamped(log + round(0.015 * (log - START)), 0.0, 0.0), log)
+        for topic, _, log in records
+        if topic == "/joint_states"
+    ]
+    log = open_log(bags.write_mcap(tmp_path / "log.mcap", sorted(records, key=lambda record: record[2])), GYRO.robot())
+    assert "/center_of_gravity" in log.rate_errors()
+    assert check_wiring(log).keys == {}
+
+
+def test_recorded_clock_of_an_undecided_rate_does_not_hide_an_offset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    records = sorted(records_of(GYRO, drive(GYRO), Publishing()), key=lambda record: record[2])
+    log = open_log(bags.write_mcap(tmp_path / "log.mcap", records), GYRO.robot())
+    signals = read_signals(log)
+    assert signals is not None
+    suspects = [
+        recorded_clocks._Suspect("gyro", "/imu/data", "gyro_rate_error", 0.01, "of another rate"),
+        recorded_clocks._Suspect("gyro", "/imu/data", "gyro_time_offset_s", 0.4, "late"),
+    ]
+    monkeypatch.setattr(recorded_clocks, "_suspects", lambda log: iter(suspects))
+    noise = np.random.default_rng(3).normal(size=len(signals.turns["gyro"]))
+    found = recorded_clocks.find_recorded_clock(log, signals, lambda of: np.resize(noise, len(of.turns["gyro"])))
+    assert found is not None
+    assert "gyro_time_offset_s" in found.text
+    assert found.robot.clock.sigma_s == pytest.approx(0.4)
 
 
 def test_recorded_clock_that_turns_do_not_show_is_named(tmp_path: Path) -> None:

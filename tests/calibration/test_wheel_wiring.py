@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import skidloc
-from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
+from localization.calibration.wheel_signals import read_signals
+from localization.calibration.wheel_wiring import WiringReport, _without_dead, check_wiring, open_checked
 from localization.cli import main
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot_file import load_robot, robot_toml
@@ -59,7 +61,25 @@ def test_wiring_without_an_encoder_that_counts_nothing(tmp_path: Path) -> None:
     assert report.robot.joints.left == LEFT[:1]
     assert report.robot.joints.right == RIGHT
     assert report.keys == {"joints.left": f'["{LEFT[0]}"]'}
-    assert "counts nothing" in report.findings[0]
+    assert "its encoder counts nothing" in report.findings[0]
+
+
+def test_wiring_without_a_wheel_of_no_data_blames_no_encoder(tmp_path: Path) -> None:
+    signals = read_signals(open_log(drive(tmp_path / "log.mcap"), ROBOT))
+    assert signals is not None
+    rates, angle_rates = signals.rates.copy(), signals.angle_rates.copy()
+    rates[:, 1] = angle_rates[:, 1] = np.nan
+    report = _without_dead(ROBOT, replace(signals, rates=rates, angle_rates=angle_rates))
+    assert report is not None
+    assert report.findings[0].startswith(f"{LEFT[1]}: has no data")
+    assert "encoder" not in report.findings[0]
+    assert report.robot.joints.left == LEFT[:1]
+
+
+def test_wiring_without_two_encoders_that_count_nothing_names_both(tmp_path: Path) -> None:
+    kept = np.array([1.0, 0.0, 1.0, 0.0])
+    report = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (kept * position, kept * velocity)))
+    assert f"{LEFT[1]}, {RIGHT[1]}: their encoders count nothing" in report.findings[0]
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

@@ -53,7 +53,13 @@ def test_check_compares_gps_where_the_first_minute_is_too_even(tmp_path: Path) -
 def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
     whole = (CASES / "base-log" / "log.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 7 // 10])
-    (row,) = (row for row in check(tmp_path, tmp_path / "cut.mcap")["rows"] if row["quantity"] == "file")
+    found = check(tmp_path, tmp_path / "cut.mcap")
+    (row,) = (row for row in found["rows"] if row["quantity"] == "log file")
+    assert row["verdict"] == "note"
+    assert "log file" not in quantities(found, "cannot be seen")
+    assert found["sentence"].startswith(f"{sum(row['verdict'] == 'ok' for row in found['rows'])} of {len(found['rows']) - 1} quantities")
+    assert "the log file is damaged, incomplete or corrected." in found["sentence"]
+    assert "its end is missing" in (tmp_path / "out" / "check.html").read_text()
     assert "cut.mcap" in row["advice"]
     assert "its end is missing" in row["advice"]
 

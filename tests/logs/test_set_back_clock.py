@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from localization.logs.reader import open_source
+from localization.logs.sqlite import SqliteFile
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 
@@ -75,3 +76,19 @@ def test_set_back_clock_single_message_of_a_wrong_time_is_no_step(tmp_path: Path
     found[2000] = topic, message, log - 20 * S
     source = open_source(write(tmp_path / "log", found, form))
     assert source.warnings == []
+
+
+def test_set_back_clock_rows_behind_later_damage_are_kept(tmp_path: Path) -> None:
+    """They are read page by page, and moved like all others."""
+    (path,) = write(tmp_path / "log", records(40.0), "sqlite3").glob("*.db3")
+    source = SqliteFile(path)
+    data = bytearray(path.read_bytes())
+    size = int.from_bytes(data[16:18], "big")
+    leaves = [at for at in range(size, len(data), size) if data[at] == 13]
+    at = leaves[len(leaves) * 8 // 10]  # of the table of messages, after the step at 12 of 30 s
+    data[at : at + size] = b"\xff" * size
+    path.write_bytes(data)
+    times = np.array([message.log_ns for message in source.messages(["/imu/data"])])
+    assert "page by page" in source.warnings[-1]
+    assert len(times) > 2900
+    assert (times[-1] - times[0]) / S == pytest.approx(END_S, abs=0.05)

@@ -28,7 +28,7 @@ from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
 from localization.ros.discovery import TF
 from localization.ros.estimate_log import old_estimate_log
-from localization.ros.node import Node
+from localization.ros.node import Node, _notes_on_clocks
 from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
 from localization.ros.session import Files
 from localization.ros.settings import Frames, LiveRun, Names, NodeConfig
@@ -67,6 +67,14 @@ def worst(faulty, calm):
 
 def _wrapped(difference):
     return np.array([difference[0], difference[1], math.remainder(difference[2], math.tau)])
+
+
+def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
+    robot = dataclasses.replace(ROBOT, clock=dataclasses.replace(ROBOT.clock, gyro_rate_error=0.01))
+    assert not _notes_on_clocks(ROBOT.clock)
+    _, reports = run_node(LogTransport(drive_log(scans_hz=6.25)), robot=robot)
+    notes = [text for text in reports if "rate_error" in text]
+    assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it; synchronize the clocks."]
 
 
 def test_live_node_gives_the_numbers_of_a_replay(calm):
