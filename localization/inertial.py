@@ -25,8 +25,8 @@ class InertialSensors:
 
     def __init__(self, robot: Robot, mounts: Mapping[str, Mount], has_slopes: bool) -> None:
         """``has_slopes``: the vertical is measured, for gravity on slopes."""
-        self._robot, self._mounts = robot, mounts
-        self.gyro = GyroBuffer(robot.gyro_noise, mounts)
+        self._noise, self._radius_m, self._mounts = robot.gyro_noise, robot.geometry.wheel_radius_m, mounts
+        self.gyro = GyroBuffer(self._noise, mounts)
         self.attitude: AttitudeFilter | None = None
         """The vertical; None where nothing needs it."""
         self._body_rates: BodyRates | None = None
@@ -34,12 +34,12 @@ class InertialSensors:
             self._measure_attitude()
 
     def _measure_attitude(self) -> None:
-        self.attitude = AttitudeFilter(self._robot.gyro_noise, self._mounts, self._robot.geometry.wheel_radius_m)
+        self.attitude = AttitudeFilter(self._noise, self._mounts, self._radius_m)
 
     def measure_in_space(self) -> None:
         """Measure the vertical and turns about all three axes from here on, as poses in space need them."""
         if self._body_rates is None:
-            self._body_rates = BodyRates(self._robot.gyro_noise, self._mounts)
+            self._body_rates = BodyRates(self._noise, self._mounts)
         if self.attitude is None:
             self._measure_attitude()
 

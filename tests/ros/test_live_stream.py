@@ -344,7 +344,8 @@ def test_lidar_without_a_mount_is_an_error_and_a_warning():
     assert "frame 'laser'" in text
     assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in text
     assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, text)}
-    (note,) = node.warnings()
+    (of_imu, note) = sorted(node.warnings(), key=lambda text: "frame 'laser'" in text)
+    assert "the mount of IMU 'imu_link' is unknown" in of_imu
     assert "frame 'laser'" in note
     assert f"{node.session.pipeline.estimator.counts()['scans']} scans of it were taken as if from the body's origin" in note
 
