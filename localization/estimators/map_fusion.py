@@ -87,7 +87,7 @@ class MapFusion(SavedMapFusion[EkfFusion]):
         if self._is_keyframe_due:
             self._is_keyframe_due, self._is_scan_awaited = False, not len(self.odometry.scan_points)
             was_localized = self.localizer.state == "localized"
-            self.localizer.add(self.odometry.scan_points, *self._motion_since_keyframe(), self.odometry.lidar_position)
+            self.localizer.add(self.odometry.scan_points, *self._motion_since_keyframe())
             self.odometry.start_key()
             self._summed = RecentMotion(np.zeros(3), np.zeros((3, 3)))
             self._n_losses += was_localized and self.localizer.state == "lost"

@@ -89,20 +89,13 @@ class BackgroundSearcher(ABC, Generic[Search]):
 class PlanarSearch(BackgroundSearch[Place]):
     """`PlaceMap.search` of merged scans; `move` by each keyframe meanwhile."""
 
-    def __init__(
-        self,
-        places: PlaceMap,
-        points: Points2,
-        near: tuple[Pose2, FloatArray] | None,
-        beams: FloatArray | None = None,
-        way_m: float = 0.0,
-    ) -> None:
+    def __init__(self, places: PlaceMap, points: Points2, near: tuple[Pose2, FloatArray] | None, is_by_fix: bool = False) -> None:
         """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
-        ``beams`` (M, 4) from x, y to x, y [m]. ``way_m``: way from the first to the last of the scans [m]."""
-        self.n_points, self.way_m, self.is_whole = len(points), way_m, near is None
+        ``is_by_fix``: it is about a measured position."""
+        self.n_points, self.is_by_fix = len(points), is_by_fix
         self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
         """(3,) motion since the scans, with its covariance (3, 3)."""
-        super().__init__(places, points, *(near or (None, None)), beams, due_s=places.search_s)
+        super().__init__(places, points, *(near or ()), due_s=places.search_s)
 
     def move(self, delta: Pose2, cov: Cov3) -> None:
         """The robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) meanwhile."""

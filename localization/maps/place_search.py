@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,6 @@ from localization.lidar.correlative_search import draw_image
 from localization.lidar.registration import Alignment, align_points
 from localization.lidar.scan_matcher import OPEN_INFORMATION
 from localization.lidar.submap import VoxelGrid, make_grid, voxel_means
-from localization.maps.beams import share_behind_walls
 from localization.maps.grid import Grid, draw_grid
 from localization.maps.keyframe_map import KeyframeMap
 from localization.trajectory import IntArray
@@ -63,8 +62,6 @@ _MAX_PLACES = 12
 _SEARCH_S, _SEARCH_S_PER_BLOCK = 0.2, 1.2e-4
 """Time that a search beside the estimates is given, and for each block of free space [s]: 0.08 and 0.10 ms of CPU are the medians
 of each in fr079 and ACES, 0.19 the most, on a machine with seven processes on two cores."""
-_BEHIND_SCORE = 3.0
-"""What a beam behind walls counts against a point on a wall."""
 _BLOCK_M, _PADDING = _BLOCK * CELL_M, max(_WIDTHS)
 _NEAR = math.exp(-0.5 * 1.5**2)
 """Likelihood from which on a point lies on a wall: within 1.5 cells of a point of the map."""
@@ -85,8 +82,6 @@ class Place:
     """Share of the points that lie in space that is free in the map; the others are where the map is unknown."""
     contradicting: float
     """Share of the points that lie in space that is free for certain (`CERTAINLY_FREE`), and not at its border."""
-    behind_walls: float = 0.0
-    """Share of the beams that go on behind walls of the map; 0 where only points were compared."""
 
     @property
     def residual_variance(self) -> float:
@@ -100,8 +95,8 @@ class Place:
 
     @property
     def score(self) -> float:
-        """By which places compete: points in free space and beams through walls contradict the map, points in unknown space do not."""
-        return self.on_walls - 2.0 * self.in_free - _BEHIND_SCORE * self.behind_walls
+        """By which places compete: points in free space contradict the map, those in unknown space do not."""
+        return self.on_walls - 2.0 * self.in_free
 
 
 class PlaceMap:
@@ -168,11 +163,9 @@ class PlaceMap:
         blocks = np.unique((blocks[:, None, :] + around).reshape(-1, 2), axis=0)
         return np.asarray((blocks + 0.5) * _BLOCK_M)
 
-    def search(
-        self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None, beams: FloatArray | None = None
-    ) -> list[Place]:
-        """Places where ``points`` (N, 2) of the body frame [m] fit best, and ``beams`` (M, 4) from x, y to x, y, the best first; with
-        ``near`` (3,), within ``half`` (3,) [m, m, rad] of it. None where no free space is."""
+    def search(self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None) -> list[Place]:
+        """Places where ``points`` (N, 2) of the body frame [m] fit best, the best first; with ``near`` (3,), within
+        ``half`` (3,) [m, m, rad] of it. None where no free space is."""
         some = voxel_means(points, 2.0 * CELL_M)
         some = np.ascontiguousarray(some[np.linspace(0, len(some) - 1, min(len(some), _SEARCH_POINTS)).astype(np.intp)])
         reach = float(np.quantile(np.hypot(some[:, 0], some[:, 1]), 0.8))
@@ -191,7 +184,7 @@ class PlaceMap:
         if not len(scores):
             return []
         found = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
-        places = [self.with_beams(self.align(points, pose), beams) for pose in _distinct(found, scores)]
+        places = [self.align(points, pose) for pose in _distinct(found, scores)]
         return sorted(places, key=lambda place: -place.score)
 
     def _branch_and_bound(self, turned: FloatArray, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -222,10 +215,6 @@ class PlaceMap:
         """The place of ``points`` (N, 2) of the body frame near ``pose`` (3,), uncertain by ``cov`` (3, 3)."""
         fit = align_points(self.surfaces, points, pose, cov, pose)
         return self.compare(points, fit)
-
-    def with_beams(self, place: Place, beams: FloatArray | None) -> Place:
-        """``place`` compared with ``beams`` (M, 4) from x, y to x, y of the body frame [m] as well."""
-        return place if beams is None else replace(place, behind_walls=share_behind_walls(self.grid, place.pose, beams))
 
     def compare(self, points: Points2, fit: Alignment) -> Place:
         """How ``points`` (N, 2) agree with walls and free space at the pose of ``fit``."""

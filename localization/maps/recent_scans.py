@@ -17,7 +17,7 @@ from localization.lidar.registration import align_points, is_narrow, mahalanobis
 from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
 from localization.lidar.submap import make_grid, voxel_means
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, Points2, Pose2
 
 _MAX_KEYFRAMES = 12
 """Keyframes whose scans are joined, at most: 6 m of way."""
@@ -59,8 +59,6 @@ class _Keyframe:
     """(3, 3) of the motion since."""
     way_m: float
     """Way that the robot had driven there, turns to new views included [m]."""
-    sensor: FloatArray
-    """(2,) where the LiDAR is in the body frame [m]."""
 
 
 class RecentScans:
@@ -99,27 +97,13 @@ class RecentScans:
         self._way_m += _NEW_VIEW_M * abs(motion.delta[2]) if _is_partial(points) else 0.0
         return motion
 
-    def keep_last(self) -> None:
-        """Discard all scans but the last."""
-        self._keys = deque(list(self._keys)[-1:], _MAX_KEYFRAMES)
-
-    def add(self, points: Points2, sensor: FloatArray = np.zeros(2)) -> None:  # noqa: B008
-        """The scan ``points`` (N, 2) [m] was taken where the robot is, by a LiDAR at ``sensor`` (2,) of the body frame [m]."""
-        self._keys.append(_Keyframe(self._pose, points, np.zeros((3, 3)), self._way_m, sensor))
+    def add(self, points: Points2) -> None:
+        """The scan ``points`` (N, 2) [m] was taken where the robot is."""
+        self._keys.append(_Keyframe(self._pose, points, np.zeros((3, 3)), self._way_m))
 
     def joined(self, cell_m: float, n: int = _MAX_KEYFRAMES) -> Points2:
         """(M, 2) the last ``n`` scans as seen from the last one, one point in each voxel of ``cell_m`` [m]."""
         return voxel_means(self._seen_from(self._pose, n), cell_m)
-
-    def beams(self, n: int) -> FloatArray:
-        """(M, 4) evenly chosen beams, ``n`` and one for each scan at most, from x, y to x, y as seen from the last scan [m]."""
-        every = max(math.ceil(sum(len(key.points) for key in self._keys) / n), 1)
-        found = []
-        for key in self._keys:
-            delta, ends = se2.between(self._pose, key.pose), key.points[::every]
-            begins = np.broadcast_to(se2.transform(delta, key.sensor), ends.shape)
-            found.append(np.hstack([begins, se2.transform(delta, ends)]))
-        return np.vstack(found)
 
     def _seen_from(self, pose: Pose2, n: int) -> Points2:
         return np.vstack([se2.transform(se2.between(pose, key.pose), key.points) for key in list(self._keys)[-n:]])

@@ -25,8 +25,7 @@ from scipy.spatial import cKDTree
 
 from localization.estimators import MapFusion, PriorMap
 from localization.maps import KeyframeMap
-from localization.maps.localizer import Localizer
-from localization.maps.place_probability import LIKELY
+from localization.maps.localizer import LIKELY, Localizer
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from motion_models import se2
@@ -74,7 +73,7 @@ def run_start(
         if last is not None and math.hypot(delta[0], delta[1]) < STEP_M and abs(delta[2]) < STEP_RAD:
             continue
         begin, n_before = time.process_time(), len(places.found)
-        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else COV, keyframes.sensors[k])
+        localizer.add(scans[k], delta, np.zeros((3, 3)) if last is None else COV)
         spent += time.process_time() - begin if math.isnan(after) else 0.0
         last = truth = pose
         measured.append(k)

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from localization.maps import KeyframeMap
-from localization.maps.place_probability import LIKELY, SEARCH_WEIGHTS, Weights, features, weigh
+from localization.maps.localizer import LIKELY
+from localization.maps.place_probability import SEARCH_WEIGHTS, Weights, features, weigh
 from localization.maps.place_search import Place, PlaceMap
 from motion_models.se2 import FloatArray, Points2, Pose2
 
@@ -32,10 +33,8 @@ class RecordedSearches(PlaceMap):
         super().__init__(keyframes, range_noise_m)
         self.found: list[tuple[Sequence[Place], int]] = []
 
-    def search(
-        self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None, beams: FloatArray | None = None
-    ) -> list[Place]:
-        places = super().search(points, near, half, beams)
+    def search(self, points: Points2, near: Pose2 | None = None, half: FloatArray | None = None) -> list[Place]:
+        places = super().search(points, near, half)
         if near is None and places:
             self.found.append((places, len(points)))
         return places
