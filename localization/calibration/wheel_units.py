@@ -131,7 +131,8 @@ def _without_outliers(speed: FloatArray, other: FloatArray) -> FloatArray:
     ratios = other[fast] / speed[fast]
     usual = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
     is_near = np.abs(other - usual * speed) <= _NEAR * abs(usual) * np.abs(speed) + _NEAR_M_S
-    return np.where(is_near, other, np.nan) if is_near[fast].mean() >= _MIN_NEAR else other
+    is_enough = np.isfinite(other[is_near]).sum() >= _MIN_INTERVALS and is_near[fast].mean() >= _MIN_NEAR
+    return np.where(is_near, other, np.nan) if is_enough else other
 
 
 def _check_side_units(signals: WheelSignals, robot: Robot) -> UnitReport | None:
