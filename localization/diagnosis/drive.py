@@ -54,6 +54,8 @@ class MessageLoss(NamedTuple):
     gaps: int
     longest_s: float
     period_s: float
+    held_s: float
+    """Age of the newest message in gaps, on average over the whole drive [s]: speeds that change meanwhile are late."""
 
 
 class StandstillTurn(NamedTuple):
@@ -327,7 +329,8 @@ def find_message_loss(stamps: IntArray) -> MessageLoss | None:
         return None
     holes = gaps[(gaps > 1.6 * period) & (gaps < _MAX_PAUSE_S)]
     missing = float(np.sum(np.round(holes / period) - 1.0))
-    return MessageLoss(missing / (missing + len(stamps)), len(holes), float(holes.max(initial=0.0)), period)
+    held_s = float(np.sum(holes**2) / (2.0 * np.sum(gaps)))
+    return MessageLoss(missing / (missing + len(stamps)), len(holes), float(holes.max(initial=0.0)), period, held_s)
 
 
 def find_period(gaps: FloatArray) -> float | None:

@@ -463,6 +463,17 @@ def relative_speeds(predictor: DrivePredictor) -> FloatArray:
     return np.asarray(speeds / mean - 1.0)
 
 
+def late_columns(predictor: DrivePredictor, late_s: float) -> FloatArray:
+    """(M, 6, 2) motion by speed and turning rate, one each, that come ``late_s`` [s] after those of the wheels while they change."""
+    batch, twist = predictor.batch, predictor.nominal_twist
+    found = np.zeros((len(batch.ends), len(CHANNELS), 2))
+    for i, inside in enumerate(batch.intervals()):
+        gains = np.diff(twist[inside], axis=0, prepend=twist[inside][:1])[:, [0, 2]] * late_s
+        moved = moved_by(twist[inside], batch.dt[inside], gains)
+        found[i, :3] = np.column_stack([moved[:, 0, 0], moved[:, 2, 1]])
+    return found
+
+
 def rolling_column(predictor: DrivePredictor) -> FloatArray:
     """(M, 6, 1) motion by the load that rolling resistance moves against the direction of rolling, which the friction model does not have.
 

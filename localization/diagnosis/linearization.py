@@ -17,6 +17,7 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import (
     Baseline,
     DrivePredictor,
+    late_columns,
     mirrored,
     relative_speeds,
     rolling_column,
@@ -331,9 +332,12 @@ LEVELS = 2
 
 
 def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArray) -> FloatArray:
-    """(M, 6, q) accelerometers and the floor under the IMU are never quite level; and what the model itself is off."""
+    """(M, 6, q) accelerometers and the floor under the IMU are never quite level; speeds in gaps of the wheels' messages are late; and what
+    the model itself is off."""
     columns = [np.zeros((*rows.shape, LEVELS))]
     columns[0][:, 4, 0] = columns[0][:, 5, 1] = 1.0
+    loss = predictor.drive.message_loss
+    late = [] if loss is None or not loss.gaps else [late_columns(predictor, loss.held_s) / FLAT]
     if predictor.unmodelled.has_stiffness:
         for cause in (slip_stiffness_cause(predictor.drive.robot), stiffness_exponent_cause()):
             columns.append(predictor.signature(hypothesis, cause, rows)[..., None] * (cause.plausible / FLAT))
@@ -342,4 +346,4 @@ def _nuisances(predictor: DrivePredictor, hypothesis: Hypothesis, rows: FloatArr
     if predictor.unmodelled.slip_share:
         slips = mirrored(slip_columns(predictor)) * (predictor.unmodelled.slip_share / FLAT)
         columns += [slips, slips * relative_speeds(predictor)[:, None, None]]
-    return np.where(np.isfinite(rows)[..., None], np.concatenate(columns, axis=-1), np.nan)
+    return np.where(np.isfinite(rows)[..., None], np.concatenate([*columns, *late], axis=-1), np.nan)

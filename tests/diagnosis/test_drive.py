@@ -25,7 +25,7 @@ def test_find_message_loss_counts_gaps() -> None:
     kept = np.delete(stamps, np.r_[100:120, 400:410, 700])
     loss = find_message_loss(kept)
     assert loss is not None
-    assert loss == MessageLoss(pytest.approx(0.031), 3, pytest.approx(0.42), pytest.approx(0.02))
+    assert loss == MessageLoss(pytest.approx(0.031), 3, pytest.approx(0.42), pytest.approx(0.02), pytest.approx(0.005666, abs=1e-6))
 
 
 def test_find_message_loss_pause_is_no_loss() -> None:
@@ -119,7 +119,7 @@ def test_examine_of_standing_wheels_reports_the_turning_gyro(moving: int) -> Non
     """Wheels' messages that are frozen leave nothing to diagnose but this."""
     robot = load_robot("jackal")
     maneuver = Maneuver(np.full(20, 0.1), np.ones((20, 2)), np.zeros((1, 3)), np.array([20]), np.zeros(2), 1e-6 * np.eye(3))
-    turn, loss = StandstillTurn(40.0, 12.0, 5.0), MessageLoss(0.2, 30, 0.5, 0.02)
+    turn, loss = StandstillTurn(40.0, 12.0, 5.0), MessageLoss(0.2, 30, 0.5, 0.02, 0.01)
     drive = Drive("d", robot, (maneuver,) * moving, "scan matching", standstill_turn=turn, message_loss=loss)
     found = examine(drive, make_model("friction", robot)).diagnosis
     assert found.verdict == "undecidable"
