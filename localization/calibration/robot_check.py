@@ -23,11 +23,11 @@ from localization.errors import LogError
 from localization.evaluation.reference_check import compare_reference
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
-from localization.events import Event, ImuSample
-from localization.gyro import GRAVITY_SAMPLES, is_gravity
+from localization.events import Event
+from localization.gyro import is_gravity
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
-from localization.logs.info import LogInfo
+from localization.logs.info import LogInfo, first_force
 from localization.logs.topic_roles import CHOSEN_BY
 from localization.pipeline import Trial
 from motion_models.errors import RobotError
@@ -384,15 +384,10 @@ def _imu_rows(log: Log) -> list[CheckRow]:
         return []
     frame = log.frames.get(log.sources.imu.topic, "")
     mount = log.mounts.get(frame, Mount())
-    samples = []
-    for event in log.events():
-        if isinstance(event, ImuSample) and event.frame_id == frame:
-            samples.append(event)
-        if len(samples) >= GRAVITY_SAMPLES:
-            break
-    if not samples:
+    published = first_force(log, log.sources.imu.topic)
+    if published is None:
         return []
-    force = mount.rotation @ np.mean([sample.linear_acceleration for sample in samples], axis=0)
+    force = mount.rotation @ published
     size = float(np.linalg.norm(force))
     value = f"{frame}: roll {math.degrees(mount.roll):.0f}, pitch {math.degrees(mount.pitch):.0f} deg"
     if not is_gravity(size):

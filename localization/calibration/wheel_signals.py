@@ -341,6 +341,8 @@ def lidar_motion(source: ScanSource, signals: WheelSignals) -> LidarMotion | Non
 
 def with_lidar(source: ScanSource, signals: WheelSignals) -> WheelSignals:
     """``signals`` with the motion by scans, where there are any."""
+    if "LiDAR" in signals.turns:
+        return signals
     motion = lidar_motion(source, signals)
     if motion is None:
         return signals

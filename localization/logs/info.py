@@ -18,6 +18,7 @@ from localization.logs.decode import decode_imu
 from localization.logs.event_decoder import TopicDecoder
 from localization.logs.reader import Log
 from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
+from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY
 
 _STAMPED = {*TYPES.values(), *REFERENCE_TYPES}
@@ -204,7 +205,8 @@ def _describe_tilt(log: Log) -> str:
     if imu is None or frame not in log.mounts:
         missing = "no IMU" if imu is None else f"no mount of the IMU's frame '{frame}'"
         return f"not available: there is {missing}, and the ground is taken as level."
-    scale, problem = scale_of_force(_first_force(log, imu.topic), f"the accelerometer of {imu.topic}")
+    force = first_force(log, imu.topic)
+    scale, problem = scale_of_force(0.0 if force is None else float(np.linalg.norm(force)), f"the accelerometer of {imu.topic}")
     if not scale:
         return f"not available, and the ground is taken as level: {problem or f'{imu.topic} has no accelerometer.'}"
     in_g = ", which is in g and is scaled to m/s^2" if scale == GRAVITY else ""
@@ -215,11 +217,11 @@ def _describe_tilt(log: Log) -> str:
     )
 
 
-def _first_force(log: Log, topic: str) -> float:
-    """Size of the mean specific force of an IMU's first samples, as it is published; 0 where there are none."""
+def first_force(log: Log, topic: str) -> FloatArray | None:
+    """Mean specific force (3,) of an IMU's first samples, as it is published; None where there are none."""
     samples = islice(log.readings({topic: TopicDecoder(0, decode_imu)}), GRAVITY_SAMPLES)
     forces = [sample.linear_acceleration for sample in samples]
-    return float(np.linalg.norm(np.mean(forces, axis=0))) if forces else 0.0
+    return np.asarray(np.mean(forces, axis=0)) if forces else None
 
 
 def _description(source: TopicSource) -> dict[str, str]:

@@ -248,8 +248,8 @@ class Log:
             if raw.type == self.types[raw.topic]:
                 decoder = decoders[raw.topic]
                 if raw.topic in rates:
-                    late_ns = decoder.late_ns + round(rates[raw.topic] * (raw.log_ns - self.start_ns))
-                    decoder = decoder._replace(late_ns=late_ns)
+                    drift_ns = round(rates[raw.topic] * (raw.log_ns - self.start_ns))
+                    decoder = decoder._replace(late_ns=decoder.late_ns + drift_ns)
                 item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoder, stats)
                 if item is not None:
                     yield item

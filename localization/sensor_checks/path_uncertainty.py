@@ -11,7 +11,7 @@ from localization.estimators import Estimate
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount, Robot
-from motion_models.se2 import Cov3, Pose2
+from motion_models.se2 import Cov3, FloatArray, Pose2
 
 
 def lever_of_unknown_front(robot: Robot | None, mounts: Mapping[str, Mount]) -> float | None:
@@ -61,7 +61,7 @@ class PathUncertainty:
         return spread
 
 
-def _way_in(trajectory: Trajectory, seconds: float) -> np.ndarray:
+def _way_in(trajectory: Trajectory, seconds: float) -> FloatArray:
     """(n, 3) longer one of the ways in the ``seconds`` before and after each pose."""
     stamps, shift_ns = trajectory.stamps_ns, round(seconds * 1e9)
     before, after = (

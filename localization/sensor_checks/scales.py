@@ -63,5 +63,5 @@ class ScaleCheck:
 
 def _error_of_ranges(off: float, radius: LearnedParameter) -> float:
     """Standard deviation of the ranges' scale where a ``radius`` is learned as ``off`` by a share, by what is beyond its own error."""
-    share = 1.0 / (1.0 + (radius.prior_sigma / _RANGES_SIGMA) ** 2)
-    return math.sqrt(share * max(off**2 - radius.sigma**2, 0.0)) if off < _MAX_SCALE else 0.0
+    w = 1.0 / (1.0 + (radius.prior_sigma / _RANGES_SIGMA) ** 2)
+    return math.sqrt(w * max(off**2 - radius.sigma**2, 0.0)) if off < _MAX_SCALE else 0.0

@@ -187,7 +187,7 @@ def print_tables(drives: dict[str, Drive], maps: dict[str, KeyframeMap], phases:
     """Both tables, of each half of each drive."""
     runs = [run(name, drives[name], maps[name], i, phase) for phase in phases for name in drives for i in (0, 1)]
     runs.append(pooled(runs))
-    print("| carried | found | lost said after [s] | right place first after | localized there after |\n" + "|---" * 5 + "|")
+    print("| carried | found | lost reported after [s] | right place first after | localized there after |\n" + "|---" * 5 + "|")
     print("\n".join(delays_row(found) for found in runs))
     counted = "cuts / found / within 10 s"
     print(f"\n| carried | all: {counted} | ground: {counted} | scan: {counted} / of driving | wrong, longest [s] | wrong above 0.9 |")

@@ -16,7 +16,7 @@ _PRIOR_SCANS = 0.2
 """Weight of white slip, as the wheels' noise model has it, in scans: the first key scans are drawn by then, and their error stays (NEES of
 simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8)."""
 
-_MAX_CHANGE = 0.1
+_MAX_CHANGE_M, _MAX_CHANGE_RAD = 0.1, 0.1
 """Motion in a step and that with the twist before it differ by no more where the robot goes on as before [m, rad]."""
 
 
@@ -42,7 +42,7 @@ class SweepSlip:
             return match, match.cov
         motion = se2.local(start, match.pose)
         off = motion - step.duration * self._twist
-        is_near = math.hypot(off[0], off[1]) < _MAX_CHANGE and abs(off[2]) < _MAX_CHANGE
+        is_near = math.hypot(off[0], off[1]) < _MAX_CHANGE_M and abs(off[2]) < _MAX_CHANGE_RAD
         self._goes_on = is_near and bool(match.outlier_cov.any())
         if step.scan is None or not len(step.scan.offsets):  # all points were measured at once
             return match, match.cov
