@@ -1,4 +1,5 @@
-"""What users of other tools expect: ros2_controllers' odometry, REP-103's axes, and a straight drive whose length is known."""
+"""What users of other tools expect: ros2_controllers' odometry, REP-103's axes, a straight drive whose length is known (as FusionCore's of
+60 m), and the end that robot_localization's test of its Husky bag has."""
 
 import math
 
@@ -10,6 +11,7 @@ from localization.log_replay import replay
 from localization.pipeline import Trial
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
+from tests.studies import robot_localization_bag
 
 ROBOT = load_robot("husky_a200")
 PERIOD_NS = 20_000_000
@@ -76,3 +78,10 @@ def test_ekf_drives_sixty_metres_straight():
     run = end_of(rates, "ekf", rng.normal(0.0, 0.01, 3001))
     assert math.hypot(*run.poses[-1][:2]) == pytest.approx(60.0, abs=0.01)
     assert abs(run.poses[-1][1]) < 3.0 * math.sqrt(run.covariances[-1][1, 1])
+
+
+def test_husky_bag_as_read_here_ends_where_robot_localization_expects():
+    """Their filter of speeds and orientations, as a sum: units, axes, quaternions and times of the bag are read as they read them."""
+    rows = robot_localization_bag.read()
+    end = robot_localization_bag.end_by_orientations(rows["odom"], rows["imu"])
+    assert math.dist(end, robot_localization_bag.EXPECTED_M) < robot_localization_bag.TOLERANCE_M

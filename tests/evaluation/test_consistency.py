@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from filterpy.stats import NEES
 from scipy.stats import binom, chi2, kstest
 
 from localization.errors import EvaluationError
@@ -54,6 +55,13 @@ def test_nees_is_that_of_the_inverse_covariance():
     expected = [x @ np.linalg.solve(c, x) for x, c in zip(e, p, strict=True)]
     np.testing.assert_allclose(nees(e, p), expected, rtol=1e-6)
     np.testing.assert_array_equal(nis(e, p), nees(e, p))
+
+
+def test_nees_is_that_of_filterpy():
+    rng = np.random.default_rng(2)
+    p = random_covariances(rng, 200)
+    truth, estimate = rng.normal(size=(2, 200, 3))
+    np.testing.assert_allclose(nees(truth - estimate, p), NEES(truth, estimate, p), rtol=1e-6)
 
 
 def test_nees_does_not_depend_on_units():
