@@ -13,6 +13,10 @@ from localization.maps.place_search import Place
 from localization.maps.position_plane import PositionFix
 from motion_models.se2 import Cov3, FloatArray, Pose2
 
+LIKELY = 0.9
+"""Probability from which on the robot is localized."""
+RIGHT_M, RIGHT_RAD = 0.5, 0.2
+"""How near a pose is the right place [m, rad]: half a door, and a scan that still overlaps."""
 MAX_SEARCH_ODDS = 5.0
 """Log-odds of a search, at most."""
 _RIVALRY = 20.0
@@ -92,3 +96,9 @@ def sigmoid(log_odds: float) -> float:
 def log_odds(probability: float) -> float:
     """Inverse of `sigmoid`."""
     return math.log(probability / (1.0 - probability))
+
+
+def within(cov: Cov3) -> float:
+    """Probability that a pose with ``cov`` (3, 3) is within `RIGHT_M` and `RIGHT_RAD`, its position equally uncertain on all sides."""
+    variance, sigma = max(0.5 * float(np.trace(cov[:2, :2])), 1e-12), math.sqrt(max(float(cov[2, 2]), 1e-12))
+    return (1.0 - math.exp(-0.5 * RIGHT_M**2 / variance)) * math.erf(RIGHT_RAD / (sigma * math.sqrt(2.0)))

@@ -82,6 +82,10 @@ class RecentScans:
         """Discard all scans: the odometry does not connect them with later ones."""
         self._keys.clear()
 
+    def keep_last(self) -> None:
+        """Discard all scans but the last."""
+        self._keys = deque(list(self._keys)[-1:], _MAX_KEYFRAMES)
+
     def move(self, motion: RecentMotion, points: Points2) -> RecentMotion:
         """Add ``motion``, at whose end ``points`` (N, 2) of the body frame are measured [m]. Returns the motion by scans and odometry where
         the odometry is wide."""

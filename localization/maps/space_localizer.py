@@ -17,8 +17,9 @@ import numpy as np
 
 from localization.maps.background_search import BackgroundSearch, BackgroundSearcher
 from localization.maps.grid import Grid
-from localization.maps.localizer import INITIAL_COV, LIKELY, State, within
-from localization.maps.place_probability import sigmoid
+from localization.maps.localizer import INITIAL_COV, State
+from localization.maps.place_probability import LIKELY, sigmoid, within
+from localization.maps.search_pacing import SearchPacing
 from localization.maps.space_places import SpacePlace, SpacePlaces
 from motion_models import se3
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
@@ -50,8 +51,6 @@ _NEAR_KEYFRAMES = 10
 """Keyframes after which a given or reckoned pose that no cloud confirms is dropped."""
 _NEAR_SEARCH_S, _SEARCH_S = 0.3, 1.5
 """Times after which the result of a search beside the estimates is due, about a pose and in the whole map [s]."""
-_PATIENCE, _MAX_WAIT = 6, 3
-"""After each so many searches in vain, one more keyframe is left out between them, at most the second number, as in the plane."""
 
 
 class SpaceMotion(NamedTuple):
@@ -111,7 +110,7 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
         self.hypotheses, self._log_odds, self.is_outside = [], -_MAX_LOG_ODDS, False
         self.pose, self._running = self.places.on_ground(self.places.centre, np.eye(3)), None
         self._since = self._before = _NO_MOTION  # since the clouds of the last search, and those of the search before until then
-        self._failures = self._wait = 0
+        self._pacing = SearchPacing()
         self._forget()
 
     @property
@@ -156,7 +155,7 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
         if self.state == "localized":  # by odometry for long: the place is searched about the pose, or everywhere
             self.state, self.hypotheses, self._log_odds = "searching", [], -_MAX_LOG_ODDS
             self._near_left = _NEAR_KEYFRAMES
-        if self._running is None:
+        if self._running is None and self._pacing.add_keyframe():
             self._search(cloud, rotation)
 
     def _take(self, search: BackgroundSearch[SpacePlace]) -> None:
@@ -183,7 +182,7 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
     def _lose(self) -> None:
         """The place was wrong, or the map is."""
         self.state, self.hypotheses, self._log_odds = "lost", [], -_MAX_LOG_ODDS
-        self._failures = self._wait = 0
+        self._pacing.restart()
         self._forget()
 
     def _forget(self) -> None:
@@ -193,11 +192,6 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
 
     def _search(self, cloud: FloatArray, rotation: FloatArray) -> None:
         """Search ``cloud`` (N, 3) of the last keyframe, and take the best place where searches over some way agree."""
-        self._wait -= 1
-        if self._wait > 0:
-            return
-        self._failures += 1
-        self._wait = 1 + min(self._failures // _PATIENCE, _MAX_WAIT)
         yaw = math.atan2(rotation[1, 0], rotation[0, 0])
         level = se3.rotation(np.array([0.0, 0.0, -yaw])) @ rotation
         near: tuple[FloatArray, ...] = ()
@@ -231,7 +225,8 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
         self.hypotheses[0] = replace(best, way_m=way)
         if best.probability >= LIKELY and way >= _INDEPENDENT_M:
             self.state, self.pose, self._cov = "localized", best.pose, A @ (best.cov + _BEND) @ A.T + self._since.cov
-            self._near_left = self._failures = self._wait = 0
+            self._near_left = 0
+            self._pacing.restart()
 
 
 def _is_within(cov: FloatArray, sigma_m: float, sigma_rad: float) -> bool:

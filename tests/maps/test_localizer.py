@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from localization.errors import MapError
-from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.localizer import Localizer
+from localization.maps.place_probability import LIKELY
 from localization.maps.place_search import PlaceMap
 from motion_models import se2
 from tests.helpers import floor_plan

@@ -25,7 +25,8 @@ from scipy.spatial import cKDTree
 
 from localization.estimators import MapFusion, PriorMap
 from localization.maps import KeyframeMap
-from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.localizer import Localizer
+from localization.maps.place_probability import LIKELY
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from motion_models import se2

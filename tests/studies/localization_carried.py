@@ -22,7 +22,7 @@ import numpy as np
 
 from localization.estimators import MapFusion, PriorMap
 from localization.maps import KeyframeMap
-from localization.maps.localizer import LIKELY
+from localization.maps.place_probability import LIKELY
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Pipeline, Trial
 from motion_models.registry import make_model

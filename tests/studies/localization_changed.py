@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, draw_grid
-from localization.maps.localizer import LIKELY, Localizer
+from localization.maps.localizer import Localizer
+from localization.maps.place_probability import LIKELY
 from localization.maps.place_search import CELL_M, PlaceMap
 from motion_models import se2
 from tests.studies.buildings import BUILDINGS

@@ -12,7 +12,7 @@ from localization.estimators.graph_fusion import GraphConfig
 from localization.lidar.submap import voxel_means
 from localization.log_replay import replay
 from localization.maps import KeyframeMap
-from localization.maps.localizer import RIGHT_M, RIGHT_RAD
+from localization.maps.place_probability import RIGHT_M, RIGHT_RAD
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import ReplayConfig, Trial
 from motion_models import se2

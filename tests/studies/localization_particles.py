@@ -31,7 +31,7 @@ from PIL import Image
 from localization.maps import KeyframeMap
 from localization.maps.export import UNKNOWN, exports
 from localization.maps.grid import Grid
-from localization.maps.localizer import LIKELY
+from localization.maps.place_probability import LIKELY
 from motion_models import se2
 from tests.studies.buildings import BUILDINGS
 from tests.studies.localization import COV, run_start, ways

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from localization.maps import KeyframeMap
-from localization.maps.localizer import LIKELY
-from localization.maps.place_probability import SEARCH_WEIGHTS, Weights, features, weigh
+from localization.maps.place_probability import LIKELY, SEARCH_WEIGHTS, Weights, features, weigh
 from localization.maps.place_search import Place, PlaceMap
 from motion_models.se2 import FloatArray, Points2, Pose2
 

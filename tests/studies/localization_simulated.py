@@ -25,7 +25,8 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from localization.maps.grid import Grid
-from localization.maps.localizer import LIKELY, RIGHT_M, RIGHT_RAD, Localizer
+from localization.maps.localizer import Localizer
+from localization.maps.place_probability import LIKELY, RIGHT_M, RIGHT_RAD
 from localization.maps.place_search import PlaceMap
 from localization.maps.position_plane import PositionFix
 from motion_models import se2
