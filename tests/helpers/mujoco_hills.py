@@ -17,7 +17,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.helpers.hills import HILLS, Ground, HillDrive
-from tests.helpers.mujoco_vehicle import CONE, CONTACT, FLATTENING
+from tests.helpers.mujoco_vehicle import ARMATURE, CONE, CONTACT, COUPLED, FLATTENING, SERVO_GAIN, WHEEL_MASS_SHARE
 
 _STEP_S, _IMU_EVERY, _WHEELS_EVERY, _GROUND_EVERY = 0.001, 10, 20, 2
 _FIELD_M = 40.0
@@ -25,8 +25,8 @@ _WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, 
 _RAMP_RAD_PER_S2 = 8.0
 _K = 0.55
 _GYRO_SIGMA, _FORCE_SIGMA, _BIAS = 0.01, 0.1, (0.002, -0.003, 0.0002)
-_START_S = 1.0
-"""In which the robot settles, before the drive."""
+_START_S, _HELD_S = 1.0, 0.1
+"""In which the robot settles, before the drive, and for how long of it the robot is held: on wheels that roll downhill it rocks."""
 
 
 def robot_of(mu: float, cg_height_m: float = 0.4) -> Robot:
@@ -103,9 +103,9 @@ def _record(
     angles_at, rates_at = [model.jnt_qposadr[j] for j in hinges], [model.jnt_dofadr[j] for j in hinges]
     gyro, force = data.sensor("gyro").data, data.sensor("force").data
     events: list[Event] = []
-    stamps, positions, rotations, set_points = [], [], [], np.zeros(2)
+    stamps, positions, rotations, goal, set_points = [], [], [], np.zeros(2), np.zeros(2)
     sums, bias, start = np.zeros(6), np.array(_BIAS), round(_START_S / _STEP_S)
-    is_standing = False
+    held = round((_START_S - _HELD_S) / _STEP_S)
     for i in range(round((seconds + _START_S) / _STEP_S) + 1):
         t = i * _STEP_S - _START_S
         R = data.body("base").xmat.reshape(3, 3)
@@ -119,9 +119,9 @@ def _record(
             vx, wz = command(t, data.qpos[:3], math.atan2(R[1, 0], R[0, 0]))
             half = 0.5 * wz * g.track_width_m / _K
             goal = np.array([vx - half, vx + half]) / g.wheel_radius_m
-            set_points += np.clip(goal - set_points, *(s * _RAMP_RAD_PER_S2 * _WHEELS_EVERY * _STEP_S for s in (-1.0, 1.0)))
-            data.ctrl[:] = np.tile(set_points, 2)
-            is_standing = not set_points.any()
+        set_points += np.clip(goal - set_points, *(s * _RAMP_RAD_PER_S2 * _STEP_S for s in (-1.0, 1.0)))
+        data.ctrl[:] = np.tile(set_points, 2)
+        is_standing = i >= held and not set_points.any()
         if is_standing:  # else soft contacts let the robot creep downhill by millimetres a second
             data.qvel[:] = 0.0
             sums[3:] -= R.T @ model.opt.gravity
@@ -158,7 +158,7 @@ def _move_ground(data, radius_m: float, ground: Ground) -> None:
 def _xml(robot: Robot, mu: float, softness: float = 1.0) -> str:
     g = robot.geometry
     mass, radius = 50.0, g.wheel_radius_m
-    wheel_mass = 0.02 * mass
+    wheel_mass = WHEEL_MASS_SHARE * mass
     chassis = mass - 4.0 * wheel_mass
     height = (g.cg_height_m - radius) * mass / chassis
     inertia = mass * (g.track_width_m**2 + g.wheelbase_m**2) / 12.0
@@ -169,22 +169,23 @@ def _xml(robot: Robot, mu: float, softness: float = 1.0) -> str:
     )
     wheels = "".join(
         f'<body name="{name}" pos="{x * 0.5 * g.wheelbase_m} {y * 0.5 * g.track_width_m} 0">'
-        f'<joint name="{name}" type="hinge" axis="0 1 0" armature="{30.0 * wheel_mass * radius**2}"/>'
+        f'<joint name="{name}" type="hinge" axis="0 1 0" armature="{ARMATURE * wheel_mass * radius**2}"/>'
         f'<geom name="{name}" type="ellipsoid" size="{own} {0.25 * radius} {own}" mass="{wheel_mass}" contype="0"/></body>'
         for name, x, y in _WHEELS
     )
     contact = CONTACT.replace('solref="0.01 1"', f'solref="{0.01 * math.sqrt(softness)} 1"')
     pairs = "".join(f'<pair geom1="ground_{n}" geom2="{n}" condim="3" friction="{mu} {mu} 0 0 0" {contact}/>' for n, _, _ in _WHEELS)
-    servos = "".join(f'<velocity joint="{n}" kv="{20.0 * mass * 9.81 * radius}"/>' for n, _, _ in _WHEELS)
+    servos = "".join(f'<velocity joint="{n}" kv="{SERVO_GAIN * mass * 9.81 * radius}"/>' for n, _, _ in _WHEELS)
     return f"""
 <mujoco>
- <option timestep="{_STEP_S}" integrator="implicitfast" {CONE}/>
+ <option timestep="{_STEP_S}" integrator="Euler" {CONE}/>
  <worldbody>{floor}
   <body name="base" pos="0 0 {radius}"><freejoint/>
    <inertial pos="0 0 {height}" mass="{chassis}" diaginertia="{0.6 * inertia} {0.8 * inertia} {inertia}"/>
    <site name="imu" pos="0.1 0 {0.2 - radius}"/>{wheels}
   </body>
  </worldbody>
+ {COUPLED}
  <contact>{pairs}</contact><actuator>{servos}</actuator>
  <sensor><gyro name="gyro" site="imu"/><accelerometer name="force" site="imu"/></sensor>
 </mujoco>"""

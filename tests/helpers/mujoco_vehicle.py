@@ -21,10 +21,10 @@ from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 _STEP_S = 0.00125
-_WHEEL_MASS_SHARE = 0.02
-_ARMATURE = 30.0
+WHEEL_MASS_SHARE = 0.02
+ARMATURE = 30.0
 """Inertia of a motor behind its gears, over the wheel's mass times its radius squared."""
-_SERVO_GAIN = 2.0
+SERVO_GAIN = 2.0
 """Torque of a wheel's servo per rad/s of error, over m g r: 3 ms of lag on a Jackal, which an explicit integrator resolves.
 
 Stiffer servos take an integrator that is implicit in their damping. Contacts do not see that part of the wheels' acceleration, and robots
@@ -40,6 +40,9 @@ friction is full. At the default impratio of 1 wheels hopped in all but slow tur
 crept; heights of the centre of gravity came out 20 to 24 % too small (`tests.studies.weigh_slopes`)."""
 FLATTENING = 0.0034
 """How much smaller the rolling radius is than the geometry's, by the contacts' depth: measured, the same for all robots to 0.0001."""
+_COUPLING = 'solref="0.005 1" solimp="0.99 0.99 0.001"'
+COUPLED = f'<equality><joint joint1="fl" joint2="rl" {_COUPLING}/><joint joint1="fr" joint2="rr" {_COUPLING}/></equality>'
+"""The wheels of a side turn alike, as by a chain."""
 _WHEELS = (("fl", 1.0, 1.0), ("fr", 1.0, -1.0), ("rl", -1.0, 1.0), ("rr", -1.0, -1.0))
 _PHYSICAL = frozenset(
     {"wheel_radius_scale", "wheel_radius_difference", "track_width", "payload", "cg_offset_x", "cg_offset_y", "split_friction", "scrub"}
@@ -137,7 +140,7 @@ def _xml(true: TrueRobot, robot: Robot, friction_time_s: float) -> str:
     """MJCF of the robot as it truly is, on a plane."""
     body, g = true.body, robot.geometry
     mass, mu = body.mass, body.param("mu")
-    wheel_mass = _WHEEL_MASS_SHARE * mass
+    wheel_mass = WHEEL_MASS_SHARE * mass
     chassis_mass = mass - 4.0 * wheel_mass
     radius = 0.5 * (body.radius_left + body.radius_right)
     half_wheelbase, half_track = 0.5 * body.param("wheelbase"), 0.5 * body.param("track_width")
@@ -151,11 +154,11 @@ def _xml(true: TrueRobot, robot: Robot, friction_time_s: float) -> str:
         grip = mu * (1.0 + 0.5 * body.grip_split * left)
         wheels.append(f"""
    <body name="{name}" pos="{front * half_wheelbase} {left * half_track} 0">
-    <joint name="{name}" type="hinge" axis="0 1 0" armature="{_ARMATURE * wheel_mass * radius**2}"/>
+    <joint name="{name}" type="hinge" axis="0 1 0" armature="{ARMATURE * wheel_mass * radius**2}"/>
     <geom name="{name}" type="ellipsoid" size="{own_radius} {0.25 * radius} {own_radius}" mass="{wheel_mass}" contype="0"/>
    </body>""")
         contacts.append(f'<pair geom1="floor" geom2="{name}" condim="3" friction="{grip} {grip} 0 0 0" {contact}/>')
-        servos.append(f'<velocity joint="{name}" kv="{_SERVO_GAIN * mass * 9.81 * radius}"/>')
+        servos.append(f'<velocity joint="{name}" kv="{SERVO_GAIN * mass * 9.81 * radius}"/>')
     edge = f"{0.5 * g.wheelbase_m} 0 {height}"
     load = f'<body pos="{edge}"><inertial pos="0 0 0" mass="{true.payload_kg}" diaginertia="1e-3 1e-3 1e-3"/></body>'
     gravity = f"{-9.81 * math.sin(body.slope)} 0 {-9.81 * math.cos(body.slope)}"
@@ -170,7 +173,7 @@ def _xml(true: TrueRobot, robot: Robot, friction_time_s: float) -> str:
    {load if true.payload_kg > 0.0 else ""}{"".join(wheels)}
   </body>
  </worldbody>
- <equality>{"".join(f'<joint joint1="f{side}" joint2="r{side}" solref="0.005 1" solimp="0.99 0.99 0.001"/>' for side in "lr")}</equality>
+ {COUPLED}
  <contact>{"".join(contacts)}</contact>
  <actuator>{"".join(servos)}</actuator>
 </mujoco>"""
