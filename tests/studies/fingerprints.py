@@ -5,7 +5,7 @@ python -m tests.studies.fingerprints [--write FILE] [--against FILE] [--only NAM
 Each row is one estimator over the first part of a log: SHA-256 of stamps, poses, covariances, twists, NIS, parameters, counts and warnings,
 the last pose, and the CPU time. ``--write`` stores the rows; ``--against`` compares with stored ones, of the same machine and
 libraries, and ends with exit code 1 if any differs. Drives: three real buildings, laps of the simulator with gyro and with friction model,
-and a Husky outdoors, of wheels, gyro and positions.
+a Husky outdoors, of wheels, gyro and positions, two scenes that move, and hills with a 3D LiDAR, in space and by slopes alone.
 """
 
 from __future__ import annotations
@@ -28,10 +28,15 @@ from localization.log_replay import Run, replay
 from localization.logs import open_log
 from localization.logs.reference_topics import merge_positions, read_positions
 from localization.maps.place_search import PlaceMap
-from localization.pipeline import Trial
+from localization.pipeline import ReplayConfig, Trial
 from localization.simulation.sensors import SensorConfig
+from localization.synchronizer import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
+from tests.helpers.hill_scans import MOUNT, make_scene, scans
+from tests.helpers.hills import rolling_drive, with_accelerometer_bias, with_gyro_bias
+from tests.helpers.in_space import IN_SPACE, in_order
+from tests.helpers.moving_scenes import SCENES
 from tests.studies.ablation import simulated
 from tests.studies.buildings import BUILDINGS, DATA, Drive
 
@@ -63,6 +68,11 @@ CASES = (
     Case("husky", "ekf"),
     Case("husky", "graph", "full_linear"),
     Case("laps", "odometry"),
+    Case("crowd", "ekf"),
+    Case("walk off", "ekf"),
+    Case("space", "ekf"),
+    Case("space", "graph", "diff_drive"),
+    Case("slopes", "ekf", "friction"),
 )
 
 
@@ -73,21 +83,39 @@ def _husky() -> Drive:
     return Drive(events, robot, log.mounts, reference_track(log.references("/fix"), "/fix")).until(60.0)
 
 
+def _scene(name: str) -> Drive:
+    drive = SCENES[name](1)
+    return Drive(drive.events, drive.robot, drive.mounts, None)
+
+
+def _hills(seconds: float, seed: int, has_clouds: bool) -> Drive:
+    """Biases of gyro and accelerometer beside; the truth is not used."""
+    drive = with_gyro_bias(with_accelerometer_bias(rolling_drive(seconds, seed=seed), seed), seed)
+    clouds = list(scans(drive, make_scene(drive, seed))) if has_clouds else []
+    return Drive(in_order(drive, clouds), drive.robot, {**drive.mounts, "lidar_link": MOUNT}, None)
+
+
 DRIVES: Mapping[str, Callable[[], Drive]] = {
     "aces": lambda: BUILDINGS["aces"].open().until(120.0),
     "fr079": lambda: BUILDINGS["fr079"].open().until(90.0),
     "csail": lambda: BUILDINGS["csail"].open().until(120.0),
     "laps": lambda: simulated("laps", SensorConfig(), 0).until(60.0),
     "husky": _husky,
+    "crowd": lambda: _scene("crowd of 12 overtakes"),
+    "walk off": lambda: _scene("12 people walk off"),
+    "space": lambda: _hills(8.0, 2, has_clouds=True),
+    "slopes": lambda: _hills(40.0, 3, has_clouds=False),
 }
+CONFIGS: Mapping[str, ReplayConfig] = {"space": IN_SPACE, "slopes": ReplayConfig(step=StepConfig(slopes=True))}
+"""Of the drives whose steps are not those of the plane."""
 
 
 def run(case: Case, drive: Drive) -> Run:
     """The estimate of ``case`` over its ``drive``; the estimator `map` in the map that the graph makes of it."""
-    has_lidar, model = case.drive != "husky", make_model(case.model, drive.robot)
+    has_lidar, model = case.drive not in ("husky", "slopes"), make_model(case.model, drive.robot)
 
     def once(trial: Trial) -> Run:
-        return replay(drive.events, [trial], drive.robot, drive.mounts, has_lidar)[0]
+        return replay(drive.events, [trial], drive.robot, drive.mounts, has_lidar, CONFIGS.get(case.drive, ReplayConfig()))[0]
 
     if case.estimator != "map":
         return once(Trial(model, case.estimator, case.corrections))
@@ -103,6 +131,9 @@ def digest(found: Run) -> str:
         if trajectory is not None:
             for part in (trajectory.stamps_ns, trajectory.poses, trajectory.covariances):
                 total.update(b"" if part is None else np.ascontiguousarray(part).tobytes())
+    if found.in_space is not None:
+        for part in (found.in_space.positions, found.in_space.quaternions, found.in_space.covariances):
+            total.update(b"" if part is None else np.ascontiguousarray(part).tobytes())
     for array in (found.twists, found.twist_covariances, found.nis, found.map_points):
         total.update(np.ascontiguousarray(array).tobytes())
     rest = {"parameters": found.parameters, "counts": found.counts, "warnings": found.warnings, "localization": found.localization}
