@@ -2,10 +2,8 @@
 
 Gravity is a measurement of the vertical once the robot's own acceleration is taken off, which wheels and turning give; what they do not
 explain (bumps, slip, vibration) is the measurement's noise, estimated on the way. The state is the vertical with the gyro's biases; its
-error is a small rotation (Sola 2017, "Quaternion kinematics for the error-state Kalman filter").
-
-A mount that is off by a degree or two looks like a slope, too, but stays with the body while a slope turns against it and changes with
-the way. A second, slow filter separates both: only what is not the mount is the ground's tilt.
+error is a small rotation (Sola 2017, "Quaternion kinematics for the error-state Kalman filter"). What of it is the mount's error, and what
+the ground's tilt, is separated by `localization.ground_tilt`.
 """
 
 from __future__ import annotations
@@ -17,9 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.accelerometer import Accelerometer, PlacedImu
 from localization.events import Gravity, ImuSample
 from localization.ground_curvature import GroundCurvature
-from localization.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
+from localization.ground_tilt import GroundTilt
+from localization.small_filters import propagate_in_place, update_in_place
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
 from motion_models.robot import GyroNoise, Mount
@@ -29,26 +29,12 @@ from motion_models.slope import GRAVITY
 _NS = 1e-9
 _MAX_GAP_S = 0.5
 """Without a sample for longer, the vertical starts anew."""
-_IN_G, _NO_GRAVITY = (0.8, 1.2), 3.0
-"""Size of the mean specific force in g (some drivers), and below what gravity was removed [m/s^2]."""
-_MIN_TURN_RAD = 3.0
-"""Turn by the wheels, as difference of the sides' angles, after which it shows whether the gyro's axis points up."""
-_LEVEL = math.tan(math.radians(3.0))
-"""Tilt up to which the ground counts as level: a Husky outdoors is level within 1.8 deg, and mounts are known to a degree or two."""
-_CERTAIN = 3.5
-"""Sigmas at which the ground counts as tilted."""
-_MOUNT_SIGMA, _GROUND_SIGMA = math.radians(1.2), math.radians(6.0)
-"""Sigma of mounts in robot files, and of the slope of hills (median 5.8 deg, 95 % below 10.7)."""
-_HILL_M = 5.0
-"""Way over which a slope changes."""
 _START_SIGMA, _MOVING_SIGMA = math.radians(0.5), math.radians(4.0)
 """Sigma of the first vertical, at rest and on the way [rad]."""
 _BIAS_SIGMA = 0.01
 """Sigma of the bias of a gyro that is not zeroed [rad/s]."""
 _ACCELEROMETER_RAD = math.radians(0.3)
 """Error of the vertical by an accelerometer's bias of 0.05 m/s^2 [rad]."""
-_LASTING = 2.0
-"""For how many windows errors of the vertical last."""
 _SLOPE_EFFECT = 0.25
 """Relative uncertainty of a slope's effect, by mu and the height of the CG."""
 _MIN_UP = 0.2
@@ -85,15 +71,9 @@ class Tilt:
         return np.asarray(self.before + shares[:, None] * (self.after - self.before))
 
 
-class _Imu(NamedTuple):
-    """The IMU and where it sits, as compiled loops take them."""
+class _Robot(NamedTuple):
+    """Constants of the robot, as compiled loops take them."""
 
-    rotation: FloatArray
-    """(3, 3) from its axes into the body's."""
-    place: FloatArray
-    """(3,) in the body [m]."""
-    scale: float
-    """Scale of the accelerometer's forces; 0 until known."""
     radius: float
     """Radius of the wheels [m]."""
     white: float
@@ -115,69 +95,77 @@ class _Sums(NamedTuple):
     """(4,) way [m] and turn [rad] in the window, turn by the wheels as difference of the sides' angles, and its agreement with the gyro."""
 
 
-def scale_of_force(size: float, name: str) -> tuple[float, str]:
-    """Factor to m/s^2 of an accelerometer whose first samples have a mean of ``size``, which is gravity at rest; and its problem, as a
-    sentence about ``name``. The factor is 0 with a problem, and where all samples are zero (no accelerometer, no problem)."""
-    if is_gravity(size):
-        return 1.0, ""
-    if _IN_G[0] < size < _IN_G[1]:
-        return GRAVITY, ""
-    if not size:
-        return 0.0, ""
-    if size < _NO_GRAVITY:
-        return 0.0, f"{name} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it."
-    return 0.0, f"{name} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g."
+class _ImuMeans:
+    """`insert` samples of the IMU, then `take` their mean."""
+
+    def __init__(self) -> None:
+        self._stamps, self._samples, self._n = np.empty(_BUFFER, np.int64), np.empty((_BUFFER, 6)), 0
+        self._last_ns = 0
+
+    def insert(self, sample: ImuSample) -> None:
+        """Store ``sample`` until it is taken."""
+        n = self._n
+        if n == len(self._stamps):
+            self._stamps, self._samples = np.concatenate([self._stamps] * 2), np.concatenate([self._samples] * 2)
+        self._stamps[n], self._samples[n, :3], self._samples[n, 3:] = sample.stamp_ns, sample.angular_velocity, sample.linear_acceleration
+        self._n = n + 1
+
+    def take(self, end_ns: int, *, is_used: bool) -> tuple[FloatArray, float] | None:
+        """Mean (6,) of the samples until ``end_ns``, rates [rad/s] and forces, and the time since the last mean that was used [s].
+
+        These samples are removed. None where there are none, or it is not used.
+        """
+        n, last_ns, mean = self._n, self._last_ns, np.zeros(6)
+        self._n, end_ns = _take(self._stamps, self._samples, n, end_ns, mean)
+        if self._n == n or not is_used:
+            return None
+        self._last_ns = end_ns
+        return mean, (end_ns - last_ns) * _NS
 
 
 class AttitudeFilter:
     """`insert` each sample of the IMU, `advance` to the end of each step."""
 
     def __init__(self, noise: GyroNoise, mounts: Mapping[str, Mount], wheel_radius_m: float) -> None:
-        self._mounts = mounts
-        self._frame: str | None = None
-        self._unmounted: str | None = None  # frame of an accelerometer whose mount is not known
-        self._stamps, self._samples, self._n = np.empty(_BUFFER, np.int64), np.empty((_BUFFER, 6)), 0
-        self._imu = _Imu(np.eye(3), np.zeros(3), 0.0, wheel_radius_m, noise.white_rad_per_sqrt_s)
-        self._first: list[FloatArray] = []
-        self._problem = ""  # why there is no attitude
-        self._is_unusable = False
-        self._last_ns, self._is_explained = 0, False
+        self._accelerometer, self._samples = Accelerometer(mounts), _ImuMeans()
+        self._robot = _Robot(wheel_radius_m, noise.white_rad_per_sqrt_s)
         self._sums = _Sums(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.zeros((6, 6)), np.zeros(7), np.zeros(3), np.zeros(4))
-        self._split, self._split_cov = np.zeros(4), np.diag([_MOUNT_SIGMA**2] * 2 + [_GROUND_SIGMA**2] * 2)
-        self._has_started, self._tilts = False, False
-        self._downhill, self._curvature = np.zeros(2), GroundCurvature()
+        self._is_explained = False
+        self._downhill: FloatArray | None = None
+        """(2,) by the vertical at the end of the last step, mount and ground together; None while the vertical is unknown."""
+        self._ground, self._curvature = GroundTilt(), GroundCurvature()
         self.gravity: Gravity | None = None
         """By the window that ended in the last `advance`; None where none did."""
 
     @property
     def has_attitude(self) -> bool:
         """Whether the vertical is known."""
-        return self._has_started
+        return self._downhill is not None
 
     @property
     def is_tilting(self) -> bool:
         """Whether the ground has been found to tilt."""
-        return self._tilts
+        return self._ground.is_certain
 
     @property
     def up(self) -> FloatArray:
         """(3,) the vertical in body axes; the body's z axis where it is not known."""
-        return self._sums.state[:3].copy() if self._has_started else np.array([0.0, 0.0, 1.0])
+        return self._sums.state[:3].copy() if self.has_attitude else np.array([0.0, 0.0, 1.0])
 
     @property
     def ground_up(self) -> FloatArray:
         """(3,) the vertical in the axes of the robot as it stands on the ground: without the mount's error."""
         x, y, z = self.up.tolist()
-        down_x, down_y = -x / max(z, _MIN_UP) - self._split[0], -y / max(z, _MIN_UP) - self._split[1]
+        error = self._ground.mount_error
+        down_x, down_y = -x / max(z, _MIN_UP) - error[0], -y / max(z, _MIN_UP) - error[1]
         whole = 1.0 / math.sqrt(1.0 + down_x * down_x + down_y * down_y)
         return np.array([-down_x * whole, -down_y * whole, whole])
 
     @property
     def tilt_variances(self) -> tuple[float, float]:
         """Variances of roll and pitch [rad^2]: by the attitude, and by the mount, which stays."""
-        return 0.5 * float(self._sums.cov[0, 0] + self._sums.cov[1, 1]) + _ACCELEROMETER_RAD**2, 0.5 * float(
-            self._split_cov[0, 0] + self._split_cov[1, 1]
-        )
+        own, mount = self._sums.cov, self._ground.mount_cov
+        return 0.5 * float(own[0, 0] + own[1, 1]) + _ACCELEROMETER_RAD**2, 0.5 * float(mount[0, 0] + mount[1, 1])
 
     @property
     def cov(self) -> FloatArray:
@@ -192,43 +180,12 @@ class AttitudeFilter:
     @property
     def mount_error(self) -> FloatArray:
         """(2,) the tilt that stays with the body: by the mount, not the ground."""
-        return self._split[:2].copy()
+        return self._ground.mount_error.copy()
 
     def insert(self, sample: ImuSample) -> None:
         """Take the next sample of the first IMU whose mount is known."""
-        if self._frame is None and sample.frame_id in self._mounts:
-            self._frame = sample.frame_id
-        if self._frame is None and sample.linear_acceleration.any():
-            self._unmounted = sample.frame_id
-        if sample.frame_id != self._frame or self._problem or self._is_unusable:
-            return
-        if not self._imu.scale:
-            self._first.append(sample.linear_acceleration)
-            if len(self._first) == GRAVITY_SAMPLES:
-                self._check_force()
-        n = self._n
-        if n == len(self._stamps):
-            self._stamps, self._samples = np.concatenate([self._stamps] * 2), np.concatenate([self._samples] * 2)
-        self._stamps[n], self._samples[n, :3], self._samples[n, 3:] = sample.stamp_ns, sample.angular_velocity, sample.linear_acceleration
-        self._n = n + 1
-
-    def _check_force(self) -> None:
-        """Units and sign of the accelerometer, by the mean of the first samples."""
-        size = float(np.linalg.norm(np.mean(self._first, axis=0)))
-        scale, self._problem = scale_of_force(size, f"the accelerometer of IMU '{self._frame}'")
-        if self._problem:
-            self._problem += " Slopes are not modelled."
-        elif scale:
-            self._set_scale(scale)
-        else:
-            self._is_unusable = True
-        if self._problem or self._is_unusable:
-            self._n = 0
-
-    def _set_scale(self, scale: float) -> None:
-        mount = self._mounts[self._frame or ""]
-        rotation, place = np.ascontiguousarray(mount.rotation), np.array([mount.x, mount.y, mount.z])
-        self._imu = self._imu._replace(rotation=rotation, place=place, scale=scale)
+        if self._accelerometer.accept(sample):
+            self._samples.insert(sample)
 
     def advance(self, end_ns: int, dt_s: FloatArray, rates: FloatArray) -> Tilt | None:
         """Advance to ``end_ns``; wheels rolled at ``rates`` (n, 2) [rad/s] for ``dt_s`` (n,) [s] each, n = 0 where that is not known.
@@ -236,26 +193,24 @@ class AttitudeFilter:
         The tilt since the last call, where the ground tilts; else None.
         """
         self.gravity = None
-        if not self._n or self._problem:
+        imu = self._accelerometer.imu
+        taken = self._samples.take(end_ns, is_used=imu.scale != 0.0) if self._accelerometer.is_usable else None
+        if taken is None:
             return None
-        wheels = np.ascontiguousarray(dt_s), np.ascontiguousarray(rates)
-        before, left, turned = self._n, self._last_ns, float(self._sums.wheels[1])
-        self._n, self._last_ns, dt = _advance(self._imu, self._sums, self._stamps, self._samples, self._n, left, end_ns, wheels)
-        if self._n == before or not self._imu.scale:
-            return None
-        has_wheels = len(rates) > 0
+        (mean, dt), has_wheels, turned = taken, len(rates) > 0, float(self._sums.wheels[1])
+        _advance(imu, self._robot, self._sums, mean, dt, np.ascontiguousarray(dt_s), np.ascontiguousarray(rates))
         if not 0.0 < dt < _MAX_GAP_S:
-            self._has_started = False
+            self._downhill = None
             self._restart(has_wheels)
             return None
         self._is_explained &= has_wheels
-        if self._has_started and has_wheels:
-            way = 0.5 * self._imu.radius * float(dt_s @ rates.sum(axis=1))
+        if self._downhill is not None and has_wheels:
+            way = 0.5 * self._robot.radius * float(dt_s @ rates.sum(axis=1))
             turn = float(self._sums.wheels[1]) - turned - float(self._sums.state[5]) * dt
-            self._curvature.advance(self._downhill, self._slope(), (way, turn), self._imu.white**2 * dt)
-        if self._sums.window[6] >= (_WINDOW_S if self._has_started else _FIRST_WINDOW_S):
+            self._curvature.advance(self._downhill, self._slope(), (way, turn), self._robot.white**2 * dt)
+        if self._sums.window[6] >= (_FIRST_WINDOW_S if self._downhill is None else _WINDOW_S):
             self._measure(has_wheels)
-        return self._tilt() if self._has_started else None
+        return None if self._downhill is None else self._tilt(self._downhill)
 
     def _restart(self, has_wheels: bool) -> None:
         """Begin a window, over which forces are summed, at the IMU's velocity where ``has_wheels``."""
@@ -269,56 +224,37 @@ class AttitudeFilter:
         state, cov, window, velocity, (way, turn, _, _) = self._sums
         is_explained = self._is_explained and has_wheels
         gravity = (window[:3] - (velocity - window[3:6]) if is_explained else window[:3]) / window[6]
-        if not self._has_started:
+        if self._downhill is None:
             self._start(gravity)
         else:
-            _update_vertical(state, cov, gravity, _EXPLAINED if is_explained else _UNEXPLAINED)
-            self.gravity = Gravity(gravity, max(float(state[6]), (_EXPLAINED if is_explained else _UNEXPLAINED) ** 2))
-            _separate(self._split, self._split_cov, state, cov, float(turn), float(way))
-            ground, cov = self._split[2:], self._split_cov[2:, 2:]
-            if not self._tilts and np.hypot(ground[0], ground[1]) > _LEVEL:
-                self._tilts = bool(ground @ np.linalg.solve(cov, ground) > _CERTAIN**2)
+            least = _EXPLAINED if is_explained else _UNEXPLAINED
+            _update_vertical(state, cov, gravity, least)
+            self.gravity = Gravity(gravity, max(float(state[6]), least**2))
+            self._ground.update(self._slope(), self._slope_cov(), float(turn), float(way))
         self._restart(has_wheels)
 
     def _start(self, gravity: FloatArray) -> None:
         """The first vertical."""
         up = gravity / max(float(np.linalg.norm(gravity)), 1e-9)
-        if not self._is_above(float(up[2])):
+        way, _, turned, agreement = self._sums.wheels.tolist()
+        if not self._accelerometer.is_above(float(up[2]), turned, agreement):
             return
-        is_still = self._is_explained and not self._sums.wheels[0] and not self._sums.wheels[2]
+        is_still = self._is_explained and not way and not turned
         sigma = _START_SIGMA if is_still else _MOVING_SIGMA
         self._sums.state[:] = [*up, *self._sums.state[3:6], 0.01 if is_still else 0.1]
         self._sums.cov[:] = np.diag([sigma**2] * 3 + [_BIAS_SIGMA**2] * 3)
-        self._split_cov[2:] = self._split_cov[:, 2:] = 0.0
-        self._split_cov[2, 2] = self._split_cov[3, 3] = _GROUND_SIGMA**2
-        self._has_started, self._downhill, self._curvature = True, -up[:2] / up[2], GroundCurvature()
+        self._ground.restart()
+        self._downhill, self._curvature = -up[:2] / up[2], GroundCurvature()
         self.gravity = Gravity(gravity, (GRAVITY * sigma) ** 2)
 
-    def _is_above(self, up_z: float) -> bool:
-        """Whether the vertical by the mount is above the robot; where it is below, the wheels' turns show why."""
-        least = math.cos(MAX_MOUNT_ERROR_RAD)
-        if up_z > least:
-            return True
-        named = f"gravity contradicts the mount of IMU '{self._frame}'"
-        if up_z > -least:
-            angle = math.degrees(math.acos(min(max(up_z, -1.0), 1.0)))
-            self._problem = f"{named} by {angle:.0f} deg. Slopes are not modelled. Correct the mount's roll and pitch."
-        elif self._sums.wheels[2] > _MIN_TURN_RAD:
-            if self._sums.wheels[3] > 0.0:  # the gyro agrees with the mount: this driver publishes gravity, not specific force
-                self._set_scale(-self._imu.scale)
-            else:
-                self._problem = f"{named}: it hangs upside down. Slopes are not modelled. Correct the mount's roll or pitch."
-        return False
-
-    def _tilt(self) -> Tilt | None:
-        """The tilt by the mount's error and the vertical as they are now."""
-        before, self._downhill = self._downhill, self._slope()
-        if not self._tilts:
+    def _tilt(self, before: FloatArray) -> Tilt | None:
+        """The tilt since the downhill slope ``before`` (2,), by the mount's error and the vertical as they are now."""
+        self._downhill = after = self._slope()
+        if not self._ground.is_certain:
             return None
-        error, P = self._split[:2], self._sums.cov
-        now = self._downhill - error
-        own = np.array([[P[1, 1], -P[0, 1]], [-P[0, 1], P[0, 0]]]) + _ACCELEROMETER_RAD**2 * np.eye(2)
-        cov = own + self._split_cov[:2, :2] + _SLOPE_EFFECT**2 * np.outer(now, now)
+        error = self._ground.mount_error
+        now = after - error
+        cov = self._slope_cov() + self._ground.mount_cov + _SLOPE_EFFECT**2 * np.outer(now, now)
         return Tilt(before - error, now, cov, self._curvature.twist)
 
     def _slope(self) -> FloatArray:
@@ -326,74 +262,59 @@ class AttitudeFilter:
         state = self._sums.state
         return np.asarray(-state[:2] / max(state[2], _MIN_UP))
 
+    def _slope_cov(self) -> FloatArray:
+        """(2, 2) of `_slope`, by the attitude."""
+        P = self._sums.cov
+        return np.array([[P[1, 1], -P[0, 1]], [-P[0, 1], P[0, 0]]]) + _ACCELEROMETER_RAD**2 * np.eye(2)
+
     def warnings(self) -> list[str]:
         """Problems of the accelerometer, and their remedy."""
-        if self._problem:
-            return [self._problem]
-        if self._frame is None and self._unmounted is not None:
-            where = "/tf_static or in the robot file's [mounts]"
-            return [f"the mount of IMU '{self._unmounted}' is unknown: slopes are not modelled. Give it in {where}."]
-        if self._imu.scale == GRAVITY:
-            return [f"the accelerometer of IMU '{self._frame}' is in g, not m/s^2: it was scaled by {GRAVITY}."]
-        if self._imu.scale < 0.0:
-            return [f"the accelerometer of IMU '{self._frame}' publishes gravity, not specific force: its sign was turned."]
-        return []
+        return self._accelerometer.warnings()
 
 
 @kernel
-def _advance(
-    imu: _Imu,
-    sums: _Sums,
-    stamps: IntArray,
-    samples: FloatArray,
-    n: int,
-    last_ns: int,
-    end_ns: int,
-    wheels: tuple[FloatArray, FloatArray],
-) -> tuple[int, int, float]:
-    """Advance by the mean of those of the first ``n`` samples, of the times ``stamps``, that are not after ``end_ns``; they are removed.
+def _take(stamps: IntArray, samples: FloatArray, n: int, end_ns: int, mean: FloatArray) -> tuple[int, int]:
+    """Fill ``mean`` (6,) by those of the first ``n`` samples, of the times ``stamps``, that are not after ``end_ns``; they are removed.
 
-    How many are left, the stamp of the last one that was used, and the time since ``last_ns`` [s]. ``wheels``: intervals (m,) and rates
-    (m, 2). Where the time is none or too long for a gap, nothing but the velocity is propagated; while the scale is unknown, nothing.
+    How many are left, and the stamp of the last one that was taken.
     """
     used = 0
     while used < n and stamps[used] <= end_ns:
         used += 1
     if not used:
-        return n, last_ns, 0.0
-    dt = 0.0
-    if imu.scale:
-        dt = (stamps[used - 1] - last_ns) * _NS
-        last_ns = stamps[used - 1]
-        _add_mean(imu, sums, samples[:used], dt, wheels)
+        return n, 0
+    last_ns = stamps[used - 1]
+    for i in range(used):
+        for j in range(6):
+            mean[j] += samples[i, j] / used
     for i in range(used, n):
         stamps[i - used] = stamps[i]
         samples[i - used] = samples[i]
-    return n - used, last_ns, dt
+    return n - used, last_ns
 
 
-@subroutine
-def _add_mean(imu: _Imu, sums: _Sums, samples: FloatArray, dt: float, wheels: tuple[FloatArray, FloatArray]) -> None:
-    """Rotate by the mean of ``samples`` (n, 6), which acts for ``dt``, and add the motion of the wheels."""
-    rate, force, mean = np.zeros(3), np.zeros(3), np.zeros(6)
-    for i in range(len(samples)):
-        for j in range(6):
-            mean[j] += samples[i, j] / len(samples)
+@kernel
+def _advance(imu: PlacedImu, robot: _Robot, sums: _Sums, mean: FloatArray, dt: float, dt_s: FloatArray, rates: FloatArray) -> None:
+    """Rotate by ``mean`` (6,) of the IMU's samples, which acts for ``dt``, and add the motion of the wheels, of `AttitudeFilter.advance`.
+
+    Where the time is none, or too long for a gap, nothing but the velocity is propagated.
+    """
+    rate, force = np.zeros(3), np.zeros(3)
     for i in range(3):
         for j in range(3):
             rate[i] += imu.rotation[i, j] * mean[j]
             force[i] += imu.scale * imu.rotation[i, j] * mean[3 + j]
-    _sum_wheels(imu, sums, rate, dt, wheels[0], wheels[1])
+    _sum_wheels(imu.place, robot.radius, sums, rate, dt, dt_s, rates)
     if 0.0 < dt < _MAX_GAP_S:
-        _rotate(sums.state, sums.cov, sums.window, rate, force, dt, imu.white)
+        _rotate(sums.state, sums.cov, sums.window, rate, force, dt, robot.white)
 
 
 @subroutine
-def _sum_wheels(imu: _Imu, sums: _Sums, rate: FloatArray, dt: float, dt_s: FloatArray, rates: FloatArray) -> None:
+def _sum_wheels(place: FloatArray, radius: float, sums: _Sums, rate: FloatArray, dt: float, dt_s: FloatArray, rates: FloatArray) -> None:
     """The IMU's velocity at the end, and the wheels' way and turns."""
-    m, place = len(dt_s), imu.place
+    m = len(dt_s)
     if m:
-        sums.velocity[0] = rate[1] * place[2] - rate[2] * place[1] + 0.5 * imu.radius * (rates[m - 1, 0] + rates[m - 1, 1])
+        sums.velocity[0] = rate[1] * place[2] - rate[2] * place[1] + 0.5 * radius * (rates[m - 1, 0] + rates[m - 1, 1])
         sums.velocity[1] = rate[2] * place[0] - rate[0] * place[2]
         sums.velocity[2] = rate[0] * place[1] - rate[1] * place[0]
     if not 0.0 < dt < _MAX_GAP_S:
@@ -402,7 +323,7 @@ def _sum_wheels(imu: _Imu, sums: _Sums, rate: FloatArray, dt: float, dt_s: Float
     for i in range(m):
         way += dt_s[i] * (rates[i, 0] + rates[i, 1])
         turn += dt_s[i] * (rates[i, 1] - rates[i, 0])
-    sums.wheels[0] += abs(0.5 * imu.radius * way)
+    sums.wheels[0] += abs(0.5 * radius * way)
     sums.wheels[1] += rate[2] * dt
     sums.wheels[2] += abs(turn)
     sums.wheels[3] += turn * rate[2]
@@ -427,7 +348,7 @@ def _rotate(state: FloatArray, cov: FloatArray, window: FloatArray, rate: FloatA
         for j in range(3):
             move[i, j] = turn[i, j]
         move[i, 3 + i] = dt
-    _propagate(move, cov)
+    propagate_in_place(move, cov)
     wide = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2) * _AXES_ERROR
     for i in range(3):
         cov[i, i] += (white * white + wide * wide) * dt
@@ -445,7 +366,7 @@ def _update_vertical(state: FloatArray, cov: FloatArray, gravity: FloatArray, le
     rows = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
     found, gain = np.zeros(6), np.empty(6)
     for i in range(3):
-        _update(found, cov, rows[i], error[i], variance, gain)
+        update_in_place(found, cov, rows[i], error[i], variance, gain)
     a, b, c = state[0], state[1], state[2]
     state[0] += found[1] * c - found[2] * b
     state[1] += found[2] * a - found[0] * c
@@ -454,62 +375,6 @@ def _update_vertical(state: FloatArray, cov: FloatArray, gravity: FloatArray, le
     for i in range(3):
         state[i] *= whole
         state[3 + i] += found[3 + i]
-
-
-@kernel
-def _separate(split: FloatArray, cov: FloatArray, state: FloatArray, own: FloatArray, turn: float, way: float) -> None:
-    """Separate the mount's error from the ground's tilt: ``split`` (4,) and ``cov`` (4, 4) change in place after ``turn`` and ``way``."""
-    c, s = math.cos(turn), math.sin(turn)
-    fade = math.exp(-way / _HILL_M)
-    move = np.eye(4)
-    move[2, 2], move[2, 3], move[3, 2], move[3, 3] = fade * c, fade * s, -fade * s, fade * c
-    before = split.copy()
-    split[2] = move[2, 2] * before[2] + move[2, 3] * before[3]
-    split[3] = move[3, 2] * before[2] + move[3, 3] * before[3]
-    _propagate(move, cov)
-    new = _GROUND_SIGMA * _GROUND_SIGMA * (1.0 - fade * fade)
-    cov[2, 2] += new
-    cov[3, 3] += new
-    found, gain = np.zeros(4), np.empty(4)
-    for axis in range(2):
-        row = np.array([1.0 - axis, axis, 1.0 - axis, axis])
-        variance = _LASTING * (own[1 - axis, 1 - axis] + _ACCELEROMETER_RAD * _ACCELEROMETER_RAD)
-        _update(found, cov, row, -state[axis] / max(state[2], _MIN_UP) - split[axis] - split[2 + axis], variance, gain)
-    for i in range(4):
-        split[i] += found[i]
-
-
-@subroutine
-def _propagate(move: FloatArray, cov: FloatArray) -> None:
-    """``cov`` = ``move`` ``cov`` ``move``^T, in place."""
-    half, n = np.zeros_like(cov), len(cov)
-    for i in range(n):
-        for j in range(n):
-            for k in range(n):
-                half[i, j] += move[i, k] * cov[k, j]
-    cov[:] = 0.0
-    for i in range(n):
-        for j in range(n):
-            for k in range(n):
-                cov[i, j] += half[i, k] * move[j, k]
-
-
-@subroutine
-def _update(found: FloatArray, cov: FloatArray, row: FloatArray, error: float, variance: float, gain: FloatArray) -> None:
-    """One scalar measurement with derivative ``row`` by the first states: ``found``, the estimated error, and ``cov`` change in place."""
-    spread, left = variance, error
-    for i in range(len(found)):
-        gain[i] = 0.0
-        for j in range(len(row)):
-            gain[i] += cov[i, j] * row[j]
-    for j in range(len(row)):
-        spread += row[j] * gain[j]
-        left -= row[j] * found[j]
-    for i in range(len(found)):
-        found[i] += gain[i] * left / spread
-    for i in range(len(found)):
-        for j in range(len(found)):
-            cov[i, j] -= gain[i] * gain[j] / spread
 
 
 @subroutine

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from localization.attitude import scale_of_force
+from localization.accelerometer import scale_of_force
 from localization.gyro import GRAVITY_SAMPLES
 from localization.logs.decode import decode_imu
 from localization.logs.event_decoder import TopicDecoder

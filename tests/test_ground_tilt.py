@@ -1,0 +1,62 @@
+"""The ground's tilt apart from the mount's error, and the filter steps in place that it is made of."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.ground_tilt import GroundTilt
+from localization.small_filters import propagate_in_place, update_in_place
+
+COV = np.radians(0.5) ** 2 * np.eye(2)
+
+
+def turn_on_a_plane(degrees, mount_deg=(0.0, 0.0), seed=0, seconds=40, noise=True):
+    """Turn at .5 rad/s and .3 m/s on a plane of ``degrees`` with a mount that is off; windows of a second."""
+    rng, made, steep = np.random.default_rng(seed), GroundTilt(), math.tan(math.radians(degrees))
+    for k in range(1, seconds + 1):
+        yaw = 0.5 * k
+        ground = steep * np.array([-math.cos(yaw), math.sin(yaw)])
+        off = np.radians(0.5) * rng.normal(size=2) if noise else np.zeros(2)
+        made.update(ground + np.radians(mount_deg) + off, COV, 0.5, 0.3)
+    return made
+
+
+def test_mount_error_is_separate_from_a_plane():
+    made = turn_on_a_plane(8.0, (2.0, -1.0))
+    assert made.is_certain
+    off = made.mount_error - np.radians([2.0, -1.0])
+    assert off @ np.linalg.solve(made.mount_cov, off) < 9.2  # 99 % of chi-square with 2 degrees of freedom
+    assert np.degrees(np.hypot(*off)) < 1.0
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1.0])
+def test_level_ground_under_a_mount_that_is_off_is_never_tilted(degrees):
+    assert not any(turn_on_a_plane(degrees, (1.5, 1.5), seed).is_certain for seed in range(20))
+
+
+def test_restart_forgets_the_ground_and_keeps_the_mount():
+    made = turn_on_a_plane(8.0, (2.0, 0.0), noise=False)
+    mount, cov = made.mount_error.copy(), made.mount_cov.copy()
+    made.restart()
+    np.testing.assert_array_equal(made.mount_error, mount)
+    np.testing.assert_array_equal(made.mount_cov, cov)
+    made.update(np.radians([2.0, 10.0]), 1e-8 * np.eye(2), 0.0, 0.0)
+    assert np.degrees(np.abs(made.mount_error - mount)).max() < 0.3  # the new slope is the ground's
+
+
+def test_steps_in_place_are_those_of_the_textbook():
+    rng = np.random.default_rng(3)
+    A, F, x, z, R = rng.normal(size=(4, 4)), rng.normal(size=(4, 4)), np.zeros(4), 0.7, 0.3
+    P = A @ A.T
+    made = P.copy()
+    propagate_in_place(F, made)
+    np.testing.assert_allclose(made, F @ P @ F.T, rtol=1e-12)
+    made, H = P.copy(), np.array([1.0, 0.5, 0.0])
+    update_in_place(x, made, H, z, R, np.empty(4))
+    full = np.append(H, 0.0)
+    K = P @ full / (full @ P @ full + R)
+    np.testing.assert_allclose(x, K * z, rtol=1e-12)
+    np.testing.assert_allclose(made, P - np.outer(K, full @ P), atol=1e-12)
