@@ -68,7 +68,7 @@ def align_points(grid: VoxelGrid, points: Points2, prior: Pose2, cov: Cov3, gues
     """
     information, H, g = np.asarray(np.linalg.inv(cov), dtype=float), np.empty((3, 3)), np.empty(3)
     first = prior_error_at_points(points, cov) if guess_error is None else guess_error
-    pose, sums = _align(grid, points, triple(prior), information, triple(guess), first, H, g)
+    pose, sums = _align(grid, points, tuple(prior.tolist()), information, tuple(guess.tolist()), first, H, g)
     return Alignment(np.array(pose), H, g, *sums)
 
 

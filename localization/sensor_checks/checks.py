@@ -114,7 +114,7 @@ class SensorChecks:
         """
         step, estimate, pose, residuals, _ = record
         self._inflation.reckoning.correct(step, pose, None if residuals is None else residuals.file_delta)
-        self._steps.moving.keep_view()
+        self._steps.moving.compare_estimate(estimate)
         if estimate.nis is not None:
             self._steps.standstill.restart()
         if residuals is not None:
@@ -122,7 +122,6 @@ class SensorChecks:
                 self._is_lidar_placed = step.scan.frame_id in self._mounts
             self._consistency.add(step, residuals, estimator.learned_parameters if self._is_lidar_placed else tuple)
         if estimate.covariance is not None:
-            self._steps.moving.compare_estimate(estimate.nis)
             self._consistency.compare_estimate(estimate.nis)
 
     def _inflate(self, record: Record, estimator: Estimator) -> Estimate:

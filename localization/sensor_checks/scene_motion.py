@@ -58,7 +58,7 @@ def explain(reference: Profile, now: Profile, points: Points2, start: Pose2, lea
     from ``start`` than that may be off was led away by points that move: it is ``start`` itself then.
     """
     labels = np.empty(len(points), dtype=np.int8)
-    motion, moved_share = _explain(reference, now, points, triple(start), least_moved, labels)
+    motion, moved_share = _explain(reference, now, points, tuple(start.tolist()), least_moved, labels)
     return SceneMotion(np.array(motion), labels, moved_share)
 
 
