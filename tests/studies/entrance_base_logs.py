@@ -244,8 +244,8 @@ def written(
     changed = edit(records)
     is_ordered = getattr(edit, "keeps_order", False)
     ordered = changed if is_ordered else sorted(changed, key=lambda record: record[2])
-    is_sqlite = getattr(edit, "is_sqlite", False)
-    path = bags.write_ros2_bag(folder / "log", ordered, "sqlite3") if is_sqlite else bags.write_mcap(folder / "log.mcap", ordered)
+    write = getattr(edit, "write", lambda path, them: bags.write_mcap(path.with_suffix(".mcap"), them))
+    path = write(folder / "log", ordered)
     (folder / "robot.toml").write_text(robot(base.robot))
     return path, folder / "robot.toml", truth
 

@@ -1,8 +1,8 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [closing | threads | last | other | more | hostile | KIND | part of a NAME ...] [-v]` prints
-kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the EKF, with
-those of the same drive with nothing wrong in brackets.
+`python -m tests.studies.entrance_commands [forum | closing | threads | last | other | more | hostile | KIND | part of a NAME ...] [-v]`
+prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the
+EKF, with those of the same drive with nothing wrong in brackets.
 """
 
 from __future__ import annotations
@@ -247,6 +247,7 @@ def main(arguments: Sequence[str]) -> None:
     """Judge those that are named, by default all."""
     from tests.studies.entrance_closing_cases import CLOSING
     from tests.studies.entrance_command_cases import CASES
+    from tests.studies.entrance_forum_cases import FORUM
     from tests.studies.entrance_hostile_cases import HOSTILE
     from tests.studies.entrance_last_cases import LAST
     from tests.studies.entrance_more_cases import MORE
@@ -254,11 +255,11 @@ def main(arguments: Sequence[str]) -> None:
     from tests.studies.entrance_thread_cases import THREADS
 
     wanted = [a for a in arguments if not a.startswith("-")]
-    sets = {"more": MORE, "hostile": HOSTILE, "other": OTHER, "last": LAST, "threads": THREADS, "closing": CLOSING}
+    sets = {"more": MORE, "hostile": HOSTILE, "other": OTHER, "last": LAST, "threads": THREADS, "closing": CLOSING, "forum": FORUM}
     found = []
     for case in (
         c
-        for c in (*CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
+        for c in (*FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
         if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:

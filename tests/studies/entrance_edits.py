@@ -81,7 +81,7 @@ def in_sqlite(edit: Edit) -> Edit:
     def stored(records: list[Record]) -> list[Record]:
         return edit(records)
 
-    stored.keeps_order = stored.is_sqlite = True  # type: ignore[attr-defined]
+    stored.keeps_order, stored.write = True, lambda path, them: bags.write_ros2_bag(path, them, "sqlite3")  # type: ignore[attr-defined]
     return stored
 
 
