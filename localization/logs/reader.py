@@ -9,7 +9,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import cached_property, partial
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -25,6 +25,7 @@ from localization.logs.decode import MessageStats, UnusableError, frame_name, st
 from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item, late_ns, rate_error
 from localization.logs.reference_topics import reference_decoder
 from localization.logs.serialization import LogDeserializer
+from localization.logs.split import SplitSource
 from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
@@ -346,28 +347,6 @@ class DecompressedSource:
         return self._inner.messages(topics)
 
 
-class SplitSource:
-    """Several files one after the other, as a recorder splits a long log. ``notes`` are warnings about files that are not among them."""
-
-    def __init__(self, parts: list[Source], notes: list[str]) -> None:
-        self._parts, self._warnings = parts, notes
-        self.is_ros1 = False
-        self.channels = merge_channels(chain.from_iterable(part.channels for part in parts))
-        filled = [part for part in parts if any(channel.count for channel in part.channels)]
-        self.start_ns = min((part.start_ns for part in filled), default=0)
-        self.end_ns = max((part.end_ns for part in filled), default=0)
-
-    @property
-    def warnings(self) -> list[str]:
-        """Warnings about what was lost so far, of all parts."""
-        return [*self._warnings, *chain.from_iterable(part.warnings for part in self._parts)]
-
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """The messages of these topics in order of log time, part after part."""
-        for part in self._parts:
-            yield from part.messages(topics)
-
-
 def _or_none(decode: Callable[[RawMessage], Any], raw: RawMessage) -> Any:
     try:
         return decode(raw)
@@ -456,6 +435,8 @@ def _open_file(path: Path) -> Source:
         return ros1.Ros1Bag(path)
     if head.startswith(mcap.MAGIC):
         return mcap.McapFile(path)
+    if not head.startswith(sqlite.MAGIC) and path.suffix == ".db3":
+        return sqlite.RecoveredSqlite(path, "its first page is not that of a database")
     if not head.startswith(sqlite.MAGIC):
         raise LogError(f"'{path}' is not a log: it is neither a ROS 1 bag (.bag), nor an MCAP file (.mcap), nor a ROS 2 bag folder.")
     try:

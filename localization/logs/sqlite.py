@@ -11,10 +11,10 @@ import heapq
 import itertools
 import sqlite3
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 from urllib.parse import quote
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
@@ -32,7 +32,11 @@ _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinition
 _ERRORS = (sqlite3.Error, UnicodeDecodeError)  # the latter where SQLite's message quotes a damaged name
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
+_USUAL_PAGE = 4096
+"""Size of SQLite's pages [bytes], where the first one, which has it, is lost."""
+
 Row = tuple[int, int, bytes]
+T = TypeVar("T")
 
 
 def _reason(error: Exception) -> str:
@@ -184,7 +188,9 @@ class RecoveredSqlite:
                 database.execute("PRAGMA writable_schema=ON")
                 self._topics, definitions = _describe(database)
         except (*_ERRORS, DamagedError) as error:
-            raise LogError(f"'{path}' cannot be read: {reason}; not even its list of topics can ({_reason(error)}).") from error
+            self._topics, definitions = dict(self._leaves(_topic_row)), {}
+            if not self._topics:
+                raise LogError(f"'{path}' cannot be read: {reason}; not even its list of topics can ({_reason(error)}).") from error
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0
         for topic, log_ns, _ in self._rows():
@@ -205,13 +211,17 @@ class RecoveredSqlite:
 
     def _rows(self) -> Iterator[Row]:
         """Messages on the file's leaf pages: those rows that are an id, a known topic's number, a time and bytes."""
+        for index, (key, log_ns, data) in self._leaves(_message_row):
+            if key in self._topics:
+                yield key, log_ns + later_ns(self._set_backs, 0, index), data
+
+    def _leaves(self, read: Callable[[bytes], T | None]) -> Iterator[tuple[int, T]]:
+        """Rows on the file's leaf pages, each with its number, of those that ``read`` knows."""
         with self._path.open("rb") as file:
             pages = _Pages(file)
-            for number in range(1, pages.count):
-                page = pages.read(number)
-                rows = _leaf_rows(pages, page) if page[:1] == bytes([_TABLE_LEAF]) else ()
-                known = ((index, row) for index, row in rows if row[0] in self._topics)
-                yield from ((key, log_ns + later_ns(self._set_backs, 0, index), data) for index, (key, log_ns, data) in known)
+            leaves = (page for page in map(pages.read, range(1, pages.count)) if page[:1] == bytes([_TABLE_LEAF]))
+            rows = ((index, read(payload)) for page in leaves for index, payload in _leaf_rows(pages, page))
+            yield from ((index, row) for index, row in rows if row is not None)
 
 
 class _Pages:
@@ -220,9 +230,9 @@ class _Pages:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         head = file.read(100)
-        size = int.from_bytes(head[16:18], "big")
+        size = int.from_bytes(head[16:18], "big") if head.startswith(MAGIC) else _USUAL_PAGE
         self.size = 65536 if size == 1 else size
-        self.usable = self.size - (head[20] if len(head) == 100 else 0)
+        self.usable = self.size - (head[20] if head.startswith(MAGIC) and len(head) == 100 else 0)
         is_valid = self.size >= 512 and self.size & (self.size - 1) == 0 and self.usable >= 480
         self.count = file.seek(0, 2) // self.size if is_valid else 0
         self._is_taken = bytearray(self.count)
@@ -239,17 +249,16 @@ class _Pages:
         return self.read(number - 1)
 
 
-def _leaf_rows(pages: _Pages, page: bytes) -> Iterator[tuple[int, Row]]:
-    """Messages of a leaf page, each with its row's number."""
+def _leaf_rows(pages: _Pages, page: bytes) -> Iterator[tuple[int, bytes]]:
+    """Rows of a leaf page, each with its number."""
     count = int.from_bytes(page[3:5], "big")
     for i in range(min(count, len(page) // 4)):
         at = int.from_bytes(page[8 + 2 * i : 10 + 2 * i], "big")
         length, at = _varint(page, at)
         index, at = _varint(page, at)
         payload = _payload(pages, page, at, length)
-        row = _message_row(payload) if payload is not None else None
-        if row is not None:
-            yield index, row
+        if payload is not None:
+            yield index, payload
 
 
 def _payload(pages: _Pages, page: bytes, at: int, length: int) -> bytes | None:
@@ -278,13 +287,7 @@ def _payload(pages: _Pages, page: bytes, at: int, length: int) -> bytes | None:
 
 def _message_row(payload: bytes) -> Row | None:
     """(topic, time, data) of a row (id, topic_id, timestamp, data) of the table `messages`; None of any other row."""
-    head, at = _varint(payload, 0)
-    if head > len(payload):
-        return None
-    types = []
-    while at < head:
-        kind, at = _varint(payload, at)
-        types.append(kind)
+    types, head = _column_types(payload)
     if len(types) != 4 or types[0] != 0 or types[3] < 12 or types[3] % 2:
         return None
     topic, at = _integer(payload, head, types[1])
@@ -293,6 +296,29 @@ def _message_row(payload: bytes) -> Row | None:
     if topic is None or log_ns is None or log_ns < 0 or at + size != len(payload):
         return None
     return topic, log_ns, payload[at:]
+
+
+def _topic_row(payload: bytes) -> tuple[str, str] | None:
+    """(name, type) of a row (id, name, type, serialization_format, ...) of the table `topics`; None of any other row."""
+    types, head = _column_types(payload)
+    if len(types) < 4 or types[0] != 0 or any(kind < 13 or kind % 2 == 0 for kind in types[1:4]):
+        return None
+    first, second, third = ((kind - 13) // 2 for kind in types[1:4])
+    texts = payload[head : head + first], payload[head + first : head + first + second], payload[head + first + second :][:third]
+    name, kind, form = (text.decode(errors="replace") for text in texts)
+    return (name, kind) if name.startswith("/") and kind.count("/") == 2 and form == "cdr" else None
+
+
+def _column_types(payload: bytes) -> tuple[list[int], int]:
+    """Serial types of the columns of a row, and where its values begin; none where it is no row."""
+    head, at = _varint(payload, 0)
+    types: list[int] = []
+    if head > len(payload):
+        return types, 0
+    while at < head:
+        kind, at = _varint(payload, at)
+        types.append(kind)
+    return types, head
 
 
 def _integer(data: bytes, at: int, kind: int) -> tuple[int | None, int]:

@@ -123,14 +123,39 @@ def test_sqlite_truncated_is_read_to_the_cut(tmp_path: Path, compression: str | 
     assert "run.db3 was read page by page" in warnings_of(log)
 
 
-def test_sqlite_schema_with_names_that_are_not_text_is_refused(tmp_path: Path) -> None:
+def test_sqlite_schema_with_names_that_are_not_text_is_read_page_by_page(tmp_path: Path) -> None:
     """SQLite's message quotes the name, and Python's sqlite3 cannot decode it."""
     path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "sqlite3")
     file = path / "run.db3"
     data = file.read_bytes().replace(b"CREATE TABLE topics", b"CREATE TABL\x81 topics").replace(b"topicstopics", b"\x81opicstopics")
     file.write_bytes(data)
-    with pytest.raises(LogError, match="a name in its schema is not text"):
-        open_log(path, ROBOT)
+    log = open_log(file, ROBOT)
+    assert "page by page (a name in its schema is not text)" in warnings_of(log)
+    assert check_is_prefix(log) == 20
+
+
+@pytest.mark.parametrize("first", [bytes(4096), b"\xff" * 4096], ids=["zeros", "ones"])
+def test_sqlite_without_its_first_page_is_read_page_by_page(tmp_path: Path, first: bytes) -> None:
+    """It has the size of pages, the schema and where the tables are; a loss of power leaves zeros there."""
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(400), "sqlite3")
+    file = path / "run.db3"
+    file.write_bytes(first + file.read_bytes()[4096:])
+    log = open_log(path, ROBOT)
+    assert "page by page (its first page is not that of a database)" in warnings_of(log)
+    assert check_is_prefix(log) == 400
+
+
+def test_sqlite_without_its_topics_is_refused(tmp_path: Path) -> None:
+    path = bags.write_ros2_bag(tmp_path / "run", numbered_records(20), "sqlite3")
+    file = path / "run.db3"
+    data = bytearray(file.read_bytes())
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        (page,) = database.execute("SELECT rootpage FROM sqlite_master WHERE name = 'topics'").fetchone()
+    data[:4096] = bytes(4096)
+    data[4096 * (page - 1) : 4096 * page] = bytes(4096)
+    file.write_bytes(data)
+    with pytest.raises(LogError, match="not even its list of topics"):
+        open_log(file, ROBOT)
 
 
 def test_sqlite_write_ahead_log_beside_the_file_is_reported(tmp_path: Path) -> None:

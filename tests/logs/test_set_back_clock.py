@@ -92,3 +92,49 @@ def test_set_back_clock_rows_behind_later_damage_are_kept(tmp_path: Path) -> Non
     assert "page by page" in source.warnings[-1]
     assert len(times) > 2900
     assert (times[-1] - times[0]) / S == pytest.approx(END_S, abs=0.05)
+
+
+def split_bag(folder: Path, parts: list[list[Record]], form: str) -> Path:
+    """A recording of several files, as a recorder splits it, whose metadata.yaml names them in order."""
+    folder.mkdir()
+    names = []
+    for i, part in enumerate(parts):
+        (file,) = (p for p in bags.write_ros2_bag(folder.parent / f"part_{i}", part, form).iterdir() if p.suffix != ".yaml")
+        names.append(f"log_{i}{file.suffix}")
+        file.rename(folder / names[-1])
+    listed = "".join(f"\n  - {name}" for name in names)
+    count = sum(len(part) for part in parts)
+    text = f"rosbag2_bagfile_information:\n  message_count: {count}\n  relative_file_paths:{listed}\n"
+    (folder / "metadata.yaml").write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("back_s", [2.5, 40.0, 9000.0])
+def test_set_back_clock_between_two_files_later_ones_are_moved(tmp_path: Path, form: str, back_s: float) -> None:
+    found = records(back_s)
+    cut = round(150 * SET_AT_S)
+    parts = [found[: cut // 2], found[cut // 2 : cut], found[cut : cut + 600], found[cut + 600 :]]
+    source = open_source(split_bag(tmp_path / "log", parts, form))
+    times = np.array([message.log_ns for message in source.messages(["/imu/data"])])
+    assert len(times) == 3000
+    assert (source.end_ns - source.start_ns) / S == pytest.approx(END_S, abs=0.05)
+    np.testing.assert_allclose(np.diff(times) / S, 0.01, atol=0.011)
+    (warning,) = source.warnings
+    assert f"set back by {back_s:.1f} s, {SET_AT_S:.1f} s after the start" in warning
+
+
+def test_set_back_clock_files_of_one_sensor_each_are_read_side_by_side(tmp_path: Path) -> None:
+    found = records(0.0)
+    parts = [[record for record in found if record[0] == topic] for topic in ("/joint_states", "/imu/data")]
+    source = open_source(split_bag(tmp_path / "log", parts, "mcap"))
+    assert [message.log_ns for message in source.messages(["/imu/data", "/joint_states"])] == sorted(record[2] for record in found)
+    assert source.warnings == []
+
+
+def test_set_back_clock_files_of_topics_one_after_the_other_are_not_moved(tmp_path: Path) -> None:
+    """Sorted by topics, then split in the midst of the second one's messages."""
+    found = sorted(records(0.0), key=lambda record: record[0], reverse=True)
+    source = open_source(split_bag(tmp_path / "log", [found[:2500], found[2500:]], "mcap"))
+    assert [message.log_ns for message in source.messages(["/imu/data", "/joint_states"])] == sorted(record[2] for record in found)
+    assert source.warnings == []
