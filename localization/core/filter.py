@@ -180,12 +180,6 @@ def augment(state: State, name: str, group: Group, mean: FloatArray, cov: FloatA
     return State(Layout({**state.layout.groups, name: group}), {**state.means, name: mean}, P)
 
 
-def marginalize(state: State, name: str) -> State:
-    """The state without the variable ``name``: the marginal distribution of the others."""
-    groups = {other: group for other, group in state.layout.groups.items() if other != name}
-    return State(Layout(groups), {other: state[other] for other in groups}, state.cov(*groups))
-
-
 def inflate(state: State, name: str, cov: FloatArray) -> State:
     """The state whose variable ``name`` is off by an independent error more, with covariance ``cov`` (k, k)."""
     P, rows = state.P.copy(), state.layout.rows[name]

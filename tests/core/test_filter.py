@@ -17,7 +17,6 @@ from localization.core.filter import (
     clone,
     inflate,
     inflate_both,
-    marginalize,
     propagate,
     set_marginal,
     update,
@@ -261,14 +260,6 @@ def test_clone_is_the_variable_as_it_is():
         np.testing.assert_array_equal(cloned.cov("pose", "bias"), state.cov("pose", "bias"))
         np.testing.assert_array_equal(cloned.cross_cov(name, "bias"), state.cross_cov("pose", "bias"))
     assert list(clone(state, "pose", "start").layout.groups) == ["pose", "start", "bias"]
-
-
-def test_marginalize_removes_a_variable_and_its_rows():
-    state = random_state(SE3, np.random.default_rng(7))
-    left = marginalize(clone(state, "pose", "key"), "start")
-    assert list(left.layout.groups) == list(left.means) == ["pose", "bias", "key"]
-    np.testing.assert_array_equal(left.cov("pose", "bias"), state.cov("pose", "bias"))
-    assert len(left.P) == 14
 
 
 def test_augment_inflate_and_set_marginal_change_their_own_rows():

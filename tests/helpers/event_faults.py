@@ -145,8 +145,13 @@ def scale_ranges(factor: float) -> EventFault:
 
 def jitter_scan_stamps(sigma_s: float, seed: int = 0) -> EventFault:
     """Stamps of scans with a normal error of ``sigma_s`` [s] each, as of a driver that takes the time at which it has read a scan."""
-    rng = np.random.default_rng(seed)
-    return change_scans(lambda scan, begin_ns: replace(scan, stamp_ns=scan.stamp_ns + round(1e9 * sigma_s * float(rng.normal()))))
+
+    def apply(events: list[Event]) -> Iterable[Event]:
+        rng = np.random.default_rng(seed)
+        late = change_scans(lambda scan, begin_ns: replace(scan, stamp_ns=scan.stamp_ns + round(1e9 * sigma_s * float(rng.normal()))))
+        return late(events)
+
+    return apply
 
 
 def bump_lidar(degrees: float, part: float = 0.5) -> EventFault:
@@ -179,6 +184,7 @@ def faults_on_the_way() -> dict[str, EventFault]:
         "ranges 3 % long": scale_ranges(1.03),
         "wheels 10 % large": change_wheels(lambda step, part: step * 0.9),
         "scan stamps jitter by 30 ms": jitter_scan_stamps(0.03),
+        "scan stamps jitter by 30 ms, drawn again": jitter_scan_stamps(0.03, 7),
         "LiDAR bumped by 30 deg": bump_lidar(30.0),
         "LiDAR bumped by 90 deg": bump_lidar(90.0),
         "scans repeat for 8 s": lambda events: _repeat_scans(events),

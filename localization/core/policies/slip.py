@@ -18,6 +18,9 @@ simulated rooms with weight 1: 1.6, with 0.2: 1.9; with white slip 4.7 and 4.8).
 
 _MAX_CHANGE_M, _MAX_CHANGE_RAD = 0.1, 0.1
 """Motion in a step and that with the twist before it differ by no more where the robot goes on as before [m, rad]."""
+_MIN_STEP_S = 0.02
+"""Shortest step whose motion shows a twist [s]: LiDARs give up to 40 scans a second. Nearer scans are of two LiDARs, or have stamps that
+jitter, and their motion over the step is error."""
 
 
 class SweepSlip:
@@ -27,7 +30,7 @@ class SweepSlip:
 
     def __init__(self) -> None:
         self._twist, self._slip = np.zeros(3), np.zeros(3)  # of the last step, and less that of the wheels
-        self._is_measured = self._goes_on = False
+        self._is_measured = self._goes_on = self._is_long = False
         self._changes = SlipChanges()
 
     def start_step(self, step: Step) -> tuple[Step, Tangent2]:
@@ -44,9 +47,10 @@ class SweepSlip:
         off = motion - step.duration * self._twist
         is_near = math.hypot(off[0], off[1]) < _MAX_CHANGE_M and abs(off[2]) < _MAX_CHANGE_RAD
         self._goes_on = is_near and bool(match.outlier_cov.any())
+        self._is_long = step.duration >= _MIN_STEP_S
         if step.scan is None or not len(step.scan.offsets):  # all points were measured at once
             return match, match.cov
-        if self._is_measured:  # else the pose at the start was not measured: its error would look like motion
+        if self._is_measured and self._is_long:  # else the error of the pose at the start would look like motion
             slip = motion / step.duration - step.mean_twist
             match = sensor.refine(match, step.twist + slip)
             self._changes.add(slip - self._slip, match.cov, step, sensor.sweep_s)
@@ -55,7 +59,9 @@ class SweepSlip:
     def end_step(self, step: Step, twist: Twist2, is_measured: bool) -> None:
         """The estimated mean ``twist`` (3,) of ``step``; ``is_measured``: by a scan."""
         self._goes_on &= is_measured
-        self._twist, self._slip, self._is_measured = twist, twist - step.mean_twist, is_measured
+        self._is_measured = is_measured
+        if self._is_long or not is_measured:
+            self._twist, self._slip = twist, twist - step.mean_twist
 
 
 class SlipChanges:
@@ -82,9 +88,8 @@ class SlipChanges:
             return
         white = (1.0 - min(sweep_s / step.duration, 1.0) * 2.0 / 3.0) * np.diagonal(step.cov)
         scans = np.diagonal(scan_cov)
-        is_inlier = np.maximum(last**2, self._last**2) < OUTLIER_SIGMAS**2 * (
-            2.0 * white + 6.0 * scans
-        )  # else wheels or scans are outliers
+        limit = OUTLIER_SIGMAS**2 * (2.0 * white + 6.0 * scans)
+        is_inlier = np.maximum(last**2, self._last**2) < limit  # else wheels or scans are outliers
         excess = (-last * self._last - 4.0 * scans) / white
         self._sum = np.where(is_inlier, FORGETTING * self._sum + excess, self._sum)
         self._weight = np.where(is_inlier, FORGETTING * self._weight + 1.0, self._weight)
