@@ -19,21 +19,18 @@ from localization.core.space import (
 )
 from localization.core.state import State
 from localization.core.twist import twist_at_end
-from localization.estimators.estimator import NO_POINTS, Estimate, Estimator
+from localization.estimators.estimator import Estimate, Estimator
 from localization.events import Gravity, Step
-from localization.lidar import MIN_POINTS, KeyScanError, LidarConfig, LostScans, Sweep, choose_voxel_size, key_scan_noise
-from localization.lidar.cloud_map import SYSTEMATIC_COV, CloudMap, thin
+from localization.lidar import LidarConfig, LostScans
+from localization.lidar.cloud_sensor import CloudMatchingSensor
 from localization.lifting import Pose3, aligning
 from motion_models import se3
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray, Points2
-from motion_models.se3 import Transform3
 
 _PLANAR = [0, 1, 5]
 _BIAS_SIGMA = 0.01
 """Sigma of the biases of a gyro's axes that are not zeroed [rad/s]."""
-_MIN_POINTS_MAPPED = 50
-"""Points with a surface in the submap, below which a cloud is lost. The first cloud of a standing robot has surfaces for a sixth of it."""
 
 
 class SpaceFusion(Estimator):
@@ -43,16 +40,11 @@ class SpaceFusion(Estimator):
     """
 
     def __init__(self, gyro: GyroNoise, mounts: Mapping[str, Mount], lidar: LidarConfig, config: SpaceConfig) -> None:
-        self._gyro, self._mounts, self._lidar, self._config = gyro, mounts, lidar, config
+        self._gyro, self._config = gyro, config
         self.state = initial_space_state(gyro, _BIAS_SIGMA, config)
         self._has_vertical = False
-        self._map: CloudMap | None = None
-        self._odom_T_map = np.eye(4)
-        self._cloud: FloatArray | None = None  # of the last step, deskewed, in the body frame
-        self._lidar_position = np.zeros(3)
-        self._cloud_cov: FloatArray | None = None  # (6, 6) of the last match; None before the first one
-        self._last_key: Transform3 | None = None
-        self._lost, self._clock_offset_s = LostScans(), 0.0
+        self._sensor = CloudMatchingSensor(mounts, lidar)
+        self._clock_offset_s = 0.0
         self._counts = dict.fromkeys(("scans", "matched", "standing", "planar"), 0)
 
     @classmethod
@@ -63,7 +55,7 @@ class SpaceFusion(Estimator):
         made = cls(gyro, mounts, lidar, config)
         made.state = start_at(made.state, pose.position, pose.rotation, pose.covariance)
         made._counts = {**planar.counts(), **{name: planar.counts().get(name, 0) for name in made._counts}}
-        made._lost = planar.lost or made._lost
+        made._sensor.lost = planar.lost or made._sensor.lost
         made._clock_offset_s = planar.clock_offset_s
         return made
 
@@ -80,12 +72,12 @@ class SpaceFusion(Estimator):
     @property
     def cloud(self) -> FloatArray | None:
         """(N, 3) of the last step, deskewed and thinned, in the body frame [m]; None where there is none, and after `run_deferred`."""
-        return self._cloud
+        return self._sensor.cloud
 
     @property
     def lidar_position(self) -> FloatArray:
         """(3,) of the last cloud's LiDAR in the body frame [m]."""
-        return self._lidar_position
+        return self._sensor.position
 
     def start_key(self) -> None:
         """Clone the pose as the last keyframe, the variable "key", which all later measurements update as well."""
@@ -108,24 +100,14 @@ class SpaceFusion(Estimator):
 
     def _tilt_map(self, state: State) -> State:
         """Move the submap by its estimated error, a right perturbation of the pose: it shares the pose's error of roll and pitch."""
-        pose = state["pose"]
-        self._odom_T_map = pose @ se3.exp(state["map"]) @ se3.inverse(pose) @ self._odom_T_map
+        self._sensor.move_map(state["pose"], state["map"])
         return State(state.layout, {**state.means, "map": np.zeros(6)}, state.P)
 
     def run_deferred(self) -> bool:
         """The last cloud enters the submap, if it is a key cloud. Deferred until its estimate is out."""
-        cloud, self._cloud = self._cloud, None
-        if cloud is None or self._map is None:
-            return False
-        pose, c = self.state["pose"], self._lidar
-        if self._last_key is not None:
-            moved = se3.log(se3.inverse(self._last_key) @ pose)
-            if math.hypot(*moved[:3]) < c.key_distance_m and math.hypot(*moved[3:]) < c.key_angle_rad:
-                return False
-        self._last_key = pose
-        share, new = self._map.insert(se3.inverse(self._odom_T_map) @ pose, cloud)
-        noise = np.zeros((6, 6)) if self._cloud_cov is None else key_scan_noise(self._cloud_cov, new)
-        self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(share, noise)))
+        error = self._sensor.insert_key_cloud(self.state["pose"])
+        if error is not None:
+            self.state = propagate(self.state, key_scan_transition(self.state, error))
         return False
 
     def _update_cloud(self, step: Step) -> float | None:
@@ -135,36 +117,16 @@ class SpaceFusion(Estimator):
         """
         self._counts["planar"] += step.scan is not None and step.scan.is_planar
         if step.scan is None or step.scan.is_planar or not self._has_vertical:
-            self._lost.add(step.end_ns, "excluded") if step.is_scan_excluded else self._lost.add_no_scan(step.end_ns)
+            self._sensor.add_no_cloud(step.end_ns, is_excluded=step.is_scan_excluded)
             return None
         self._counts["scans"] += 1
-        c = self._lidar
-        mount = self._mounts.get(step.scan.frame_id, Mount())
-        self._lidar_position = np.array([mount.x, mount.y, mount.z])
-        sweep = Sweep.from_scan(step.scan, mount, c.min_range_m, c.max_range_m)
-        if len(sweep.points) < MIN_POINTS:
-            self._lost.add(step.end_ns, "sparse")
+        found = self._sensor.measure(step, self._twist_of(step), self.state["pose"], self.state.difference_cov("pose", "map"))
+        if found is None:
             return None
-        points = sweep.deskew_in_space(self._twist_of(step))
-        if self._map is None:
-            self._map = CloudMap(c.voxel_size_m or choose_voxel_size(points), c.range_noise_m)
-            self._cloud = thin(points, self._map.cell)
-            self._lost.add(step.end_ns)
-            return None
-        self._cloud = thin(points, self._map.cell)
-        prior = se3.inverse(self._odom_T_map) @ self.state["pose"]
-        match = self._map.match(self._cloud, prior, self.state.difference_cov("pose", "map"))
-        if match.mapped < _MIN_POINTS_MAPPED or match.overlap < c.lost_below:
-            self._lost.add(step.end_ns, "lost")
-            return None
-        self._lost.add(step.end_ns)
         self._counts["matched"] += 1
-        cov = match.cov + SYSTEMATIC_COV
-        if self._cloud_cov is None:  # the first cloud errs as this one does
-            self.state = propagate(self.state, key_scan_transition(self.state, KeyScanError(0.0, key_scan_noise(cov, 1.0))))
-        self._cloud_cov = cov
-        measured = self._odom_T_map @ match.measured
-        self.state, innovation = update(self.state, measure_scan(self.state, measured, cov), ("map",))
+        if found.first is not None:
+            self.state = propagate(self.state, key_scan_transition(self.state, found.first))
+        self.state, innovation = update(self.state, measure_scan(self.state, found.measured, found.cov), ("map",))
         return innovation.nis_of(_PLANAR)
 
     def _twist_of(self, step: Step) -> FloatArray:
@@ -197,7 +159,7 @@ class SpaceFusion(Estimator):
     @property
     def lost(self) -> LostScans:
         """Clouds that could not be matched."""
-        return self._lost
+        return self._sensor.lost
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what the filter estimated besides the pose, by name."""
@@ -209,7 +171,7 @@ class SpaceFusion(Estimator):
 
     def counts(self) -> Mapping[str, int]:
         """Number of occurrences by name: scans, matched, and those of lost scans by cause."""
-        return {**self._counts, **self._lost.causes}
+        return {**self._counts, **self._sensor.lost.causes}
 
     def warnings(self) -> list[str]:
         """Warnings about inputs that poses in space need and that are missing, with the remedy."""
@@ -227,7 +189,7 @@ class SpaceFusion(Estimator):
 
     def map_points(self) -> Points2:
         """(M, 2) points of the map projected to the plane [m]."""
-        return NO_POINTS if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
+        return self._sensor.map_points()
 
 
 def _align(state: State, gravity: Gravity) -> State:
