@@ -19,7 +19,7 @@ from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
 from localization.maps.background_search import BackgroundSearcher, PlanarSearch
 from localization.maps.found_places import SAME_COV, FoundPlaces, agree
 from localization.maps.grid import Grid
-from localization.maps.place_probability import LIKELY, NEAR_WEIGHTS, SEARCH_WEIGHTS, PlaceHypothesis, Weights, log_odds, weigh, with_fix
+from localization.maps.place_probability import LIKELY, NEAR_WEIGHTS, PlaceHypothesis, log_odds, weigh, with_fix
 from localization.maps.place_search import CELL_M, Place, PlaceMap
 from localization.maps.position_plane import PositionFix
 from localization.maps.recent_scans import RecentMotion, RecentScans
@@ -72,12 +72,10 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         initial: Pose2 | None = None,
         initial_cov: Cov3 = INITIAL_COV,
         is_background: bool = False,
-        weights: Weights = SEARCH_WEIGHTS,
     ) -> None:
         """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3). With ``is_background``, searches
-        run beside the estimates, and `advance` takes their results when they are due; else `add` returns with them.
-        ``weights`` give the probability of what a search has found."""
-        self.places, self._is_background, self._weights = place_map, is_background, weights
+        run beside the estimates, and `advance` takes their results when they are due; else `add` returns with them."""
+        self.places, self._is_background = place_map, is_background
         self.state: State = "searching"
         self.pose, self._cov = place_map.centre, np.zeros((3, 3))
         self._tracked: TrackedPlace | None = None
@@ -257,7 +255,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         """Take the best place of ``search`` if it is probable and the search before agrees, or if nothing else in the map is like it: then
         the probability is at most `LIKELY` until scans from elsewhere fit."""
         before, moved = self._found, search.moved
-        weighed = weigh(search.result(), search.n_points, self._weights, search.is_by_fix)
+        weighed = weigh(search.result(), search.n_points, is_narrowed=search.is_by_fix)
         places = [replace(place, pose=se2.compose(place.pose, moved)) for place in weighed]
         if not places:
             self._found = FoundPlaces()
