@@ -142,9 +142,8 @@ class Pipeline:
             if self.space_choice is not None and self.space_choice.has_clouds:
                 self.space_choice.add(estimate, self.attitude)
             estimate = self.checks.inflate(step, estimate, self.estimator)
-            if estimate.nis is not None:
-                self.synchronizer.restart_gap()
-            self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
+            is_measured = estimate.nis is not None
+            self.synchronizer.feed_back(self.estimator.params, self.estimator.clock_offset_s, is_pose_measured=is_measured)
             if step.duration > 0.0:
                 self.wheel_twist = step.twist if step.has_wheels else None
             yield estimate  # publish
@@ -157,7 +156,7 @@ class Pipeline:
         does it first."""
         self.checks.examine(self.estimator)
         if self.estimator.run_deferred():
-            self.synchronizer.set_calibration(self.estimator.params, self.estimator.clock_offset_s)
+            self.synchronizer.feed_back(self.estimator.params, self.estimator.clock_offset_s)
 
     def finish(self) -> list[Estimate]:
         """The estimates that still waited for events when these ended."""

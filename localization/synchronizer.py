@@ -74,18 +74,17 @@ class Synchronizer:
         self._now_ns = -(1 << 62)  # newest stamp of all events
         self._clock_offset_ns = 0
 
-    def set_calibration(self, params: FloatArray | None, clock_offset_s: float) -> None:
-        """Use ``params`` (k,) of the motion model (None: unchanged) and the wheels' clock offset from the next step on.
+    def feed_back(self, params: FloatArray | None, clock_offset_s: float, *, is_pose_measured: bool = False) -> None:
+        """Use what the estimator has found from the next step on: ``params`` (k,) of the motion model (None: unchanged), and by how much
+        the wheels' stamps are late, ``clock_offset_s`` [s]: what happened at t is stamped t + offset.
 
-        ``clock_offset_s``: the wheels' stamps are late by this much [s]; what happened at t is stamped t + offset.
+        Where a matched scan has measured the pose, an unknown velocity in a gap of the wheel data acts only from here on.
         """
         if params is not None:
             self.wheels.params = params
         self._clock_offset_ns = round(clock_offset_s * 1e9)
-
-    def restart_gap(self) -> None:
-        """Restart the gap in the wheel data: a matched scan measured the pose, so the unknown velocity acts only from here on."""
-        self._velocity.lasted_s = 0.0
+        if is_pose_measured:
+            self._velocity.lasted_s = 0.0
 
     def insert(self, event: Event) -> None:
         """Store ``event`` in the buffer of its sensor."""

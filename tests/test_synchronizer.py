@@ -370,12 +370,12 @@ def test_missing_wheels_with_gyro_give_its_turn_rate():
         assert np.sqrt(step.predicted.cov[2, 2]) == pytest.approx(StepConfig().lost_rate_rad_s * step.duration)
 
 
-def test_restart_gap_after_each_scan_makes_steps_independent():
+def test_pose_measured_by_each_scan_makes_steps_in_a_gap_independent():
     cutter = stepper()
     found = []
     for event in in_order(wheels(2.0), [scan(0.1 * i) for i in range(1, 60)]):
         found += steps_after(event, cutter)
-        cutter.restart_gap()  # as if each scan was matched
+        cutter.feed_back(None, 0.0, is_pose_measured=True)  # as if each scan was matched
     deaf = [s for s in found if s.start_ns >= T0 + 2600 * MS]
     assert len(deaf) > 20
     for step in deaf:
@@ -427,7 +427,7 @@ def test_d_clock_is_the_derivative_of_the_motion_by_the_shift(wheel_hz):
 
     def shifted(offset):
         cutter = stepper()
-        cutter.set_calibration(None, offset)
+        cutter.feed_back(None, offset)
         return list(steps(events, cutter))
 
     found, less, more = shifted(0.0), shifted(-h), shifted(h)
@@ -509,7 +509,7 @@ def test_clock_offset_shifts_the_wheels_window(late_s):
     scans = [scan(0.5 + 0.1 * i) for i in range(20)]
     expected, _ = cut(in_order(true, scans))
     cutter = stepper()
-    cutter.set_calibration(None, late_s)
+    cutter.feed_back(None, late_s)
     found = list(steps(in_order(late, scans), cutter))
     uncorrected, _ = cut(in_order(late, scans))
     scanned = [[s.predicted.delta for s in steps_ if s.scan is not None] for steps_ in (expected, found, uncorrected)]
@@ -521,7 +521,7 @@ def test_clock_offset_shifts_the_wheels_window(late_s):
 def test_clock_offset_makes_no_scan_late(late_s):
     """Wheels that are stamped much too early must not take the time past a scan that has not come yet."""
     cutter = stepper()
-    cutter.set_calibration(None, late_s)
+    cutter.feed_back(None, late_s)
     scans = [scan(0.5 + 0.3 * i) for i in range(20)]
     found = list(steps(in_order(wheels(8.0), scans), cutter))
     assert [s.scan for s in found if s.scan is not None] == scans
@@ -535,7 +535,7 @@ def test_d_clock_equals_numeric_differences(model):
     by_offset = {}
     for offset in (-h, 0.0, h):
         cutter = stepper(model=model)
-        cutter.set_calibration(None, offset)
+        cutter.feed_back(None, offset)
         by_offset[offset] = list(steps(in_order(samples, [scan(0.525), scan(0.875), scan(1.325)]), cutter))[1:3]
     for minus, at, plus in zip(*(by_offset[o] for o in (-h, 0.0, h)), strict=True):
         numerical = se2.log(se2.between(minus.predicted.delta, plus.predicted.delta)) / (2.0 * h)
@@ -581,16 +581,16 @@ def test_twist_of_first_scan_is_that_of_its_moment(scan_s):
     np.testing.assert_allclose(first.twist, model.twist(np.array([3.0, 3.5]), np.zeros(2), model.nominal).value, atol=1e-9)
 
 
-def test_set_calibration_holds_from_the_next_step():
+def test_feed_back_holds_from_the_next_step():
     cutter = stepper(model="diff_drive", has_lidar=False)
     other = make_model("diff_drive", ROBOT).nominal * [1.1, 1.3]
     found = []
     for event in wheels(2.0):
         for step in steps_after(event, cutter):
-            cutter.set_calibration(other, 0.0)
+            cutter.feed_back(other, 0.0)
             found.append(step)
     before, after = stepper(model="diff_drive", has_lidar=False), stepper(model="diff_drive", has_lidar=False)
-    after.set_calibration(other, 0.0)
+    after.feed_back(other, 0.0)
     expected = list(steps(wheels(2.0), before))[:1] + list(steps(wheels(2.0), after))[1:]
     for one, two in zip(found, expected, strict=False):
         np.testing.assert_array_equal(one.predicted.delta, two.predicted.delta)

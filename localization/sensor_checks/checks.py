@@ -84,7 +84,7 @@ class SensorChecks:
         if self._is_acting or contradicts:
             estimate = self._examine_records(estimator) or estimate
         path = self._faults.path
-        return path.widen(estimate, pose) if path.late_s or path.scale or path.turned_about_m is not None else estimate
+        return path.widen(estimate, pose) if path.is_any else estimate
 
     def examine(self, estimator: Estimator, *, is_last: bool = False) -> None:
         """Examine the steps that ``estimator`` has published, once there are enough, or none ``is_last``."""

@@ -6,6 +6,7 @@ the one that is off, what is published for t is the pose at t - late: an error o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from localization.estimators import Estimator
@@ -36,14 +37,16 @@ class ClockCheck:
     def __init__(self, faults: FaultLog, sigma_s: float) -> None:
         """``sigma_s``: by how much the clock of the poses may be off, whatever the drive shows [s]."""
         self._faults, self._sigma_s = faults, sigma_s
-        self._faults.path.late_s = sigma_s
+        faults.path = replace(faults.path, late_s=sigma_s)
         self._reported_s = 0.0
 
     def add(self, estimator: Estimator) -> None:
         """Take the clock offset after a step."""
         apart = estimator.clocks_apart
         late_s = 0.0 if apart is None else round(apart.late_s, 2)
-        self._faults.path.late_s = max(self._sigma_s, abs(late_s))
+        unsure_s = max(self._sigma_s, abs(late_s))
+        if unsure_s != self._faults.path.late_s:
+            self._faults.path = replace(self._faults.path, late_s=unsure_s)
         if apart is None or apart.is_latency or late_s == self._reported_s:
             return
         self._reported_s = late_s

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,16 +23,21 @@ def lever_of_unknown_front(robot: Robot | None, mounts: Mapping[str, Mount]) -> 
     return max((abs(mount.x) for mount in mounts.values()), default=0.0)
 
 
+@dataclass(frozen=True)
 class PathUncertainty:
     """`widen` each estimate. No step is changed by it, and no sensor is left out."""
 
-    def __init__(self, turned_about_m: float | None = None) -> None:
-        """``turned_about_m``: `lever_of_unknown_front`."""
-        self.turned_about_m = turned_about_m
-        self.late_s = 0.0
-        """By how much the clock of the poses may be off [s]."""
-        self.scale = 0.0
-        """Share by which the path may be too long or too short."""
+    turned_about_m: float | None = None
+    """`lever_of_unknown_front`."""
+    late_s: float = 0.0
+    """By how much the clock of the poses may be off [s]."""
+    scale: float = 0.0
+    """Share by which the path may be too long or too short."""
+
+    @cached_property
+    def is_any(self) -> bool:
+        """Whether anything is unsure of all of the path."""
+        return bool(self.late_s or self.scale) or self.turned_about_m is not None
 
     def widen(self, estimate: Estimate, pose: Pose2) -> Estimate:
         """``estimate`` with this covariance; ``pose`` (3,) since the start by sensors alone."""
@@ -39,7 +46,7 @@ class PathUncertainty:
 
     def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the covariance as it is at its end."""
-        if smoothed.covariances is None:
+        if smoothed.covariances is None or not self.is_any:
             return smoothed
         covariances = smoothed.covariances.copy()
         if self.late_s:

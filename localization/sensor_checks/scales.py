@@ -12,6 +12,7 @@ variance of m. From `_MIN_PRIOR_SIGMAS` on, m is too large for an error of the w
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from localization.estimators import LearnedParameter
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
@@ -42,7 +43,7 @@ class ScaleCheck:
     def compare(self, radius: LearnedParameter) -> None:
         """Take the wheels' ``radius`` as it is learned."""
         if self._faults.declared and any(fault in self._faults.declared for fault in NAMED[LIDAR_WHEELS_WAYS]):
-            self._faults.path.scale = 0.0
+            self._faults.path = replace(self._faults.path, scale=0.0)
             self._faults.retract(SCALES_APART)
             return
         share = 1.0 - (radius.sigma / radius.prior_sigma) ** 2  # of its information, by scans
@@ -52,7 +53,8 @@ class ScaleCheck:
         self._most = min(self._most, abs(off) + 2.0 * sigma)
         scale = min(abs(off), self._most)
         is_off = max(_MIN_PRIOR_SIGMAS * radius.prior_sigma, _MIN_SIGMAS * sigma) < scale < _MAX_SCALE
-        self._faults.path.scale = scale if is_off else _error_of_ranges(share * scale, radius)
+        error = scale if is_off else _error_of_ranges(share * scale, radius)
+        self._faults.path = replace(self._faults.path, scale=error)
         if is_off and scale > _MIN_REPORTED_SIGMAS * sigma and round(scale, 2) != self._reported:
             self._reported = round(scale, 2)
             words = ("longer", "long", "larger") if off > 0.0 else ("shorter", "short", "smaller")

@@ -107,7 +107,7 @@ def scan_at(t):
 def drive(seconds, turned, clock=0.0, params=None, hz=20.0):
     """Steps of 0.1 s from the stepper itself, for wheel angles ``turned(t)``."""
     cutter = Synchronizer(MODEL, ROBOT, {}, True)
-    cutter.set_calibration(MODEL.nominal if params is None else params, clock)
+    cutter.feed_back(MODEL.nominal if params is None else params, clock)
     wheels = [
         WheelSample(T0 + round(i / hz * S), np.full(2, np.nan), np.array(turned(i / hz), float)) for i in range(round(seconds * hz) + 20)
     ]

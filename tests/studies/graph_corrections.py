@@ -119,7 +119,7 @@ def drift(drive: Laps, model_name: str, form: Form, kind: str = "ekf", seed: int
                 measured = se2.compose(se2.between(start, now), se2.exp(SIGMAS * rng.normal(size=3)))
                 sensor.next = match_at(measured, np.diag(SIGMAS**2))
             estimator.step(step)
-            stepper.set_calibration(estimator.params, estimator.clock_offset_s)
+            stepper.feed_back(estimator.params, estimator.clock_offset_s)
             stamps.append(step.end_ns)
             poses.append(pose)
             params.append(estimator.params)
@@ -152,7 +152,7 @@ def husky() -> None:
                     pose = se2.compose(pose, step.predicted.delta)
                     found[step.end_ns] = pose
                     pipeline.estimator.step(step)
-                    pipeline.synchronizer.set_calibration(pipeline.estimator.params, pipeline.estimator.clock_offset_s)
+                    pipeline.synchronizer.feed_back(pipeline.estimator.params, pipeline.estimator.clock_offset_s)
             odometry = Trajectory(np.array(list(found)), np.array(list(found.values())))
             print(f"{name:12} {form:10} {evaluate(odometry, reference).ate_rmse_m:8.2f}", flush=True)
 
