@@ -1,12 +1,15 @@
 """The league without its peers: what they are given, and the page."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from motion_models import se2
 from tests.league import page
 from tests.league.logs import find_logs, peer_arrays
-from tests.league.peers.exchange import Drive, matrix, planar
+from tests.league.peers.exchange import Drive, matrix, peak_memory_mb, planar
 from tests.league.systems import SYSTEMS
 
 
@@ -53,5 +56,15 @@ def test_page_names_the_least_error_and_what_failed(tmp_path):
     page.write(rows, SYSTEMS, tmp_path)
     text = (tmp_path / "league.html").read_text()
     assert "Least error: &lt;peer&gt;, 0.100 m." in text
+    assert "Ahead of every estimator of skidloc (0.200) in ATE (relations: mean error) [m]: &lt;peer&gt; 0.100." in text
+    assert ") in RPE" not in text
     assert "No module named &#x27;genz_icp&#x27;" in text
     assert text.count("class=best") == 2
+
+
+def test_memory_of_a_process_is_its_own():
+    """`getrusage` would give that of the process that started it."""
+    block = np.ones(40_000_000)
+    code = "from tests.league.peers.exchange import peak_memory_mb; print(peak_memory_mb())"
+    child = float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+    assert child < peak_memory_mb() - 0.5 * block.nbytes / 2**20

@@ -3,7 +3,8 @@
 python -m tests.league [--log fr079,csail,aces] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
 
 Peers are installed into .league/, an environment of their own, from tests/league/requirements.txt; what cannot be installed or crashes
-is a row that says so. What has been run is kept in the output folder and is not run again: delete a file to run it anew. The page
+is a row that says so, and is tried again by the next run. What has been run is kept in the output folder and is not run again: delete a
+file to run it anew. All of it takes some ten minutes. MRPT is of Debian (`apt install mrpt-apps mrpt-common`). The page
 league.html has tables, plots and settings; league.json the numbers. CPU seconds are those of the estimate alone, of all its threads,
 without reading the log. `--folder` adds NAME.mcap with NAME.toml and a reference NAME.tum, .csv, .txt or .relations beside it.
 """
@@ -33,15 +34,22 @@ _TIMEOUT_S = 3600.0
 
 
 def prepare_environment() -> None:
-    """Make the peers' environment, each package by itself, so that one that cannot be had leaves the others."""
-    ready = _ENVIRONMENT / "ready"
-    if ready.exists():
-        return
-    subprocess.run([sys.executable, "-m", "venv", str(_ENVIRONMENT)], check=True)
+    """Make the peers' environment, each package by itself, so that the others stay without one; the next run tries that again."""
+    if not _python().exists():
+        subprocess.run([sys.executable, "-m", "venv", str(_ENVIRONMENT)], check=True)
+    ready = _ENVIRONMENT / "ready.txt"
+    installed = ready.read_text().split() if ready.exists() else []
     for line in (Path(__file__).parent / "requirements.txt").read_text().split():
+        if line in installed:
+            continue
         print(f"installing {line}", flush=True)
-        subprocess.run([str(_python()), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", line], check=False)
-    ready.touch()
+        command = [str(_python()), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", line]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode == 0:
+            installed.append(line)
+            ready.write_text("\n".join(installed))
+        else:
+            print(f"not installed: {(done.stderr.strip().splitlines() or ['pip ended without a word'])[-1]}", flush=True)
 
 
 def _python() -> Path:
@@ -50,11 +58,9 @@ def _python() -> Path:
 
 def run_system(system: System, log: str, out: Path, folder: Path | None) -> str:
     """Run ``system`` on ``log`` unless its result is there. Returns why it failed, or an empty string."""
-    target, failure = out / log / system.name, out / log / f"{system.name}.failed"
+    target = out / log / system.name
     if target.with_name(f"{system.name}.json").exists():
         return ""
-    if failure.exists():
-        return failure.read_text()
     if system.peer:
         command = [str(_python()), str(PEERS / f"{system.peer}.py"), str(out / log / "drive.npz"), str(target)]
     else:
@@ -70,12 +76,9 @@ def run_system(system: System, log: str, out: Path, folder: Path | None) -> str:
         ]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
-        reason = "" if done.returncode == 0 else (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
     except subprocess.TimeoutExpired:
-        reason = f"not finished after {_TIMEOUT_S:.0f} s"
-    if reason:
-        failure.write_text(reason)
-    return reason
+        return f"not finished after {_TIMEOUT_S:.0f} s"
+    return "" if done.returncode == 0 else (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
 
 
 def write_reference(drive: Drive, path: Path) -> None:

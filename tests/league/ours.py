@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import resource
 import sys
 import time
 from pathlib import Path
 
-import numpy as np
-
-from localization.trajectory import Trajectory
 from tests.league.logs import find_logs
+from tests.league.peers.exchange import write
 
 _WARM_UP_S = 20.0
 
@@ -23,16 +19,9 @@ def main(log: str, estimator: str, matcher: str, out: str, folder: str = "") -> 
     begin = time.process_time()
     run = drive.run(estimator, matcher=matcher)
     seconds = time.process_time() - begin
-    _write(Path(f"{out}.npz"), run.trajectory)
     if run.live is not None:
-        _write(Path(f"{out} live.npz"), run.live)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    Path(f"{out}.json").write_text(json.dumps({"cpu_s": seconds, "memory_mb": memory}))
-
-
-def _write(path: Path, trajectory: Trajectory) -> None:
-    covariances = {} if trajectory.covariances is None else {"covariances": trajectory.covariances}
-    np.savez_compressed(path, stamps_ns=trajectory.stamps_ns, poses=trajectory.poses, **covariances)
+        write(f"{out} live", run.live.stamps_ns, run.live.poses, seconds, run.live.covariances)
+    write(out, run.trajectory.stamps_ns, run.trajectory.poses, seconds, run.trajectory.covariances)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1000px; margin: 2em auto; padding: 0 1em; color-scheme: light dark }
 table { border-collapse: collapse; width: 100% }
 th, td { padding: .3em .6em; text-align: right; border-bottom: 1px solid #8885 }
-th:first-child, td:first-child { text-align: left }
+th:first-child, td:first-child { text-align: left; white-space: nowrap }
 .best { font-weight: bold }
 .scroll { overflow-x: auto }
 svg { max-width: 100%; height: auto; background: #fff }
@@ -51,10 +51,27 @@ def _log_section(log: str, rows: Sequence[Mapping[str, Any]]) -> str:
     best = {key: min((row[key] for row in scored), default=0.0) for key in ("ate_m", "rpe_m")}
     head = "".join(f"<th>{html.escape(title)}</th>" for title, _ in _COLUMNS.values())
     body = "".join(_table_row(row, best) for row in rows)
-    first = min(scored, key=lambda row: row["ate_m"], default=None)
-    sentence = f"<p>Least error: {html.escape(first['system'])}, {first['ate_m']:.3f} m.</p>" if first else ""
+    sentence = f"<p>{html.escape(_summary(scored))}</p>" if scored else ""
     plot = svg(f"league-{log}", 9.0, 4.5, lambda figure: _draw(figure.subplots(), scored))
     return f"<h2>{html.escape(log)}</h2>{sentence}<div class=scroll><table><tr><th>system</th>{head}</tr>{body}</table></div>{plot}"
+
+
+def _summary(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Which system has the least error, and where a peer is ahead of every row of skidloc."""
+    first = min(rows, key=lambda row: row["ate_m"])
+    parts = [f"Least error: {first['system']}, {first['ate_m']:.3f} m."]
+    ours, peers = ([row for row in rows if _is_ours(row) == is_ours and row["system"] != "wheels"] for is_ours in (True, False))
+    for key, (title, form) in _COLUMNS.items():
+        own = min((row[key] for row in ours if key in row), default=None)
+        if key == "anees" or own is None:
+            continue
+        if ahead := [f"{row['system']} {form.format(row[key])}" for row in peers if row.get(key, own) < own]:
+            parts.append(f"Ahead of every estimator of skidloc ({form.format(own)}) in {title}: {', '.join(ahead)}.")
+    return " ".join(parts)
+
+
+def _is_ours(row: Mapping[str, Any]) -> bool:
+    return str(row["system"]).startswith("skidloc")
 
 
 def _table_row(row: Mapping[str, Any], best: Mapping[str, float]) -> str:
@@ -70,9 +87,9 @@ def _table_row(row: Mapping[str, Any], best: Mapping[str, float]) -> str:
 
 def _draw(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     names = [row["system"] for row in rows][::-1]
-    axes.barh(names, [row["ate_m"] for row in rows][::-1], color=["#2a6f97" if name.startswith("skidloc") else "#b0b0b0" for name in names])
+    axes.barh(names, [row["ate_m"] for row in rows][::-1], color=["#2a6f97" if _is_ours(row) else "#b0b0b0" for row in rows[::-1]])
     axes.set_xscale("log")
     axes.set_xlabel("error [m], logarithmic")
     for index, row in enumerate(rows[::-1]):
-        axes.annotate(f" {row['ate_m']:.3f}", (row["ate_m"], index), va="center")
+        axes.annotate(f"{row['ate_m']:.3f}", (row["ate_m"], index), (4, 0), textcoords="offset points", va="center")
     axes.margins(x=0.15)

@@ -25,6 +25,11 @@ class System:
 
 SYSTEMS: Sequence[System] = (
     System("wheels", "wheel odometry, diff_drive", estimator="odometry"),
+    System(
+        "robot_localization (equations)",
+        "wheels: vx, vy, vyaw; its EKF and default settings written in numpy, as the package is not on the index",
+        peer="robot_localization",
+    ),
     System("skidloc ekf", "wheels and LiDAR, live", estimator="ekf"),
     System("skidloc graph", "wheels and LiDAR, live and smoothed", estimator="graph"),
     System("skidloc ekf with KISS-ICP", "wheels and LiDAR, live, KISS-ICP as matcher", estimator="ekf", matcher="kiss"),

@@ -82,12 +82,30 @@ def planar(T: FloatArray) -> FloatArray:
 
 def run(register: Callable[[Drive], FloatArray]) -> None:
     """Command line of a peer: ``python peer.py drive.npz OUT`` writes OUT.npz, poses of the body, and OUT.json, CPU [s] and memory [MB]."""
-    drive, out = Drive.load(Path(sys.argv[1])), sys.argv[2]
+    drive, out = arguments()
     begin = sum(os.times()[:4])
     lidar_poses = register(drive)
     seconds = sum(os.times()[:4]) - begin  # user and system, of this process and of programs that it ran
     body_T_lidar = matrix(drive.body_T_lidar)
     body = planar(body_T_lidar @ matrix(lidar_poses) @ np.linalg.inv(body_T_lidar))
-    np.savez_compressed(f"{out}.npz", stamps_ns=drive.stamps_ns, poses=body)
-    memory = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
-    Path(f"{out}.json").write_text(json.dumps({"cpu_s": seconds, "memory_mb": memory}))
+    write(out, drive.stamps_ns, body, seconds)
+
+
+def arguments() -> tuple[Drive, str]:
+    """The drive and OUT of the command line."""
+    return Drive.load(Path(sys.argv[1])), sys.argv[2]
+
+
+def write(out: str, stamps_ns: NDArray[np.int64], poses: FloatArray, cpu_s: float, covariances: FloatArray | None = None) -> None:
+    """Write poses of the body (N, 3), covariances (N, 3, 3) of their right perturbations where there are any, and the cost."""
+    more = {} if covariances is None else {"covariances": covariances}
+    np.savez_compressed(f"{out}.npz", stamps_ns=stamps_ns, poses=poses, **more)
+    Path(f"{out}.json").write_text(json.dumps({"cpu_s": cpu_s, "memory_mb": peak_memory_mb()}))
+
+
+def peak_memory_mb() -> float:
+    """Greatest resident memory of this process, or of a program that it ran [MB]. (`getrusage` of a process itself begins with the memory
+    of the process that started it.)"""
+    status = Path("/proc/self/status").read_text()
+    own_kb = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM"))
+    return max(own_kb, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss) / 1024
