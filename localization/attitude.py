@@ -22,6 +22,7 @@ from localization.ground_tilt import GroundTilt
 from localization.small_filters import propagate_in_place, update_in_place
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
+from motion_models.linear_equations import assign
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY
@@ -289,7 +290,7 @@ def _take(stamps: IntArray, samples: FloatArray, n: int, end_ns: int, mean: Floa
             mean[j] += samples[i, j] / used
     for i in range(used, n):
         stamps[i - used] = stamps[i]
-        samples[i - used] = samples[i]
+        assign(samples[i - used], samples[i])
     return n - used, last_ns
 
 

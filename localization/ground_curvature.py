@@ -15,8 +15,10 @@ import math
 
 import numpy as np
 
+from localization.small_filters import propagate_in_place, update_in_place
 from motion_models.compiled import kernel
-from motion_models.se2 import FloatArray
+from motion_models.linear_equations import multiply
+from motion_models.se2 import FloatArray, triple
 
 _LENGTH_M = 3.0
 """Way over which slope and curvature of hills change: a quarter of waves of 12 m."""
@@ -57,16 +59,14 @@ def _advance(
     c, s = math.cos(turn), math.sin(turn)
     kept = math.exp(-abs(way) / _LENGTH_M)
     F = kept * np.array([[c * c, 2.0 * c * s, s * s], [-c * s, c * c - s * s, c * s], [s * s, -2.0 * c * s, c * c]])
-    state[:] = F @ state
-    cov[:] = F @ cov @ F.T + (1.0 - kept * kept) * _PRIOR
+    state[0], state[1], state[2] = multiply(F, triple(state))
+    propagate_in_place(F, cov)
+    for i in range(3):
+        for j in range(3):
+            cov[i, j] += (1.0 - kept * kept) * _PRIOR[i, j]
     # In the axes at the end: dg = H R^T (way, 0), and downhill is -g
     x, y = way * c, -way * s
     change = (c * before[0] + s * before[1] - after[0], c * before[1] - s * before[0] - after[1])
-    rows = np.array([[x, y, 0.0], [0.0, x, y]])
+    rows, gain = np.array([[x, y, 0.0], [0.0, x, y]]), np.empty(3)
     for i in range(2):
-        H = rows[i]
-        PH = cov @ H
-        S = H @ PH + variance + _BUMPS * _BUMPS * abs(way)
-        K = PH / S
-        state[:] = state + K * (change[i] - H @ state)
-        cov[:] = cov - np.outer(K, PH)
+        update_in_place(state, cov, rows[i], change[i], variance + _BUMPS * _BUMPS * abs(way), gain)

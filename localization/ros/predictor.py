@@ -14,6 +14,7 @@ from localization.events import Turn
 from localization.wheel_buffer import WheelBuffer
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel, subroutine
+from motion_models.linear_equations import assign
 from motion_models.motion import Motion
 from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import Robot
@@ -133,7 +134,8 @@ def _predict(
     integrate(dt, twists, np.empty((n, 3, 0)), noise, delta, cov, np.empty((3, 0)))
     way, J = np.array(scalar_log(triple(delta))), np.empty((3, 3))
     fill_right_jacobian_inverse(triple(way), J)
-    twist_cov[:] = TWIST_FLOOR
+    for i in range(3):
+        assign(twist_cov[i], TWIST_FLOOR[i])
     _add_transformed(J, cov, min(duration / SLIP_LASTS_S, 1.0) / duration**2, twist_cov)
     for i in range(3):
         twist[i] = twists[n - 1, i]
@@ -187,7 +189,8 @@ def _move(pose: FloatArray, cov: FloatArray, delta: FloatArray, Q: FloatArray, t
     A = np.empty((3, 3))
     fill_inverse_adjoint(triple(delta), A)
     there[0], there[1], there[2] = scalar_compose(triple(pose), triple(delta))
-    there_cov[:] = Q
+    for i in range(3):
+        assign(there_cov[i], Q[i])
     _add_transformed(A, cov, 1.0, there_cov)
 
 
