@@ -42,7 +42,7 @@ from tests.benchmarks.online_soak import soak
 from tests.studies.buildings import BUILDINGS
 
 BEAMS = 760
-_DASHBOARD_S, _PARTS_S = 40.0, 45.0
+_DASHBOARD_S, _PARTS_S = 40.0, 25.0
 _READER = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1]).read()"
 _SETTLED_S = 3.0
 """What is heard at the start, before the first estimate, comes all at once."""
@@ -289,7 +289,7 @@ def parts() -> None:
         folder = Path(name)
         path, paced, quick = write_laps(folder / "laps.mcap"), PartTimes(), PartTimes()
         peer = start_peer(path, _DOMAIN)
-        of_robot = over_dds_by_parts(folder, _PARTS_S, int(_DOMAIN), lambda: play(peer, round(_PARTS_S) + 15), paced)
+        of_robot = over_dds_by_parts(folder, _PARTS_S, int(_DOMAIN), lambda: play(peer, round(2.0 * _PARTS_S) + 15), paced)
         peer.terminate()
         peer.communicate()
         (folder / "state").unlink()

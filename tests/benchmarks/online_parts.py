@@ -129,7 +129,8 @@ def live_run(folder: Path) -> LiveRun:
 
 
 def over_dds(folder: Path, seconds: float, domain: int, begin: Callable[[], None], times: PartTimes) -> tuple[float, float]:
-    """The part of a core of this process, and the time that counts [s]; ``begin`` makes the robot play."""
+    """The part of a core of this process in the first ``seconds``, and the time of its parts, of the next ones [s]: to measure parts takes
+    time itself. ``begin`` makes the robot play."""
     from localization.ros.transports.dds import DdsTransport
 
     transport, run = DdsTransport(domain), live_run(folder)
@@ -137,15 +138,17 @@ def over_dds(folder: Path, seconds: float, domain: int, begin: Callable[[], None
     node = Node.start(transport, run, print)
     start = time.monotonic()
     node.spin(lambda: time.monotonic() > start + _SETTLED_S)
-    times.clear()
     cpu, start = time.process_time(), time.monotonic()
+    node.spin(lambda: time.monotonic() > start + seconds)
+    share = (time.process_time() - cpu) / (time.monotonic() - start)
+    times.clear()
+    start = time.monotonic()
     with watched(DdsTransport, times):
         node.spin(lambda: time.monotonic() > start + seconds)
     took = time.monotonic() - start
-    cpu = time.process_time() - cpu
     node.finish()
     transport.close()
-    return cpu / took, took
+    return share, took
 
 
 def one_after_the_other(path: Path, folder: Path, times: PartTimes) -> tuple[float, float]:
