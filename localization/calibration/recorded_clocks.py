@@ -38,7 +38,9 @@ class RecordedClock:
 
 
 @dataclass(frozen=True)
-class _Suspect:
+class Suspect:
+    """A clock that may be the one that is off."""
+
     sensor: str
     """As the entries of `Clock` have it."""
     topic: str
@@ -56,7 +58,7 @@ def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSi
     ``signals``: of ``log``; ``turn``: (n,) by the wheels, up to a scale.
     """
     undecided = None
-    for suspect in _suspects(log):
+    for suspect in find_suspects(log):
         clock = replace(log.robot.clock, **{suspect.key: suspect.value})
         corrected = open_log(log.path, replace(log.robot, clock=clock), log.overrides)
         after_signals = read_signals(corrected)
@@ -87,7 +89,8 @@ def find_recorded_clock(log: Log, signals: WheelSignals, turn: Callable[[WheelSi
     return RecordedClock(replace(log.robot, clock=replace(log.robot.clock, sigma_s=late_s)), text, {})
 
 
-def _suspects(log: Log) -> Iterator[_Suspect]:
+def find_suspects(log: Log) -> Iterator[Suspect]:
+    """Clocks of sensors that are late, or run at another rate, against the times of recording."""
     sensors = {source.topic: CLOCKS[source.kind] for source in log.sources.used() if source.kind in CLOCKS}
     clock = log.robot.clock
     if len({*sensors.values()}) < 2:
@@ -98,7 +101,7 @@ def _suspects(log: Log) -> Iterator[_Suspect]:
         key = f"{sensors[topic]}_rate_error"
         value = round(getattr(clock, key) + rate, 5)
         way = "faster" if rate > 0.0 else "slower"
-        yield _Suspect(sensors[topic], topic, key, value, f"its stamps run {abs(rate):.2%} {way} than the times of recording")
+        yield Suspect(sensors[topic], topic, key, value, f"its stamps run {abs(rate):.2%} {way} than the times of recording")
     least = _MIN_OFF_OF_THREE_S if len({*sensors.values()}) > 2 else _MIN_OFF_S
     behind = {topic: late for topic, late in log.behind_s.items() if topic in sensors}
     for topic, late in behind.items():
@@ -110,10 +113,10 @@ def _suspects(log: Log) -> Iterator[_Suspect]:
         way = "behind" if late > 0.0 else "ahead of"
         off = f"those of the other sensors at most {max(others):.2f} s off them"
         why = f"its stamps are {abs(late):.2f} s {way} the times of recording, {off}"
-        yield _Suspect(sensors[topic], topic, key, value, why)
+        yield Suspect(sensors[topic], topic, key, value, why)
 
 
-def _agreement(log: Log, signals: WheelSignals, suspect: _Suspect, turn: Callable[[WheelSignals], FloatArray]) -> float | None:
+def _agreement(log: Log, signals: WheelSignals, suspect: Suspect, turn: Callable[[WheelSignals], FloatArray]) -> float | None:
     """Correlation of turns by the wheels with those of the gyro, or of the LiDAR where it is in question or there is no gyro."""
     if suspect.sensor == "lidar" or "gyro" not in signals.turns:
         signals = with_lidar(log, signals)

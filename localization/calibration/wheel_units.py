@@ -109,7 +109,7 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
 
 def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot) -> UnitReport:
     """Unit of the lengths of a driver's odometry, whose forward speed is ``speed`` (n,), by the speed (n,) of another sensor [m/s]."""
-    ratio = None if other is None else _ratio(speed, _without_outliers(speed, other))
+    ratio = None if other is None else _ratio(speed, without_outliers(speed, other))
     if ratio is None or 1 / MAX_RATIO <= ratio <= MAX_RATIO:
         return UnitReport(robot)
     value = ratio * robot.driver.length_unit_m
@@ -125,7 +125,7 @@ def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot)
     return UnitReport(robot, (text,), {"driver.length_unit_m": f"{exact:g}"})
 
 
-def _without_outliers(speed: FloatArray, other: FloatArray) -> FloatArray:
+def without_outliers(speed: FloatArray, other: FloatArray) -> FloatArray:
     """``other`` (n,), NaN where it is far from the usual multiple of ``speed`` (n,): scans that were matched to the wrong place."""
     fast = np.abs(speed) > 0.5 * np.nanpercentile(np.abs(speed), 95.0)
     ratios = other[fast] / speed[fast]

@@ -152,7 +152,7 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
         return _joined(found, check_wiring(open_log(log.path, clock.robot, log.overrides), is_clock_known=True))
     if not signals.joints:
         return _check_odometry(log, signals, is_clock_known)
-    dead = _without_dead(log.robot, signals)
+    dead = without_dead(log.robot, signals)
     if dead is not None:
         return _joined(dead, check_wiring(open_log(log.path, dead.robot, log.overrides), is_clock_known))
     signals, found = _wiring_of(log, signals, is_clock_known)
@@ -170,7 +170,7 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     return WiringReport(robot, sentences, {**found.keys, **units.keys}, is_ambiguous, {**found.correlations}, units.ratios)
 
 
-def _without_dead(robot: Robot, signals: WheelSignals) -> WiringReport | None:
+def without_dead(robot: Robot, signals: WheelSignals) -> WiringReport | None:
     """``robot`` without the wheels whose encoders count nothing, or that have no data, while another one of their side turns; None without
     any."""
     is_measured = np.isfinite(signals.joint_rates).any(axis=0)

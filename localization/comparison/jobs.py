@@ -172,7 +172,7 @@ def _run(job: Job, path: Path) -> list[Row]:
         if result.contradictions:
             rows.append(_failed(job, trial, " ".join(result.contradictions)))
             continue
-        scores = _scores(result.metrics(log.duration_s, with_timing=False))
+        scores = flat_scores(result.metrics(log.duration_s, with_timing=False))
         faults = {"faults": FAULT_SEPARATOR.join(dict.fromkeys(result.run.warnings))}
         turned = {} if trial.estimator == "lidar" else _turning(named_trial, log.robot, cg.value, result.run)
         rows.append({**_head(job, trial), **day, "status": OK, "error": "", "cause": "", **problems, **faults, **scores, **turned})
@@ -208,7 +208,8 @@ def _head(job: Job, trial: TrialSpec) -> Row:
     }
 
 
-def _scores(metrics: Mapping[str, Any]) -> Row:
+def flat_scores(metrics: Mapping[str, Any]) -> Row:
+    """The numbers of ``metrics`` as the columns of a row of the results."""
     left_out = ("model", "estimator", "corrections", "parameters", "counts", "lidar", "moments", "real_time_factor")
     lidar = metrics["lidar"] or dict.fromkeys(("lost_share", "longest_lost_s", "longest_lost_since_s"))
     losses = {f"lidar_{name}": lidar[name] for name in ("lost_share", "longest_lost_s", "longest_lost_since_s")}

@@ -29,7 +29,7 @@ def is_url(name: str) -> bool:
 def url_fingerprint(url: str) -> str:
     """Digits that change with the object: of its checksum or, by what the store has, its size and time. Raises as `local_copy`."""
     files, path = _open(url)
-    return hashlib.sha256(str(_repeated(url, lambda: files.ukey(path))).encode()).hexdigest()
+    return hashlib.sha256(str(repeated(url, lambda: files.ukey(path))).encode()).hexdigest()
 
 
 @contextlib.contextmanager
@@ -45,7 +45,7 @@ def local_copy(name: str, folder: Path) -> Iterator[Path]:
     files, path = _open(name)
     with tempfile.TemporaryDirectory(prefix="skidloc-copy-") as place:
         target = Path(place) / Path(path).name
-        _repeated(name, lambda: files.get(path, str(target), recursive=files.isdir(path)))
+        repeated(name, lambda: files.get(path, str(target), recursive=files.isdir(path)))
         yield target
 
 
@@ -62,7 +62,7 @@ def _open(url: str) -> tuple[Any, str]:
     return files, path.rstrip("/")
 
 
-def _repeated(url: str, read: Any) -> Any:
+def repeated(url: str, read: Any) -> Any:
     """What ``read`` returns; several tries where the store fails, none where it answers that there is nothing, or no permission."""
     for tries in range(1, _TRIES + 1):
         try:

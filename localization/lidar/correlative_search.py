@@ -93,7 +93,7 @@ def search(image: LikelihoodImage, points: Points2, prior: Pose2, cov: Cov3, lim
     rows = np.minimum(a.ravel(), len(yaws) - 1)
     while True:
         step = image.cell * COARSE**level
-        scores = _score(image.levels[level], turned / step, rows, offsets / step)
+        scores = score_offsets(image.levels[level], turned / step, rows, offsets / step)
         if level == 0:
             break
         best = np.argsort(-scores, kind="stable")[: _KEPT[level - 1]]
@@ -188,7 +188,7 @@ def reduce_image(image: FloatArray) -> FloatArray:
 
 
 @kernel
-def _score(image: FloatArray, points: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray:
+def score_offsets(image: FloatArray, points: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray:
     """(K,) mean of the image where ``points`` (Y, N, 2) of rows (K,) lie, moved by ``offsets`` (K, 2) [cells]."""
     out = np.empty(len(rows))
     for k in range(len(rows)):

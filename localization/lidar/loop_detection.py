@@ -103,7 +103,7 @@ class LoopDetector:
         place = self._merge(range(max(0, j - _OLD_KEYFRAMES), min(n_old, j + _OLD_KEYFRAMES + 1)), poses, j)
         recent = voxel_means(self._merge(range(max(0, k - _NEW_KEYFRAMES + 1), k + 1), poses, k), 1.5 * cell)
         wide = marginal + prior_outlier_cov(marginal)
-        reachable = _within_reach(place, recent, prior, wide, search_limit(marginal))
+        reachable = within_reach(place, recent, prior, wide, search_limit(marginal))
         if not len(reachable):
             return None
         found = find_place(draw_image(reachable, cell), recent, prior, wide, marginal)
@@ -122,7 +122,7 @@ class LoopDetector:
         return np.vstack(moved)
 
 
-def _within_reach(place: Points2, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> FloatArray:
+def within_reach(place: Points2, points: Points2, prior: Pose2, cov: Cov3, limit: FloatArray) -> FloatArray:
     """Points of ``place`` (N, 2) where `search` with the same arguments can put ``points`` (M, 2): no larger image is needed."""
     moved = se2.transform(prior, points)
     half = np.minimum(3.0 * np.sqrt([np.trace(cov[:2, :2]), np.trace(cov[:2, :2]), cov[2, 2]]), limit)

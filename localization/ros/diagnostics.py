@@ -84,7 +84,8 @@ class Health:
     def __init__(self, max_latency_s: float = 0.1) -> None:
         """``max_latency_s``: later estimates are reported [s]."""
         self.max_latency_s = max_latency_s
-        self._scan: Scan | None = None
+        self.scan: Scan | None = None
+        """The last one."""
         self.reset()
 
     def reset(self) -> None:
@@ -98,7 +99,7 @@ class Health:
     def observe_event(self, event: Event) -> None:
         """Store the scan that went in last."""
         if isinstance(event, Scan):
-            self._scan = event
+            self.scan = event
 
     def add_estimate(self, estimate: Estimate, pipeline: Pipeline) -> None:
         """``estimate`` came out of ``pipeline``."""
@@ -121,7 +122,7 @@ class Health:
     def degeneracy(self) -> float | None:
         """Degeneracy of the last scan (`degeneracy`); None without a planar one. It is computed on demand, for it takes longer than all the
         rest here."""
-        return degeneracy(self._scan.points[:, :2]) if self._scan is not None and self._scan.is_planar else None
+        return degeneracy(self.scan.points[:, :2]) if self.scan is not None and self.scan.is_planar else None
 
     @property
     def slip(self) -> FloatArray:
@@ -260,7 +261,8 @@ class Doctor:
     def __init__(self, robot: Robot, model: str, mounts: Mapping[str, Mount], period_s: float, run: Run | None = None) -> None:
         self._request = Request(robot, model, dict(mounts))
         self._period_s, self._run = period_s, run or run_diagnosis
-        self._events: deque[Event] = deque()
+        self.events: deque[Event] = deque()
+        """Events of the last minutes, thinned."""
         self._last_ns: dict[type, int] = {}
         self._next_s = time.monotonic() + period_s
         self._thread: threading.Thread | None = None
@@ -280,9 +282,9 @@ class Doctor:
         if event.stamp_ns - self._last_ns.get(kind, -_MIN_GAP_NS[True]) < _MIN_GAP_NS[is_scan]:
             return
         self._last_ns[kind] = event.stamp_ns
-        self._events.append(_thinned(event) if isinstance(event, Scan) else event)
-        while self._events[0].stamp_ns < event.stamp_ns - WINDOW_S * 1e9:
-            self._events.popleft()
+        self.events.append(_thinned(event) if isinstance(event, Scan) else event)
+        while self.events[0].stamp_ns < event.stamp_ns - WINDOW_S * 1e9:
+            self.events.popleft()
 
     def add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Mounts that became known after the start."""
@@ -299,7 +301,7 @@ class Doctor:
     def start(self) -> None:
         """Diagnose what is known now."""
         self._next_s = time.monotonic() + self._period_s
-        self._thread = threading.Thread(target=self._diagnose, args=(list(self._events),), name="doctor", daemon=True)
+        self._thread = threading.Thread(target=self._diagnose, args=(list(self.events),), name="doctor", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -311,7 +313,7 @@ class Doctor:
             self._thread.join(timeout=5.0)
 
     def _span_s(self) -> float:
-        return (self._events[-1].stamp_ns - self._events[0].stamp_ns) * 1e-9 if self._events else 0.0
+        return (self.events[-1].stamp_ns - self.events[0].stamp_ns) * 1e-9 if self.events else 0.0
 
     def _diagnose(self, events: Sequence[Event]) -> None:
         """In a thread: most of the time it waits for the process, and between two events others run."""

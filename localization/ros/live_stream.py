@@ -48,7 +48,8 @@ class LiveStream:
         self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats, discovered.plan.period_s)
         self._merger = Merger(discovered.plan, stats, wait_ns=None)
         self._decoders = {source.topic: decoder(source.type or TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
-        self._rates = {source.topic: _TopicRate() for source in parts.sources.used()}
+        self.topic_rates = {source.topic: TopicRate() for source in parts.sources.used()}
+        """Rate of each topic in use."""
         self.payloads = Payloads(robot, parts.arms, discovered.mounts)
         self.on_reading: Callable[[Any], None] | None = None
         """Called with each reading as its driver published it, before anything is left out."""
@@ -67,7 +68,7 @@ class LiveStream:
         decode = self._decoders.get(received.topic)
         if decode is None:
             return
-        self._rates[received.topic].count(received.received_ns)
+        self.topic_rates[received.topic].count(received.received_ns)
         wall_ns = received.received_ns + self._epoch_ns
         item = decode_item(
             received.topic, wall_ns, partial(decode, received.data), self._event_decoder.decoders[received.topic], self._stats
@@ -91,12 +92,12 @@ class LiveStream:
 
     def silent(self, now_ns: int) -> dict[str, float]:
         """Seconds since the last message, of topics in use whose next one is overdue."""
-        found = {topic: watch.silence(now_ns) for topic, watch in self._rates.items()}
+        found = {topic: watch.silence(now_ns) for topic, watch in self.topic_rates.items()}
         return {topic: seconds for topic, seconds in found.items() if seconds is not None}
 
     def rates(self) -> dict[str, float]:
         """Messages per second of the topics in use, by their last dozen [Hz]; 0 of one that never came twice."""
-        return {topic: watch.rate_hz for topic, watch in self._rates.items()}
+        return {topic: watch.rate_hz for topic, watch in self.topic_rates.items()}
 
     def batch_s(self, now_ns: int) -> float:
         """How long messages that are not urgent may wait for others [s]: until shortly before the next scan. 0 without a LiDAR.
@@ -104,12 +105,12 @@ class LiveStream:
         To wake up for each takes longer than to read a few.
         """
         lidar = self.sources.lidar
-        return 0.0 if lidar is None else self._rates[lidar.topic].rest(now_ns, (_NEAR, _PAST))
+        return 0.0 if lidar is None else self.topic_rates[lidar.topic].rest(now_ns, (_NEAR, _PAST))
 
     def dropped(self) -> list[str]:
         """Messages that were corrected or dropped, as sentences."""
         found = []
-        for name in (name for topic in self._rates for name in self._stats.parts(topic)):
+        for name in (name for topic in self.topic_rates for name in self._stats.parts(topic)):
             for oddity in Oddity:
                 if (count := self._stats.of(name, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
                     sentence = oddity.sentence(name, count)
@@ -117,33 +118,38 @@ class LiveStream:
         return found
 
 
-class _TopicRate:
+class TopicRate:
     """Time of the last message of a topic, and its mean period."""
 
     def __init__(self) -> None:
-        self._last_ns: int | None = None
-        self._period_s = 0.0
+        self.last_ns: int | None = None
+        """Time of the last message; None before the first [ns]."""
+        self.period_s = 0.0
+        """Mean period of the last dozen of messages [s]."""
 
     def count(self, now_ns: int) -> None:
-        if self._last_ns is not None:
-            gap = (now_ns - self._last_ns) * _NS
-            self._period_s += (min(gap, 10.0 * self._period_s + 0.01) - self._period_s) * 0.1
-        self._last_ns = now_ns
+        """Count a message that is received now."""
+        if self.last_ns is not None:
+            gap = (now_ns - self.last_ns) * _NS
+            self.period_s += (min(gap, 10.0 * self.period_s + 0.01) - self.period_s) * 0.1
+        self.last_ns = now_ns
 
     @property
     def rate_hz(self) -> float:
-        return 1.0 / self._period_s if self._period_s > 0.0 else 0.0
+        """Messages per second [Hz]; 0 of a topic that never came twice."""
+        return 1.0 / self.period_s if self.period_s > 0.0 else 0.0
 
     def rest(self, now_ns: int, parts: Sequence[float]) -> float:
         """Until the next of ``parts`` of the time to the next message is over [s]; 0 when all are."""
-        since = self._period_s if self._last_ns is None else (now_ns - self._last_ns) * _NS
-        return next((min(part * self._period_s - since, _LONGEST_S) for part in parts if since < part * self._period_s), 0.0)
+        since = self.period_s if self.last_ns is None else (now_ns - self.last_ns) * _NS
+        return next((min(part * self.period_s - since, _LONGEST_S) for part in parts if since < part * self.period_s), 0.0)
 
     def silence(self, now_ns: int) -> float | None:
-        if self._last_ns is None:
+        """Seconds since the last message, where the next one is overdue; else None."""
+        if self.last_ns is None:
             return None
-        seconds = (now_ns - self._last_ns) * _NS
-        return seconds if seconds > max(_SILENT_S, _PERIODS * self._period_s) else None
+        seconds = (now_ns - self.last_ns) * _NS
+        return seconds if seconds > max(_SILENT_S, _PERIODS * self.period_s) else None
 
 
 def check_age(head: Mapping[str, Any], stamp_ns: int, where: str) -> float:

@@ -131,7 +131,7 @@ class Node:
         if trial.prior is not None:
             trial.prior.check_lidar(sources.has_clouds, bool(run.config.step.planar))
         notes = prior_notes(run.robot, [trial.model.name])
-        for warning in (*notes, *_notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
+        for warning in (*notes, *notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report)
         node._open_session(discovered, view, is_compiled)
@@ -437,7 +437,7 @@ class Node:
             self.session.view.begin(self.inputs.robot, pipeline.mounts)
 
 
-def _notes_on_clocks(clock: Clock) -> list[str]:
+def notes_on_clocks(clock: Clock) -> list[str]:
     """Entries of the robot file that a node leaves out: live, a clock's rate has no start of a log from which it counts."""
     keys = [f"clock.{name}_rate_error" for name in ("wheel", "lidar", "gyro") if getattr(clock, f"{name}_rate_error")]
     if not keys:

@@ -41,7 +41,8 @@ class Payloads:
         """``arms``: their model, where the centre of gravity is that of joint states. ``mounts``: frames fixed to the body."""
         self._robot, self.mounts = robot, mounts
         self._mass_kg = robot.geometry.mass_kg if arms is None else arms.mass
-        self._unloaded = CgSample(0, np.asarray(robot.center_of_gravity, dtype=float))
+        self.unloaded = CgSample(0, np.asarray(robot.center_of_gravity, dtype=float))
+        """The CG without loads."""
         self._joints: dict[str, float] = {}
         self._arms: dict[str, CgModel] = {}  # by frame, with all joints that move it
         self.loads: dict[str, Load] = {}
@@ -61,7 +62,7 @@ class Payloads:
             self.loads[frame] = load
         try:
             geometry = self._robot.geometry
-            require_support(self.with_loads(self._unloaded).position, geometry.wheelbase_m, geometry.track_width_m)
+            require_support(self.with_loads(self.unloaded).position, geometry.wheelbase_m, geometry.track_width_m)
         except (CgError, RobotError):
             self.loads.clear()
             self.loads.update(before)
@@ -73,7 +74,7 @@ class Payloads:
 
     def apply(self, sample: CgSample) -> CgSample | None:
         """``sample`` with the loads; None where a joint that moves one of them has no position yet."""
-        self._unloaded = sample
+        self.unloaded = sample
         try:
             return self.with_loads(sample)
         except RobotError:
@@ -81,7 +82,7 @@ class Payloads:
 
     def sample(self, stamp_ns: int) -> CgSample:
         """The present centre of gravity with the loads. Raises `RobotError` as long as joints have no position."""
-        return self.with_loads(CgSample(stamp_ns, self._unloaded.position, self._unloaded.covariance))
+        return self.with_loads(CgSample(stamp_ns, self.unloaded.position, self.unloaded.covariance))
 
     @property
     def summary(self) -> str:

@@ -167,7 +167,9 @@ class Session:
         self.state, self.name, self.health = state, name, Health()
         self.head = head
         """Head of the checkpoint that was resumed; empty for a new session."""
-        self._files, self._estimate_log, self._checkpoints, self._report = files, estimate_log, checkpoints, report
+        self._files, self._estimate_log, self._report = files, estimate_log, report
+        self.checkpoints = checkpoints
+        """The writer of the state on disk; None without one."""
         self.troubles: dict[str, str] = {}
         """What cannot be written at present, and why."""
         self._reported: set[str] = set()
@@ -218,13 +220,13 @@ class Session:
 
     def change_map(self, trial: Trial) -> None:
         """The saved map of ``trial`` is the one that checkpoints are of from now on."""
-        if self._checkpoints is not None and trial.prior is not None:
-            self._checkpoints.change_identity(fingerprints(map=trial.prior.places.fingerprint), shared_of(trial))
+        if self.checkpoints is not None and trial.prior is not None:
+            self.checkpoints.change_identity(fingerprints(map=trial.prior.places.fingerprint), shared_of(trial))
 
     def change_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Checkpoints are of a robot with ``mounts`` from now on."""
-        if self._checkpoints is not None:
-            self._checkpoints.change_identity(fingerprints(mounts=mounts), {})
+        if self.checkpoints is not None:
+            self.checkpoints.change_identity(fingerprints(mounts=mounts), {})
 
     def process(self, event: Event, publish: Callable[[Estimate], None] = lambda estimate: None) -> list[Estimate]:
         """``publish`` is called with each estimate before anything else is done with it. Raises `EstimatorError`."""
@@ -284,15 +286,15 @@ class Session:
 
         Raises `CheckpointError` unless live.
         """
-        if self._checkpoints is None or not (now or self._checkpoints.is_due()):
+        if self.checkpoints is None or not (now or self.checkpoints.is_due()):
             return
         on_disk = () if self._estimate_log is None else (self._estimate_log.descriptor,)
         records = None if self._estimate_log is None else self._estimate_log.count
         with self._writing("state"):
-            self._checkpoints.write(self.state, {**extra(), "events": self.count, "records": records}, on_disk)
+            self.checkpoints.write(self.state, {**extra(), "events": self.count, "records": records}, on_disk)
             self._is_log_referenced = True
             if now:
-                self._checkpoints.wait()
+                self.checkpoints.wait()
 
     def write_output(self) -> int | None:
         """The output, if one is wanted; returns how many estimates it holds. Raises `OutputError` where there are none."""
@@ -307,9 +309,9 @@ class Session:
                 write_fused(bag, {self.name: fused_estimates(stamps, table, parent)}, self.name)
         if self._report is not None and self._estimate_log.missing:
             self._report(f"'{self._files.out}': {self._estimate_log.missing} estimates are missing, for there was no room on the disk.")
-        if self._checkpoints is not None:
+        if self.checkpoints is not None:
             with self._writing("state"):
-                self._checkpoints.wait()  # it may refer to the rows
+                self.checkpoints.wait()  # it may refer to the rows
         self._estimate_log.remove()
         self._estimate_log = None
         if not len(stamps):
@@ -323,14 +325,14 @@ class Session:
         `CheckpointError` unless live.
         """
         try:
-            if self._checkpoints is not None:
+            if self.checkpoints is not None:
                 with self._writing("state"):
-                    self._checkpoints.close()
+                    self.checkpoints.close()
                 if forget:
-                    remove_checkpoint(self._checkpoints.path)
+                    remove_checkpoint(self.checkpoints.path)
         finally:
             if self._estimate_log is not None:
-                is_referenced = self._is_log_referenced and self._checkpoints is not None and self._checkpoints.path.exists()
+                is_referenced = self._is_log_referenced and self.checkpoints is not None and self.checkpoints.path.exists()
                 is_needed = is_referenced or (self._report is not None and self._estimate_log.count)
                 (self._estimate_log.close if is_needed else self._estimate_log.remove)()
 

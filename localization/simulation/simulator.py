@@ -165,7 +165,7 @@ class Simulation:
         if isinstance(phase, Rest):
             yield from self._drive_open_loop(np.zeros((self._control_steps(phase.duration_s), 2)), "diff_drive")
         elif isinstance(phase, MoveArms):
-            target = self._masses.posture(phase.target) if isinstance(phase.target, str) else self._reach(phase.target)
+            target = self._masses.posture(phase.target) if isinstance(phase.target, str) else self.reach(phase.target)
             duration = phase.duration_s or self._masses.time_to(target)
             self._masses.move(target, self.time_s, duration)
             yield from self._drive_open_loop(np.zeros((self._control_steps(duration), 2)), "diff_drive")
@@ -254,7 +254,8 @@ class Simulation:
     def _control_steps(duration_s: float) -> int:
         return max(1, round(duration_s / _CONTROL_S))
 
-    def _reach(self, cg: FloatArray) -> FloatArray:
+    def reach(self, cg: FloatArray) -> FloatArray:
+        """Positions of the arms or loads that put the nominal CG at ``cg`` (2,) [m]. Raises `SimulationError` where none do."""
         try:
             return self._masses.reach(cg)
         except CgError as error:

@@ -68,7 +68,7 @@ def test_recorded_clock_of_another_rate_is_corrected(tmp_path: Path, topic: str,
 def test_recorded_clock_of_stamps_that_are_right_is_left(tmp_path: Path, late_s: Callable[[float], float]) -> None:
     """A queue delivers late what was stamped as it was measured."""
     assert report_of(tmp_path, GYRO, queued("/imu/data", late_s)).keys == {}
-    assert "/imu/data" in {suspect.topic for suspect in recorded_clocks._suspects(open_log(tmp_path / "log.mcap", GYRO.robot()))}
+    assert "/imu/data" in {suspect.topic for suspect in recorded_clocks.find_suspects(open_log(tmp_path / "log.mcap", GYRO.robot()))}
 
 
 def test_recorded_clock_of_the_center_of_gravity_is_none_of_a_sensor(tmp_path: Path) -> None:
@@ -89,10 +89,10 @@ def test_recorded_clock_of_an_undecided_rate_does_not_hide_an_offset(tmp_path: P
     signals = read_signals(log)
     assert signals is not None
     suspects = [
-        recorded_clocks._Suspect("gyro", "/imu/data", "gyro_rate_error", 0.01, "of another rate"),
-        recorded_clocks._Suspect("gyro", "/imu/data", "gyro_time_offset_s", 0.4, "late"),
+        recorded_clocks.Suspect("gyro", "/imu/data", "gyro_rate_error", 0.01, "of another rate"),
+        recorded_clocks.Suspect("gyro", "/imu/data", "gyro_time_offset_s", 0.4, "late"),
     ]
-    monkeypatch.setattr(recorded_clocks, "_suspects", lambda log: iter(suspects))
+    monkeypatch.setattr(recorded_clocks, "find_suspects", lambda log: iter(suspects))
     noise = np.random.default_rng(3).normal(size=len(signals.turns["gyro"]))
     found = recorded_clocks.find_recorded_clock(log, signals, lambda of: np.resize(noise, len(of.turns["gyro"])))
     assert found is not None

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.calibration.wheel_units import _without_outliers, check_length_unit
+from localization.calibration.wheel_units import check_length_unit, without_outliers
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
 from localization.events import WheelSample
 from localization.logs import open_log
@@ -144,4 +144,4 @@ def test_length_unit_of_the_robot_file_scales_odometry(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_units_of_lengths_by_a_lidar_that_matched_nothing_warn_of_nothing() -> None:
-    assert np.isnan(_without_outliers(np.linspace(0.1, 1.0, 40), np.full(40, np.nan))).all()
+    assert np.isnan(without_outliers(np.linspace(0.1, 1.0, 40), np.full(40, np.nan))).all()

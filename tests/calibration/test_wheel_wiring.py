@@ -12,7 +12,7 @@ import pytest
 
 import skidloc
 from localization.calibration.wheel_signals import read_signals
-from localization.calibration.wheel_wiring import WiringReport, _without_dead, check_wiring, open_checked
+from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked, without_dead
 from localization.cli import main
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot_file import load_robot, robot_toml
@@ -69,7 +69,7 @@ def test_wiring_without_a_wheel_of_no_data_blames_no_encoder(tmp_path: Path) -> 
     assert signals is not None
     rates, angle_rates = signals.rates.copy(), signals.angle_rates.copy()
     rates[:, 1] = angle_rates[:, 1] = np.nan
-    report = _without_dead(ROBOT, replace(signals, rates=rates, angle_rates=angle_rates))
+    report = without_dead(ROBOT, replace(signals, rates=rates, angle_rates=angle_rates))
     assert report is not None
     assert report.findings[0].startswith(f"{LEFT[1]}: has no data")
     assert "encoder" not in report.findings[0]

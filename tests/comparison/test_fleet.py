@@ -133,13 +133,13 @@ def test_store_that_fails_once_is_asked_again(monkeypatch):
             raise answer
         return answer
 
-    assert remote._repeated("s3://b/x", read) == 7
+    assert remote.repeated("s3://b/x", read) == 7
 
     def absent():
         raise FileNotFoundError
 
     with pytest.raises(LogError, match="no such object"):
-        remote._repeated("s3://b/x", absent)
+        remote.repeated("s3://b/x", absent)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -89,7 +89,7 @@ class LogTransport(MonotonicTime):
         self.types = {channel.topic: channel.type for channel in source.channels} | (types or {})
         base = time.monotonic_ns() - (source.end_ns - source.start_ns)
         messages = [Received(m.topic, base + m.log_ns - source.start_ns, m.data) for m in source.messages(list(self.types))]
-        self._left = deque(spoil(messages))
+        self.left = deque(spoil(messages))
         self._begin: int | None = None
         self.subscribed: dict[str, bool] = {}
         self.kept: set[str] | None = None
@@ -120,13 +120,13 @@ class LogTransport(MonotonicTime):
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
         """The first two seconds at once, then a tenth of a second at a time."""
-        if not self._left:
+        if not self.left:
             return []
         span = 100_000_000 if self._begin is not None else 2_000_000_000
-        self._begin = end = (self._left[0].received_ns if self._begin is None else self._begin) + span
+        self._begin = end = (self.left[0].received_ns if self._begin is None else self._begin) + span
         found = []
-        while self._left and self._left[0].received_ns < end:
-            found.append(self._left.popleft())
+        while self.left and self.left[0].received_ns < end:
+            found.append(self.left.popleft())
         wanted = self.subscribed if self.kept is None else self.kept
         return [message for message in found if message.topic in wanted]
 
@@ -135,7 +135,7 @@ class LogTransport(MonotonicTime):
         return (self._begin or time.monotonic_ns()) + 1000
 
     def is_empty(self) -> bool:
-        return not self._left
+        return not self.left
 
     def close(self) -> None:
         self.is_closed = True

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.lidar.correlative_search import COARSE, SearchResult, _score, draw_image, search
+from localization.lidar.correlative_search import COARSE, SearchResult, draw_image, score_offsets, search
 from localization.lidar.submap import voxel_means
 from localization.simulation import world
 from motion_models import se2
@@ -56,8 +56,8 @@ def test_search_coarse_scores_bound_fine_scores() -> None:
     for level in (1, 2):
         step = CELL * COARSE**level
         within = offsets + rng.integers(-(COARSE**level) // 2, COARSE**level // 2 + 1, (300, 2)) * CELL
-        coarse = _score(image.levels[level], turned / step, rows, offsets / step)
-        fine = _score(image.levels[0], turned / CELL, rows, within / CELL)
+        coarse = score_offsets(image.levels[level], turned / step, rows, offsets / step)
+        fine = score_offsets(image.levels[0], turned / CELL, rows, within / CELL)
         assert (coarse >= fine - 1e-6).all()
         assert (coarse < 1.0).all()
 

@@ -7,7 +7,7 @@ import pytest
 
 from localization.lidar import LidarConfig
 from localization.lidar.correlative_search import draw_image, search
-from localization.lidar.loop_detection import Keyframe, LoopClosure, LoopDetector, _within_reach
+from localization.lidar.loop_detection import Keyframe, LoopClosure, LoopDetector, within_reach
 from localization.simulation import world
 from motion_models import se2
 from tests.helpers import rooms
@@ -118,7 +118,7 @@ def test_within_reach_leaves_search_result_unchanged(cov: np.ndarray) -> None:
     place = np.vstack([rooms.scan_from(LAB, np.zeros(3), rng), rng.uniform(-60.0, 60.0, (500, 2))])
     points, prior = rooms.scan_from(LAB, np.array([0.4, 0.2, 0.1]), rng, beams=180), np.array([0.3, 0.3, 0.12])
     limit = np.array([3.2, 3.2, 0.5])
-    drawn = _within_reach(place, points, prior, cov, limit)
+    drawn = within_reach(place, points, prior, cov, limit)
     assert len(drawn) < len(place)
     whole, part = (search(draw_image(p, CELL), points, prior, cov, limit) for p in (place, drawn))
     assert part.pose == pytest.approx(whole.pose, abs=CELL)

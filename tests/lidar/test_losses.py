@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from localization.comparison.jobs import _scores
+from localization.comparison.jobs import flat_scores
 from localization.comparison.result_table import ResultTable
 from localization.comparison.statistics import closing, find
 from localization.evaluation.scores import score
@@ -171,7 +171,7 @@ def test_rows_of_a_comparison_are_numbers_that_the_table_reads_again(tmp_path) -
     """Also of a run with live poses besides the smoothed ones."""
     smoothed = replace(lost_and_found()[0], live=run().trajectory)
     (result,) = score([smoothed], track())
-    scores = _scores(result.metrics(200.0, with_timing=False))
+    scores = flat_scores(result.metrics(200.0, with_timing=False))
     assert (scores["lidar_lost_share"], scores["lidar_longest_lost_s"], scores["lidar_longest_lost_since_s"]) == (0.6, 60.0, 7.0)
     assert not any(isinstance(value, dict) for value in scores.values())
     table = ResultTable(tmp_path / "table.csv")

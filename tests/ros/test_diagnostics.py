@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import multiprocessing
 import time
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
@@ -189,7 +190,7 @@ def test_doctor_process_receives_thinned_events() -> None:
         doctor.observe(sample)
     for i in range(20):
         doctor.observe(Scan(i * 100_000_000, points, np.zeros(len(points))))
-    assert max(len(e.points) for e in doctor._events if isinstance(e, Scan)) <= 1500
+    assert max(len(e.points) for e in doctor.events if isinstance(e, Scan)) <= 1500
     doctor.start()
     deadline = time.monotonic() + 60.0
     while doctor.is_running and time.monotonic() < deadline:
@@ -203,14 +204,14 @@ def test_doctor_drops_events_older_than_its_window() -> None:
     doctor = Doctor(ROBOT, "icr", {}, period_s=60.0)
     for sample in _wheels(400, period_ns=1_000_000_000):
         doctor.observe(sample)
-    assert len(doctor._events) == 121
+    assert len(doctor.events) == 121
 
 
 def test_doctor_closed_ends_its_process() -> None:
     doctor = Doctor(ROBOT, "icr", {}, period_s=60.0, run=_hang)
     doctor.start()
     deadline = time.monotonic() + 30.0
-    while (doctor._process is None or doctor._process.pid is None) and time.monotonic() < deadline:
+    while not any(child.name == "skidloc-doctor" for child in multiprocessing.active_children()) and time.monotonic() < deadline:
         time.sleep(0.02)
     doctor.close()
     assert not doctor.is_running
@@ -220,7 +221,7 @@ def test_doctor_switched_off_has_no_status() -> None:
     doctor = Doctor(ROBOT, "icr", {}, period_s=0.0)
     doctor.observe(_wheels(1)[0])
     assert doctor.statuses() == []
-    assert not doctor._events
+    assert not doctor.events
 
 
 def test_doctor_short_drive_reports_why() -> None:

@@ -97,7 +97,7 @@ def test_state_on_disk_is_never_older_than_a_second(tmp_path, monkeypatch):
         clock.now_s = event.stamp_ns * 1e-9
         session.process(event)
         session.save_state()
-        session._checkpoints.wait()
+        session.checkpoints.wait()
         if state.exists() and state.stat().st_mtime_ns != modified_ns:
             written_s, modified_ns = clock.now_s, state.stat().st_mtime_ns
         assert clock.now_s - written_s < 1.0

@@ -28,7 +28,7 @@ from localization.ros.checkpoint import CheckpointWriter, read_head
 from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
 from localization.ros.discovery import TF
 from localization.ros.estimate_log import old_estimate_log
-from localization.ros.node import Node, _notes_on_clocks
+from localization.ros.node import Node, notes_on_clocks
 from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
 from localization.ros.session import Files
 from localization.ros.settings import Frames, LiveRun, Names, NodeConfig
@@ -71,7 +71,7 @@ def _wrapped(difference):
 
 def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
     robot = dataclasses.replace(ROBOT, clock=dataclasses.replace(ROBOT.clock, gyro_rate_error=0.01))
-    assert not _notes_on_clocks(ROBOT.clock)
+    assert not notes_on_clocks(ROBOT.clock)
     _, reports = run_node(LogTransport(drive_log(scans_hz=6.25)), robot=robot)
     notes = [text for text in reports if "rate_error" in text]
     assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it; synchronize the clocks."]
@@ -265,8 +265,8 @@ def test_sensor_that_vanishes_and_returns_is_used_again(topic, calm):
 def test_batch_s_ends_shortly_before_the_next_scan(calm):
     """They are looked at once before it is due; at once when it is late, or if there is no LiDAR."""
     stream = calm[1].inputs.stream
-    scans = stream._rates["/scan"]
-    period, last = scans._period_s, scans._last_ns
+    scans = stream.topic_rates["/scan"]
+    period, last = scans.period_s, scans.last_ns
     assert period == pytest.approx(0.16, rel=0.1)
 
     def rests():
@@ -276,28 +276,28 @@ def test_batch_s_ends_shortly_before_the_next_scan(calm):
     alone = LogTransport(drive_log(scans_hz=6.25), silenced("/scan", 0.0, 99.0))
     alone.types.pop("/scan")
     node, _ = run_node(alone)
-    assert node.inputs.stream.batch_s(node.inputs.stream._rates["/joint_states"]._last_ns) == 0.0
+    assert node.inputs.stream.batch_s(node.inputs.stream.topic_rates["/joint_states"].last_ns) == 0.0
 
 
 def test_batch_s_is_zero_while_a_scan_waits_for_the_wheels():
     """A scan that is ahead of the wheels is used with the very next message that they send."""
     node, _ = run_node(LogTransport(drive_log(scans_hz=6.25)))
-    scan = node.session.health._scan
+    scan = node.session.health.scan
     newest_ns = scan.stamp_ns + S // 10
-    node.inputs.stream._rates["/scan"]._last_ns = time.monotonic_ns()
+    node.inputs.stream.topic_rates["/scan"].last_ns = time.monotonic_ns()
     assert node.batch_s() > 0.0
     assert node.session.process(dataclasses.replace(scan, stamp_ns=newest_ns + S)) == []
     assert node.batch_s() == 0.0
     assert node.session.process(WheelSample(newest_ns + S + S // 10, np.zeros(2), np.full(2, np.nan)))
-    node.inputs.stream._rates["/scan"]._last_ns = time.monotonic_ns()
+    node.inputs.stream.topic_rates["/scan"].last_ns = time.monotonic_ns()
     assert node.batch_s() > 0.0
 
 
 def test_silent_topic_is_an_error_that_names_it(calm):
     _, node, _ = calm
-    watches = node.inputs.stream._rates
-    assert node.inputs.stream.silent(max(w._last_ns for w in watches.values())) == {}
-    later = node.inputs.stream.silent(max(w._last_ns for w in watches.values()) + 3 * S)
+    watches = node.inputs.stream.topic_rates
+    assert node.inputs.stream.silent(max(w.last_ns for w in watches.values())) == {}
+    later = node.inputs.stream.silent(max(w.last_ns for w in watches.values()) + 3 * S)
     assert set(later) == {"/joint_states", "/scan", "/imu/data"}
     status = node.session.health.statuses(node.session.pipeline, [], later)[-1]
     assert status.level == ERROR
@@ -319,7 +319,7 @@ def test_degeneracy_of_corridors_is_below_that_of_rooms(calm):
     assert degeneracy(np.zeros((5, 2))) is None
     _, node, _ = calm
     health = node.session.health
-    last = health._scan
+    last = health.scan
     assert health.statuses(node.session.pipeline)[1].level == OK
     corridor = scan(1.5 / np.abs(np.sin(angle)))
     health.observe_event(dataclasses.replace(last, points=np.column_stack([corridor, np.zeros(len(corridor))]), offsets=np.empty(0)))
@@ -467,7 +467,7 @@ def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):
     first = LogTransport(drive_log(scans_hz=6.25), part(0.0, 10.0))
     node, _ = run_node(first, files=files)
     node.save_state(now=True)
-    node.session._checkpoints.wait()  # kill -9 from here: no finish, no close
+    node.session.checkpoints.wait()  # kill -9 from here: no finish, no close
     second = LogTransport(drive_log(scans_hz=6.25), part(10.5, 17.0))
     node, reports = run_node(second, files=files)
     assert node.finish() == len(read_tum(tmp_path / "run.tum"))

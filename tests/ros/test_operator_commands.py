@@ -101,7 +101,7 @@ def serviced(name, *requests):
         return received
 
     transport.take = take_and_call
-    transport.first_ns, transport.counts_at_calls = transport._left[0].received_ns, []
+    transport.first_ns, transport.counts_at_calls = transport.left[0].received_ns, []
     node, reports = run_node(transport, config=NodeConfig(wait_s=0.0))
     return transport, node, replies, reports
 
@@ -163,7 +163,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     transport = LogTransport(drive_log(), spoil)
     node, reports = run_node(transport, files=files, config=NodeConfig(wait_s=0.0))
     assert "/skidloc/payload: 20 kg at 'left_gripper'" in reports
-    alone, loaded = node.payloads._unloaded.position, node.payloads.sample(0).position
+    alone, loaded = node.payloads.unloaded.position, node.payloads.sample(0).position
     assert np.hypot(*(loaded - alone)) > 0.01
     assert node.session.pipeline.synchronizer.wheels.buffer.cg == pytest.approx(loaded)
     node.publish_status(0.0)
@@ -181,7 +181,7 @@ def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     assert any("resumed from" in text for text in reports)
     assert any("no payload is set" in text for text in reports)
     assert node.payloads.loads == {}
-    assert node.session.pipeline.synchronizer.wheels.buffer.cg == pytest.approx(node.payloads._unloaded.position)
+    assert node.session.pipeline.synchronizer.wheels.buffer.cg == pytest.approx(node.payloads.unloaded.position)
 
 
 def test_payload_with_wrong_content_is_ignored_with_a_reason():

@@ -76,7 +76,7 @@ def test_odometry_without_a_lidar_has_true_vy_at_the_wheels_rate():
     messages = published(transport, PREDICTED_ODOMETRY)
     stamps = np.array([stamp_of(m) for m in messages])
     assert np.median(np.diff(stamps)) <= 0.0201 * S
-    assert len(stamps) > 0.9 * len(LogTransport(drive_log(), lambda found: [m for m in found if m.topic == "/joint_states"])._left) - 150
+    assert len(stamps) > 0.9 * len(LogTransport(drive_log(), lambda found: [m for m in found if m.topic == "/joint_states"]).left) - 150
     turning = [m.twist.twist for m in messages if abs(m.twist.twist.angular.z) > 0.3]
     assert np.median([abs(twist.linear.y / twist.angular.z) for twist in turning]) > 0.003
     moving = [m.twist.covariance.reshape(6, 6) for m in messages if abs(m.twist.twist.linear.x) > 0.1]

@@ -56,7 +56,7 @@ def test_messages_before_the_first_clock_are_dropped():
     sim = SimTimeTransport(transport)
     sim.subscribe("/scan", "sensor_msgs/msg/LaserScan", is_latched=False)
     assert sim.take(0.1) == []
-    transport._left.extendleft([Received("/scan", 0, b"scan"), Received(CLOCK, 0, b"garbled"), Received(CLOCK, 0, clock_message(7 * S))])
+    transport.left.extendleft([Received("/scan", 0, b"scan"), Received(CLOCK, 0, b"garbled"), Received(CLOCK, 0, clock_message(7 * S))])
     assert [received.received_ns for received in sim.take(0.1) if received.data == b"scan"] == [7 * S]
     assert sim.now_ns() == 7 * S
     assert CLOCK not in sim.publishers()

@@ -375,7 +375,7 @@ def test_grid_points_are_the_thesis_grid_and_reachable():
     assert sorted(map(tuple, grid_points().tolist())) == sorted(map(tuple, grid().cg.tolist()))
     simulation = Simulation(ARC, ROBOT, 0, {}, BLIND)
     for cg in (*grid_points()[::7], *(np.array(c) for c in CONFIGURATION_CGS.values())):
-        simulation._reach(cg)
+        simulation.reach(cg)
 
 
 @pytest.mark.parametrize("name", cases(sorted(set(EXPERIMENTS) - {"controller_evaluation", "rotation_grid"}), ("laps", "preliminary")))
