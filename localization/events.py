@@ -178,8 +178,8 @@ class BodyTurn:
     """[rad^2], of white noise about each axis; without biases and scale."""
     duration: float
     """[s]"""
-    rate: FloatArray
-    """(3,) at its end [rad/s]."""
+    sweep: FloatArray
+    """(K, 4) times from its end [s], increasing, through the sweep of a scan there, and turns (3,) from the end until then [rad]."""
 
 
 class Gravity(NamedTuple):

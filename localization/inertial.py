@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from localization.attitude import AttitudeFilter
 from localization.body_rates import BodyRates
-from localization.events import BodyTurn, Gravity, ImuSample, Turn
+from localization.events import BodyTurn, Gravity, ImuSample, Scan, Turn
 from localization.gyro import GyroBuffer
 from motion_models.robot import Mount, Robot
 
@@ -51,13 +51,13 @@ class InertialSensors:
         if self._body_rates is not None:
             self._body_rates.insert(sample)
 
-    def measure(self, start_ns: int, end_ns: int, by_wheels: float) -> InertialMotion:
-        """From ``start_ns`` to ``end_ns``; the turn ``by_wheels`` [rad] gives the sign of the gyro's alone, where its mount does not."""
+    def measure(self, start_ns: int, end_ns: int, by_wheels: float, scan: Scan | None = None) -> InertialMotion:
+        """From ``start_ns`` to ``end_ns``, the middle of ``scan``; the turn ``by_wheels`` [rad] has the sign where a gyro has no mount."""
         has_turn = end_ns > start_ns and self.gyro.newest_ns is not None
         turn = self.gyro.turn(start_ns, end_ns, by_wheels) if has_turn else None
         if self._body_rates is None or self.attitude is None:
             return InertialMotion(turn)
-        return InertialMotion(turn, self._body_rates.turn(start_ns, end_ns), self.attitude.gravity)
+        return InertialMotion(turn, self._body_rates.turn(start_ns, end_ns, scan), self.attitude.gravity)
 
     def warnings(self) -> list[str]:
         """Problems of the IMU."""

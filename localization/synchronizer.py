@@ -163,7 +163,7 @@ class Synchronizer:
             rates, last = self.wheels.twist_at(end_ns + shift)
         is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
-        turn, body_turn, gravity = self.inertial.measure(start_ns, end_ns, by_wheels=float(motion.delta[2]))
+        turn, body_turn, gravity = self.inertial.measure(start_ns, end_ns, by_wheels=float(motion.delta[2]), scan=scan)
         if missing:
             motion = replace(motion, cov=motion.cov + self._velocity.increment(missing, has_turn=turn is not None))
         if missing < (end_ns - start_ns) * 1e-9:  # wheels measured the velocity in this step

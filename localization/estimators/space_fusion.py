@@ -120,7 +120,7 @@ class SpaceFusion(Estimator):
             self._sensor.add_no_cloud(step.end_ns, is_excluded=step.is_scan_excluded)
             return None
         self._counts["scans"] += 1
-        found = self._sensor.measure(step, self._twist_of(step), self.state["pose"], self.state.difference_cov("pose", "map"))
+        found = self._sensor.measure(step, self.state["gyro_bias"], self.state["pose"], self.state.difference_cov("pose", "map"))
         if found is None:
             return None
         self._counts["matched"] += 1
@@ -128,14 +128,6 @@ class SpaceFusion(Estimator):
             self.state = propagate(self.state, key_scan_transition(self.state, found.first))
         self.state, innovation = update(self.state, measure_scan(self.state, found.measured, found.cov), ("map",))
         return innovation.nis_of(_PLANAR)
-
-    def _twist_of(self, step: Step) -> FloatArray:
-        """(6,) at the end of ``step``, the middle of the sweep: by the wheels, and turns by the gyro."""
-        twist = np.zeros(6)
-        twist[_PLANAR] = step.twist
-        if step.body_turn is not None:
-            twist[3:] = step.body_turn.rate - self.state["gyro_bias"]
-        return twist
 
     def _estimate(self, step: Step, nis: float | None) -> Estimate:
         pose, P = self.state["pose"], self.state.cov("pose")

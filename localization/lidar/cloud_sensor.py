@@ -52,17 +52,18 @@ class CloudMatchingSensor:
         self.position = np.zeros(3)
         """(3,) of the last cloud's LiDAR in the body frame [m]."""
 
-    def measure(self, step: Step, twist: FloatArray, prior: Transform3, cov: FloatArray) -> CloudPose | None:
+    def measure(self, step: Step, gyro_bias: FloatArray, prior: Transform3, cov: FloatArray) -> CloudPose | None:
         """Match the cloud of ``step`` near ``prior``, whose error against the submap has ``cov`` (6, 6).
 
-        None where it is lost, or the first. The sweep is deskewed with ``twist`` (6,) at its middle [m/s, rad/s].
+        None where it is lost, or the first. The sweep is deskewed by the wheels' velocity and the turns of a gyro with ``gyro_bias`` (3,)
+        [rad/s].
         """
         self.cloud = None
-        found, cause = self._measure(step, twist, prior, cov)
+        found, cause = self._measure(step, gyro_bias, prior, cov)
         self.lost.add(step.end_ns, cause)
         return found
 
-    def _measure(self, step: Step, twist: FloatArray, prior: Transform3, cov: FloatArray) -> tuple[CloudPose | None, str]:
+    def _measure(self, step: Step, gyro_bias: FloatArray, prior: Transform3, cov: FloatArray) -> tuple[CloudPose | None, str]:
         """The pose, and why the cloud is lost; "" where it is not, also of the first cloud."""
         assert step.scan is not None
         c, mount = self._config, self._mounts.get(step.scan.frame_id, Mount())
@@ -70,7 +71,8 @@ class CloudMatchingSensor:
         sweep = Sweep.from_scan(step.scan, mount, c.min_range_m, c.max_range_m)
         if len(sweep.points) < MIN_POINTS:
             return None, "sparse"
-        points = sweep.deskew_in_space(twist)
+        velocity = np.array([step.twist[0], step.twist[1], 0.0])
+        points = sweep.deskew_in_space(velocity, _turns(step, sweep.times, gyro_bias))
         if self._map is None:
             self._map = CloudMap(c.voxel_size_m or choose_voxel_size(points), c.range_noise_m)
             self.cloud = thin(points, self._map.cell)
@@ -107,3 +109,13 @@ class CloudMatchingSensor:
     def map_points(self) -> Points2:
         """(M, 2) points of the submap projected to the plane [m]."""
         return np.empty((0, 2)) if self._map is None else se3.transform(self._odom_T_map, self._map.points())[:, :2]
+
+
+def _turns(step: Step, times: FloatArray, gyro_bias: FloatArray) -> FloatArray:
+    """(N, 3) turns of the body from the end of ``step``, the middle of the sweep, to ``times`` (N,) after it [rad]: by the gyro, else by
+    the wheels."""
+    is_left_out = step.turn is None and step.duration > 0.0  # by a sensor check
+    if step.body_turn is None or is_left_out:
+        return np.outer(times, [0.0, 0.0, step.twist[2]])
+    known, *turned = step.body_turn.sweep.T
+    return np.column_stack([np.interp(times, known, angles) for angles in turned]) - np.outer(times, gyro_bias)

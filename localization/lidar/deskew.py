@@ -53,12 +53,13 @@ class Sweep:
         _move(self.points, self.times, twist, points)
         return points
 
-    def deskew_in_space(self, twist: FloatArray) -> FloatArray:
-        """(N, 3) as `deskew`, of a body that moves with constant ``twist`` (6,) of SE(3) [m/s, rad/s]."""
-        if not len(self.times) or not np.any(twist):
+    def deskew_in_space(self, velocity: FloatArray, turns: FloatArray) -> FloatArray:
+        """(N, 3) as `deskew`, of a body that moves with constant ``velocity`` (3,) in its own axes [m/s], but turns by ``turns`` (N, 3)
+        from the middle to each point's time [rad]: a robot that rocks on its wheels does not turn at a constant rate within a sweep."""
+        if not len(self.times):
             return self.points
         points = np.empty_like(self.points)
-        _move_in_space(self.points, self.times, twist, points)
+        _move_in_space(self.points, np.outer(self.times, velocity), turns, points)
         return points
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -116,11 +117,10 @@ def _move(points: FloatArray, times: FloatArray, twist: Twist2, out: FloatArray)
 
 
 @kernel
-def _move_in_space(points: FloatArray, times: FloatArray, twist: FloatArray, out: FloatArray) -> None:
-    """Fill ``out`` (N, 3) with ``points`` after the motion at ``twist`` (6,) for ``times`` (N,), to second order in the turn."""
+def _move_in_space(points: FloatArray, ways: FloatArray, turns: FloatArray, out: FloatArray) -> None:
+    """Fill ``out`` (N, 3) with ``points`` after ``ways`` in the body's axes (N, 3) and ``turns`` (N, 3), to second order in the turns."""
     for i in range(points.shape[0]):
-        t = times[i]
-        x, y, z, a, b, c = t * twist[0], t * twist[1], t * twist[2], t * twist[3], t * twist[4], t * twist[5]
+        x, y, z, a, b, c = ways[i, 0], ways[i, 1], ways[i, 2], turns[i, 0], turns[i, 1], turns[i, 2]
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         qx, qy, qz = b * pz - c * py, c * px - a * pz, a * py - b * px
         rx, ry, rz = b * qz - c * qy, c * qx - a * qz, a * qy - b * qx

@@ -40,7 +40,7 @@ def moved(state, name, error):
 @pytest.mark.parametrize(
     ("measure", "atol"),
     [
-        (lambda s: measure_body_turn(s, BodyTurn(np.array([0.01, -0.02, 0.12]), 1e-6, 0.1, np.zeros(3))), 2e-3),
+        (lambda s: measure_body_turn(s, BodyTurn(np.array([0.01, -0.02, 0.12]), 1e-6, 0.1, np.zeros((1, 4)))), 2e-3),
         (lambda s: measure_gravity(s, Gravity(np.array([0.5, 1.0, 9.7]), 0.01)), 1e-5),
         (lambda s: measure_scan(s, POSE, np.eye(6)), 1e-5),
     ],

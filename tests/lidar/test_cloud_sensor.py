@@ -16,7 +16,7 @@ from tests.helpers.hill_map import cloud_at, on_hills, scene_around
 MOUNT = Mount(0.1, 0.0, 0.3)
 COV = np.diag([0.1**2] * 3 + [0.03**2] * 3)
 START, AHEAD = on_hills(0.0, 0.0, 0.0), on_hills(1.2, 0.1, 0.1)
-NO_TWIST = np.zeros(6)
+NO_BIAS = np.zeros(3)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def step_at(seconds, points):
 def sensor(scene):
     """With a submap of one cloud."""
     made = CloudMatchingSensor({"lidar": MOUNT}, LidarConfig())
-    assert made.measure(step_at(1.0, cloud_at(START, scene)), NO_TWIST, START, COV) is None
+    assert made.measure(step_at(1.0, cloud_at(START, scene)), NO_BIAS, START, COV) is None
     error = made.insert_key_cloud(START)
     assert error is not None
     np.testing.assert_array_equal(error.new_cov, np.zeros((6, 6)))  # unknown before the first match
@@ -45,7 +45,7 @@ def sensor(scene):
 def measure(sensor, scene, pose, seed=2, seconds=2.0):
     """A cloud from ``pose``, matched by a prior that is 5 cm off."""
     prior = pose @ se3.exp(np.array([0.05, -0.03, 0.0, 0.0, 0.0, 0.01]))
-    return sensor.measure(step_at(seconds, cloud_at(pose, scene, seed)), NO_TWIST, prior, COV)
+    return sensor.measure(step_at(seconds, cloud_at(pose, scene, seed)), NO_BIAS, prior, COV)
 
 
 def test_cloud_sensor_measures_the_pose_against_the_submap(sensor, scene):
@@ -76,9 +76,9 @@ def test_cloud_is_a_key_cloud_after_a_way_only(sensor, scene):
 
 
 def test_cloud_that_is_sparse_or_elsewhere_is_lost(sensor, scene):
-    assert sensor.measure(step_at(2.0, np.ones((3, 3))), NO_TWIST, START, COV) is None
+    assert sensor.measure(step_at(2.0, np.ones((3, 3))), NO_BIAS, START, COV) is None
     elsewhere = se3.exp(np.array([300.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    assert sensor.measure(step_at(2.1, cloud_at(START, scene)), NO_TWIST, elsewhere, COV) is None
+    assert sensor.measure(step_at(2.1, cloud_at(START, scene)), NO_BIAS, elsewhere, COV) is None
     assert sensor.lost.causes == {"sparse": 1, "lost": 1}
     sensor.add_no_cloud(2_200_000_000, is_excluded=True)
     assert sensor.lost.causes["excluded"] == 1

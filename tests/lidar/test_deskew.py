@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from localization.events import Scan
 from localization.lidar import Sweep
@@ -84,6 +85,17 @@ def test_sweep_with_infinite_points_leaves_them_out(times: bool) -> None:
     assert sweep.points.shape == (3, 3)
     np.testing.assert_array_equal(sweep.times, np.array([0.0, 2.0, 5.0]) - 2.5 if times else [])
     assert Sweep.from_scan(Scan(0, np.full((4, 3), math.nan)), Mount()).deskew(np.ones(3)).shape == (0, 3)
+
+
+def test_sweep_of_a_body_that_rocks_is_deskewed_by_its_turns() -> None:
+    """It drives ahead, turns and pitches to and fro within the sweep; by its mean rates points would be more than a centimetre off."""
+    times, rng = np.linspace(-0.05, 0.05, 60), np.random.default_rng(1)
+    turns = np.column_stack([0.0 * times, 4e-3 * np.sin(40.0 * times) ** 2, 0.3 * times])
+    velocity, true = np.array([0.7, 0.0, 0.0]), rng.uniform(-10.0, 10.0, (60, 3))
+    ways = times[:, None] * velocity + 0.5 * times[:, None] ** 2 * np.cross([0.0, 0.0, 0.3], velocity)
+    sweep = Sweep(Rotation.from_rotvec(turns).inv().apply(true - ways), times, is_planar=False)
+    np.testing.assert_allclose(sweep.deskew_in_space(velocity, turns), true, atol=1e-4)
+    assert np.abs(sweep.deskew_in_space(velocity, np.outer(times, [0.0, 0.0, 0.3])) - true).max() > 0.01
 
 
 def test_sweep_within_keeps_points_in_range() -> None:

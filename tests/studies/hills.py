@@ -307,7 +307,8 @@ def _predicted(made: HillDrive, clouds: list[Scan]) -> tuple[FloatArray, FloatAr
     stamps = np.array([cloud.middle_ns for cloud in clouds])
     begins, ends = true_poses(by_wheels, stamps - SWEEP_NS // 2), true_poses(by_wheels, stamps + SWEEP_NS // 2)
     twists = (se3.log(se3.inverse(a) @ b) / (1e-9 * SWEEP_NS) for a, b in zip(begins, ends, strict=True))
-    points = (Sweep(_in_body(c), c.times_from_middle, False).deskew_in_space(twist) for c, twist in zip(clouds, twists, strict=True))
+    sweeps = (Sweep(_in_body(cloud), cloud.times_from_middle, False) for cloud in clouds)
+    points = (s.deskew_in_space(twist[:3], np.outer(s.times, twist[3:])) for s, twist in zip(sweeps, twists, strict=True))
     return stamps, true_poses(by_wheels, stamps), points
 
 
