@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -12,27 +12,57 @@ from localization.events import Step
 from localization.sensor_checks.reckoning import ESTIMATE, GYRO, WHEELS, Reckoning
 from localization.trajectory import Trajectory
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray
+from motion_models.se2 import Cov3, FloatArray, Pose2, Tangent2
 
 DeadReckoning = Literal["wheels", "wheels and gyro"]
 """Motion by the wheels alone, and that with the turns by the gyro."""
 
 
+@dataclass(frozen=True, eq=False)
+class CarriedError:
+    """Covariance of what past faults have done to the pose, carried along with the body as that of an estimate is."""
+
+    cov: Cov3 = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3) of the right perturbation of ``pose``."""
+    pending: Cov3 = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3) that was added since, of the right perturbation of the next pose."""
+    pose: Pose2 = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the estimate."""
+    count: int = 0
+    """Differences that were added."""
+    is_any: bool = False
+    """Whether any fault has done anything."""
+
+    def plus(self, difference: Tangent2) -> CarriedError:
+        """With ``difference`` (3,), of which the direction is known and the sign is not."""
+        pending = self.pending + np.outer(difference, difference)
+        return replace(self, pending=pending, count=self.count + 1, is_any=True)
+
+    def moved(self, pose: Pose2) -> CarriedError:
+        """At the next ``pose`` (3,): e' = Ad(pose'^-1 pose) e, and what was added."""
+        if not self.is_any:
+            return replace(self, pose=pose)
+        A = se2.adjoint(se2.between(pose, self.pose))
+        return replace(self, cov=A @ self.cov @ A.T + self.pending, pending=np.zeros((3, 3)), pose=pose)
+
+    @property
+    def total(self) -> Cov3:
+        """(3, 3) of both."""
+        return np.asarray(self.cov + self.pending)
+
+
 class CovarianceInflation:
-    """Differences that were added, carried along with the body as the covariance of an estimate is."""
+    """`inflate` estimates by what past faults have done to them, and by how far a disagreement that lasts has taken them."""
 
     def __init__(self) -> None:
         self.reckoning = Reckoning()
         """By the sensors, and by the estimate."""
         self._agreed = self.reckoning.poses  # where the sensors last agreed
-        self._pose = np.zeros(3)  # of the estimate, of which `_spread` is a right perturbation
-        self._pending, self._spread = np.zeros((3, 3)), np.zeros((3, 3))
-        self._has_spread = False
+        self.carried = CarriedError()
+        """By past faults."""
         self._since_ns: int | None = None
         self.are_wheels_outvoted = False
         """The wheels contradict the gyro, which the LiDAR confirms: their distance from the estimate is no error of it."""
-        self.count = 0
-        """Differences that were added."""
         self.ongoing_pair: FloatArray | None = None
         """(3,) difference of a pair of sensors that differ for now."""
         self.ongoing_scene: FloatArray | None = None
@@ -60,7 +90,7 @@ class CovarianceInflation:
 
     def add(self, difference: FloatArray) -> None:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""
-        self._pending, self.count, self._has_spread = self._pending + np.outer(difference, difference), self.count + 1, True
+        self.carried = self.carried.plus(difference)
 
     @property
     def is_acting(self) -> bool:
@@ -70,30 +100,21 @@ class CovarianceInflation:
     @property
     def is_inflating(self) -> bool:
         """Whether the covariance has anything of a fault."""
-        return (self._has_spread or self.is_lasting) and bool(self.total.any())
+        return (self.carried.is_any or self.is_lasting) and bool(self.total.any())
 
     @property
     def is_lasting(self) -> bool:
         """Whether sensors differ at present."""
         return self.ongoing_pair is not None or self.ongoing_scene is not None
 
-    @property
-    def spread(self) -> Cov3:
-        """Covariance (3, 3) of what past faults have done to the pose."""
-        return np.asarray(self._spread + self._pending)
-
     def set_known(self, spread: Cov3) -> None:
         """A place from before the faults has shown the pose: its covariance ``spread`` (3, 3) is what is left of them."""
-        self._spread, self._pending, self._has_spread = spread, np.zeros((3, 3)), True
+        self.carried = replace(self.carried, cov=spread, pending=np.zeros((3, 3)), is_any=True)
         self.restart()
 
     def inflate(self, estimate: Estimate) -> Estimate:
         """``estimate``, the last of `reckoning`, with the covariance of all differences so far."""
-        before, self._pose = self._pose, self.reckoning.poses[ESTIMATE]
-        if self._has_spread:
-            A = se2.adjoint(se2.between(self._pose, before))
-            self._spread = A @ self._spread @ A.T + self._pending
-            self._pending = np.zeros((3, 3))
+        self.carried = self.carried.moved(self.reckoning.poses[ESTIMATE])
         if estimate.covariance is not None and self.possible is not None:
             estimate = estimate.widened(np.outer(self.possible, self.possible))
         if estimate.covariance is None or not self.is_inflating:
@@ -116,7 +137,7 @@ class CovarianceInflation:
     @property
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
-        total = self.spread
+        total = self.carried.total
         for difference in (self.ongoing_pair, self.ongoing_scene):
             total = total if difference is None else total + np.outer(difference, difference)
         return total

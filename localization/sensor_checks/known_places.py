@@ -51,10 +51,10 @@ class KnownPlaces:
         Returns whether a place has shown the pose: differences of sensors count from here on."""
         inflation, now_s = self._inflation, self._faults.now_s
         is_lasting = inflation.is_lasting
-        if (is_lasting and not self._was_lasting) or inflation.count > self._count:
+        if (is_lasting and not self._was_lasting) or inflation.carried.count > self._count:
             begin_s = self._faults.latest_s
             self._places = [p for i, p in enumerate(self._places) if not i or p.at_s < begin_s - _MARGIN_S]
-        self._was_lasting, self._count = is_lasting, inflation.count
+        self._was_lasting, self._count = is_lasting, inflation.carried.count
         if not is_lasting:
             self._keep(profile_of, pose, now_s)
         if not inflation.is_inflating or now_s - self._compared_s < _EVERY_S:
@@ -73,7 +73,7 @@ class KnownPlaces:
                 return
         profile = profile_of()
         if profile is not None:
-            self._places.append(_Place(now_s, pose, profile, self._inflation.spread))
+            self._places.append(_Place(now_s, pose, profile, self._inflation.carried.total))
             del self._places[1 : 1 + len(self._places) - _MAX_PLACES]
 
     def _find(self, profile_of: Callable[[], Profile | None], pose: Pose2) -> Cov3 | None:

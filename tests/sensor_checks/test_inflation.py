@@ -9,6 +9,7 @@ import pytest
 
 from localization.estimators import Estimate
 from localization.sensor_checks.contradictions import LIDAR_DIRECTION
+from localization.sensor_checks.inflation import CarriedError
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.checked_drive import SPEED, CheckedDrive, turned
@@ -41,3 +42,22 @@ def test_fault_inflates_the_covariance_by_what_it_has_done() -> None:
     assert inflated.covariances is not None
     np.testing.assert_allclose(inflated.covariances[-1], end.covariance, atol=1e-9)
     np.testing.assert_allclose(inflated.covariances[0], 1e-6 * np.eye(3))
+
+
+def test_error_carried_along_is_that_of_the_start_seen_from_the_body() -> None:
+    """The pose before was off by e: all later ones are compose(exp of it, motion), to first order."""
+    off, before, after = np.array([1e-4, -2e-4, 3e-4]), np.array([1.0, 2.0, 0.4]), np.array([3.0, 1.5, 1.3])
+    carried = CarriedError().moved(before).plus(off)
+    np.testing.assert_allclose(carried.total, np.outer(off, off))
+    moved = carried.moved(before).moved(after)
+    true = se2.compose(se2.retract(before, off), se2.between(before, after))
+    error = se2.local(after, true)
+    np.testing.assert_allclose(moved.total, np.outer(error, error), rtol=2e-3)
+    assert moved.count == 1
+    assert not moved.pending.any()
+
+
+def test_error_that_nothing_was_added_to_is_none_anywhere() -> None:
+    carried = CarriedError().moved(np.array([5.0, 0.0, 1.0]))
+    assert not carried.is_any
+    assert not carried.total.any()
