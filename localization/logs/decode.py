@@ -62,7 +62,7 @@ class Oddity(Enum):
     TIPPING = "with arms at which the robot would tip over (joints in degrees?); their centre of gravity was left out"
     TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
     WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
-    SECOND_PUBLISHER = "of a second publisher whose wheels turn less, left out; stop one of the two (`ros2 topic info --verbose`)"
+    SECOND_PUBLISHER = "of a second publisher whose wheels turn no more, left out; stop one of the two (`ros2 topic info --verbose`)"
     FROZEN_WHEEL = "with an angle that does not change while another wheel of its side turns; it was left out (check its encoder)"
     CONSTANT_ANGLES = "with wheel angles that never change while the rates do; the increments were taken from the rates"
     WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"

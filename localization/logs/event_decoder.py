@@ -60,6 +60,8 @@ _MIN_SWAPS = 6
 _VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
 """Noise and largest acceleration of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size
 brake at up to 3 m/s^2."""
+_MORE = 1.2
+"""Travelled by a second publisher over that of the one in use, from where on the second is used: equal ones do not take turns."""
 _FROZEN_AFTER_RAD = 0.5
 """Turned by another wheel of the same side; these are coupled by a chain or by the ground."""
 _SAME_CG_NS = 1_000_000_000
@@ -261,12 +263,13 @@ class _Publisher:
 class PublisherSeparator:
     """Separates the readings of two publishers that share a topic: velocities and poses alternate between them.
 
-    The one whose wheels travel more is used. A single step to other values is a reset, a stop, or noise.
+    The one whose wheels travel more is used, of equal ones one. A single step to other values is a reset, a stop, or noise.
     """
 
     def __init__(self) -> None:
         self._current: _Publisher | None = None
         self._other: _Publisher | None = None
+        self._used: _Publisher | None = None
         self._swaps = 0
 
     def admit(self, stamp_ns: int, motion: _Motion, speed: float) -> bool:
@@ -287,7 +290,12 @@ class PublisherSeparator:
             current.travelled += speed * (stamp_ns - current.stamp_ns) * 1e-9
         current.stamp_ns, current.motion = stamp_ns, motion
         self._current = current
-        return self._other is None or self._swaps < _MIN_SWAPS or current.travelled >= self._other.travelled
+        if self._other is None or self._swaps < _MIN_SWAPS:
+            return True
+        used, rival = (current, self._other) if current is self._used else (self._other, current)
+        if used is not self._used or rival.travelled > _MORE * used.travelled:
+            self._used = max(used, rival, key=lambda publisher: publisher.travelled)
+        return current is self._used
 
 
 def _may_follow(publisher: _Publisher, stamp_ns: int, motion: _Motion) -> bool:

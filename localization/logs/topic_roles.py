@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,9 @@ REFERENCE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
     "sensor_msgs/msg/NavSatFix",
 )
+_WHEEL_WORDS = re.compile(r"wheel|motor|encoder|tick|joint|odom")
+"""Names of topics that may be the wheels', of whatever type."""
+_MAX_LISTED = 4
 
 
 @dataclass(frozen=True)
@@ -184,7 +188,20 @@ class TopicChooser:
         several = self.candidates("odometry") if wanted.odometry is None else []
         if len(several) > 1:
             return f"{found} {', '.join(several)} could each be it: name the wheels' with --topic.odometry."
-        return f"{found}{self.describe_other_odometry()}"
+        return f"{found}{self.describe_other_odometry()}{self._describe_other_types()}"
+
+    def _describe_other_types(self) -> str:
+        """Topics of other types that are the wheels' by name, and what to do: a sentence after a blank, "" where there are none."""
+        read = {*TYPES.values(), *TWIST_TYPES, *TF_TYPES, *REFERENCE_TYPES}
+        named = {topic: kind for topic, kind in self._types.items() if kind not in read and _WHEEL_WORDS.search(topic.lower())}
+        if not named:
+            return ""
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(named.items())[:_MAX_LISTED])
+        it, types = ("it", "its type is") if len(named) == 1 else ("they", "their types are")
+        return (
+            f" {listed}: by name {it} may be the wheels', but {types} not read: let a node publish them as sensor_msgs/JointState, with the"
+            " names of the wheels' joints and their angles or rates."
+        )
 
     def describe_other_odometry(self) -> str:
         """Which Odometry is by its name none of wheels, and what it is for: a sentence after a blank, "" where there is none."""

@@ -153,7 +153,7 @@ def test_second_publisher_of_zeros_loses_no_distance(tmp_path: Path, offset_ms: 
     log = opened(tmp_path, sorted(records(), key=lambda record: record[2]))
     found = wheels_of(log)
     np.testing.assert_allclose(found[-1].position, single[-1].position, atol=2.0)  # of 40 to 60 rad; the first 0.25 m cannot be separated
-    assert "of a second publisher whose wheels turn less, left out" in warnings_of(log)
+    assert "of a second publisher whose wheels turn no more, left out" in warnings_of(log)
 
 
 def test_encoder_reset_is_no_second_publisher(tmp_path: Path) -> None:
@@ -255,7 +255,7 @@ def test_second_publisher_of_rates_only_loses_no_distance(tmp_path: Path, first:
         np.testing.assert_allclose(found[-1].position, single[-1].position, rtol=0.02)
     else:
         np.testing.assert_allclose(np.mean([s.velocity for s in found], axis=0), single[-1].velocity, rtol=0.03)
-    assert "of a second publisher whose wheels turn less, left out" in warnings_of(log)
+    assert "of a second publisher whose wheels turn no more, left out" in warnings_of(log)
 
 
 def test_second_publisher_of_odometry_loses_no_distance(tmp_path: Path) -> None:
@@ -271,6 +271,22 @@ def test_second_publisher_of_odometry_loses_no_distance(tmp_path: Path) -> None:
     np.testing.assert_allclose(driven, 0.5 * 499 / 50, rtol=0.03)
     assert "/odom: " in warnings_of(log)
     assert "of a second publisher" in warnings_of(log)
+
+
+def test_second_publisher_of_odometry_of_equal_ways_is_left_out(tmp_path: Path) -> None:
+    """A simulator's odometry of another frame beside that of the wheels, with the same speeds."""
+    records = []
+    for i in range(500):
+        stamp = START + i * S // 50
+        x = 0.5 * i / 50
+        records.append(("/odom", bags.odometry(stamp, x=x, vx=0.5), stamp))
+        records.append(("/odom", bags.odometry(stamp + 8_000_000, x=x + 6.0, y=-3.0, vx=0.5), stamp + 8_000_000))
+    log = opened(tmp_path, records)
+    found = wheels_of(log)
+    driven = (found[-1].position - found[0].position) * ROBOT.driver.wheel_radius_m
+    np.testing.assert_allclose(driven, 0.5 * 499 / 50, rtol=0.03)
+    assert len(found) < 520
+    assert "of a second publisher whose wheels turn no more, left out" in warnings_of(log)
 
 
 def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> None:

@@ -376,3 +376,12 @@ def test_wheel_joints_of_two_robots_are_refused_with_both_names(tmp_path: Path) 
     log = prefixed_log(tmp_path, "robot1/", "robot2/")
     with pytest.raises(TopicError, match="front_left_wheel may be robot1/front_left_wheel or robot2/front_left_wheel"):
         list(log.events())
+
+
+def test_log_without_wheels_names_topics_of_other_types_that_may_be_theirs(tmp_path: Path) -> None:
+    records: list[Record] = [("/scan", bags.laser_scan(START + i * S // 10), START + i * S // 10) for i in range(20)]
+    records += [("/firmware/wheel_states", bags.Unknown("leo_msgs/msg/WheelStates"), START + i * S // 10 + 5) for i in range(20)]
+    records += [("/battery", bags.Unknown("leo_msgs/msg/Battery"), START + i * S // 10 + 7) for i in range(20)]
+    log = open_log(bags.write_mcap(tmp_path / "run.mcap", sorted(records, key=lambda record: record[2])), ROBOT)
+    assert "/firmware/wheel_states (leo_msgs/msg/WheelStates): by name it may be the wheels'" in log.no_wheels
+    assert "/battery" not in log.no_wheels
