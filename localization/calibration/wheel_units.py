@@ -17,6 +17,9 @@ CORRECTED = "Corrected in this run; write to the robot file:"
 """Words in sentences about what is certain, before keys of the robot file."""
 MAX_RATIO = 2.5
 """Factor by which wheels may be off without a wrong unit: slip, a wrong radius or track, as in the sensor checks."""
+_MAX_FASTER = 1.5
+"""Speed by the LiDAR over that of a driver's odometry, up to which its unit is right: wheels that slip or spin, and scans of corridors,
+make it less than 1."""
 _NEAR, _NEAR_M_S, _MIN_NEAR = 0.3, 0.05, 0.6
 """Part of a speed, and speed [m/s], by which another sensor's may be off its usual multiple; least share of fast intervals that are near.
 Of fr079's corridor, whose walls are parallel, a fifth is not."""
@@ -110,7 +113,7 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
 def check_length_unit(speed: FloatArray, other: FloatArray | None, robot: Robot) -> UnitReport:
     """Unit of the lengths of a driver's odometry, whose forward speed is ``speed`` (n,), by the speed (n,) of another sensor [m/s]."""
     ratio = None if other is None else _ratio(speed, without_outliers(speed, other))
-    if ratio is None or 1 / MAX_RATIO <= ratio <= MAX_RATIO:
+    if ratio is None or 1 / MAX_RATIO <= ratio <= _MAX_FASTER:
         return UnitReport(robot)
     value = ratio * robot.driver.length_unit_m
     name = min(_LENGTHS, key=lambda known: abs(math.log(value / _LENGTHS[known])))

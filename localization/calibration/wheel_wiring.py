@@ -74,6 +74,9 @@ _MIN_AHEAD_M, _MIN_TURNED_RAD, _SAME_END = 0.1, 1.5, 0.25
 is: robots turn about a point up to 5 cm from the middle of their wheels."""
 _MAX_DEAD = 1e-6
 """Part of the rates of a side's fastest wheel, up to which an encoder counts nothing."""
+_MIN_ROLLING = 0.2
+"""Spread of the difference of two wheels of a side, of that of all rates, from where on they turn against each other: skid-steer wheels
+have 0.01 to 0.1."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -220,7 +223,7 @@ def check_live(sensors: LiveSensors, signals: WheelSignals, is_clock_known: bool
     """
     is_clock_known = is_clock_known or len(signals.rates) < _MIN_CLOCK_INTERVALS
     if not signals.joints:
-        return _odometry_of(sensors, signals, is_clock_known)
+        return _odometry_of(sensors, signals, is_clock_known, _USUAL_M_S)
     signals, found = _wiring_of(sensors, signals, is_clock_known)
     if found.findings:
         return found
@@ -307,8 +310,29 @@ def _wiring_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bo
         signals = with_lidar(log, signals)
     measured = correlations(signals, rates, base)
     if _is_accepted(signals, rates, base):
-        return signals, WiringReport(log.robot, correlations=measured)
+        return signals, WiringReport(log.robot, _rollers(signals, rates, base), correlations=measured)
     return signals, _corrected(log, signals, base, measured)
+
+
+def _rollers(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> tuple[str, ...]:
+    """A sentence where the two wheels of each side turn against each other, on both sides at once: on rollers (mecanum, omni) that moves
+    the robot to the side. Wheels that slip or spin do it on one side, or differ without the other side."""
+    if (len(wiring.left), len(wiring.right)) != (2, 2):
+        return ()
+    known = rates[np.isfinite(rates).all(axis=1)]
+    a, b = (known[:, side[0]] - known[:, side[1]] for side in (wiring.left, wiring.right))
+    total, sizes = float(known.std()), (float(a.std()), float(b.std()))
+    if len(known) < _MIN_CLOCK_INTERVALS or min(sizes) < _MIN_ROLLING * max(total, 1e-9):
+        return ()
+    r = float(np.corrcoef(a, b)[0, 1])
+    if abs(r) < _SURE_CORRELATION:
+        return ()
+    names = " and ".join(", ".join(signals.joints[i] for i in side) for side in (wiring.left, wiring.right))
+    return (
+        f"the two wheels of each side turn against each other at the same times ({names}: correlation {r:+.2f}): mecanum or omni wheels,"
+        " which then move the robot to the side. Motion models here have none of that: where the robot moves to the side, dead reckoning is"
+        " wrong, and only a LiDAR measures it.",
+    )
 
 
 def _corrected(sensors: Log | LiveSensors, signals: WheelSignals, base: Wiring, measured: Mapping[str, float]) -> WiringReport:
@@ -362,19 +386,24 @@ def _share_of_other_end(sensors: Log | LiveSensors, signals: WheelSignals) -> fl
 
 def _check_odometry(log: Log, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
     """`_odometry_of` a log; what another clock or unit hides is compared on the right one."""
-    found = _odometry_of(log, signals, is_clock_known)
+    found = _odometry_of(log, signals, is_clock_known, usual_m_s=None)
     is_clock = any(key.startswith("clock.") for key in found.keys)
     if not is_clock and "driver.length_unit_m" not in found.keys:
         return found
     return _joined(found, check_wiring(open_log(log.path, found.robot, log.overrides), is_clock_known or is_clock))
 
 
-def _odometry_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bool) -> WiringReport:
-    """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's, after their clocks."""
+def _odometry_of(
+    log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bool, usual_m_s: tuple[float, float] | None
+) -> WiringReport:
+    """Wheels that are a driver's odometry: its turns against the gyro's and the LiDAR's, after their clocks.
+
+    ``usual_m_s``: fast speeds that are not compared with the LiDAR's, which takes milliseconds a scan; None: all are.
+    """
     assert log.sources.wheels is not None
     topic = log.sources.wheels.topic
     fastest = float(np.nan_to_num(np.nanpercentile(np.abs(signals.speeds[topic]), 95.0))) if topic in signals.speeds else 0.0
-    if fastest > 0.0 and (isinstance(log, Log) or not _USUAL_M_S[0] <= fastest <= _USUAL_M_S[1]):
+    if fastest > 0.0 and (usual_m_s is None or not usual_m_s[0] <= fastest <= usual_m_s[1]):
         signals = with_lidar(log, signals)
         units = check_length_unit(signals.speeds[topic], signals.speeds.get("LiDAR"), log.robot)
         if units.findings:

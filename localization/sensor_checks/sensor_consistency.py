@@ -29,7 +29,8 @@ DIFFERENCES: Mapping[Pair, SensorFault] = {
 """What is reported of each pair that differs."""
 PARAMETER_FAR = SensorFault(
     "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or"
-    " load, a wrong scale of the gyro, or encoders that lose counts. {use} Fit the file with `skidloc calibrate`.",
+    " load, a wrong scale of the gyro, encoders that lose counts, or a driver's odometry with another track or wheel_separation_multiplier"
+    " than in [driver]. {use} Fit the file with `skidloc calibrate`.",
 )
 _NAMED_WITHIN_S = 10.0
 """A named fault is found at most so long after a pair begins to differ."""

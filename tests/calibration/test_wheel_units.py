@@ -131,7 +131,16 @@ def test_length_unit_of_the_drivers_odometry_is_named_by_the_lidar(unit: float, 
 def test_length_unit_of_metres_is_left_as_it_is() -> None:
     speed = np.r_[np.zeros(10), np.full(20, 0.4)]
     assert not check_length_unit(speed, 0.6 * speed, ROBOT).findings
+    assert not check_length_unit(speed, 1.3 * speed, ROBOT).findings
     assert not check_length_unit(1000.0 * speed, None, ROBOT).findings
+
+
+def test_length_unit_of_ways_at_half_their_size_is_another_wheel_radius() -> None:
+    """No slip makes a LiDAR faster than the wheels."""
+    speed = 0.5 * np.sin(0.2 * np.arange(100.0))
+    report = check_length_unit(0.5 * speed, speed + 0.005 * np.random.default_rng(1).normal(size=len(speed)), ROBOT)
+    assert float(report.keys["driver.length_unit_m"]) == pytest.approx(2.0, rel=0.03)
+    assert "another wheel radius" in report.findings[0]
 
 
 def test_length_unit_of_the_robot_file_scales_odometry(tmp_path: Path) -> None:

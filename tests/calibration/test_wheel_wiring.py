@@ -55,6 +55,29 @@ def test_wiring_with_reversed_wheels_is_corrected(tmp_path: Path, kind: str, rev
     assert corrected.findings == ()
 
 
+def test_wiring_of_wheels_on_rollers_is_named(tmp_path: Path) -> None:
+    """Mecanum wheels: front and rear ones turn against each other, which moves the robot to the side."""
+    to_the_side = np.array([-1.0, 1.0, 1.0, -1.0])
+
+    def rolling(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turned = math.sin(0.2 * float(np.abs(position).sum()))
+        return position + to_the_side * turned, velocity + 1.5 * to_the_side * turned
+
+    report = report_of(drive(tmp_path / "log.mcap", rolling))
+    (text,) = report.findings
+    assert "mecanum or omni wheels" in text
+    assert report.keys == {}
+    assert report.robot == ROBOT
+
+
+def test_wiring_of_one_side_whose_wheels_differ_is_none_on_rollers(tmp_path: Path) -> None:
+    def spinning(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        turned = math.sin(0.2 * float(np.abs(position).sum()))
+        return position, velocity + 1.5 * np.array([-1.0, 1.0, 0.0, 0.0]) * turned
+
+    assert not any("mecanum" in text for text in report_of(drive(tmp_path / "log.mcap", spinning)).findings)
+
+
 def test_wiring_without_an_encoder_that_counts_nothing(tmp_path: Path) -> None:
     kept = np.array([1.0, 0.0, 1.0, 1.0])
     report = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (kept * position, kept * velocity)))
