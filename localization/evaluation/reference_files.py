@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import operator
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -359,7 +361,11 @@ def _local(degrees: FloatArray) -> FloatArray:
 
 def _read_nmea(lines: Sequence[str], path: Path, log_stamps: LogStamps | None) -> _Poses:
     """GGA (and RMC for the date, or for positions where there is no GGA). Without a date the day is the log's."""
-    sentences = [line.strip().split("*")[0].split(",") for line in lines if line.startswith("$")]
+    whole = [line for line in lines if line.startswith("$") and _is_intact(line)]
+    sentences = [line.strip().split("*")[0].split(",") for line in whole]
+    lost = sum(line.startswith("$") for line in lines) - len(whole)
+    if not sentences:
+        raise EvaluationError(f"'{path}': the checksums of all {lost} NMEA sentences are wrong.")
     kinds = {words[0][3:] for words in sentences}
     kind = next((k for k in ("GGA", "GNS", "RMC") if k in kinds), None)
     if kind is None:
@@ -380,15 +386,21 @@ def _read_nmea(lines: Sequence[str], path: Path, log_stamps: LogStamps | None) -
     if not rows:
         raise EvaluationError(f"'{path}' has no {kind} sentence with a fix.")
     stamps = np.unwrap(np.array([row[0] for row in rows], dtype=float), period=float(_DAY_NS)).round().astype(np.int64)
-    warnings: tuple[str, ...] = ()
+    warnings = (f"{path}: {lost} NMEA sentences with a wrong checksum are left out.",) if lost else ()
     if midnight is None:
         own = np.empty(0, dtype=np.int64) if log_stamps is None else log_stamps()
         if not len(own):
             raise EvaluationError(f"'{path}' has no date: record RMC sentences too.")
         midnight = int(own[0]) // _DAY_NS * _DAY_NS
         midnight += round((int(own[0]) - midnight - int(stamps[0])) / _DAY_NS) * _DAY_NS
-        warnings = (f"{path} has times of the day without a date (no RMC): the log's is taken.",)
+        warnings = (*warnings, f"{path} has times of the day without a date (no RMC): the log's is taken.")
     return _Poses(stamps + midnight, _local(np.array([row[1:] for row in rows])), warnings=warnings)
+
+
+def _is_intact(line: str) -> bool:
+    """Whether the bytes between $ and * have the checksum behind the *; sentences without one are taken as they are."""
+    body, mark, check = line.strip()[1:].partition("*")
+    return not mark or check[:2].upper() == f"{functools.reduce(operator.xor, body.encode(errors='replace'), 0):02X}"
 
 
 def _first_midnight_ns(sentences: Sequence[Sequence[str]]) -> int | None:

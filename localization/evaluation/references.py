@@ -9,12 +9,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.errors import EvaluationError
 from localization.events import Reference
 from localization.trajectory import IntArray, number_rows, parse_float, parse_seconds
 from motion_models.se2 import FloatArray
 
+BoolArray = NDArray[np.bool_]
+_MIN_JUDGED, _FAST_PERCENT, _JUMP_STEPS, _BACK = 20, 80.0, 20.0, 0.1
+"""Positions, at least; a fast step of all [%]; length of a jump in such steps; how much of it the neighbours may be apart. In no reference
+of tests/data is a sample beyond."""
 RELATION_COLUMNS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
 
 
@@ -140,6 +145,10 @@ def make_track(
     if not order.size:
         raise EvaluationError(f"{source} holds no usable sample ({dropped} in it, none of them finite).")
     warnings: tuple[str, ...] = ()
+    far = _single_jumps(positions[order])
+    if far.any():
+        order = order[~far]
+        warnings += (f"{far.sum()} of {len(stamps)} positions of {source} were dropped: a jump away, and back with the next one.",)
     if dropped:
         warnings += (f"{dropped} of {len(stamps)} samples of {source} were dropped: not finite, or of a repeated stamp.",)
     if yaws is not None and frozen_yaw(positions[order], yaws[order]):
@@ -153,9 +162,22 @@ def make_track(
         None if yaws is None else yaws[order],
         None if covariances is None else covariances[order],
         source,
-        dropped,
+        dropped + int(far.sum()),
         warnings,
     )
+
+
+def _single_jumps(positions: FloatArray) -> BoolArray:
+    """(N,) samples far from the one before and the one after, which are near each other: no robot goes there and back at once."""
+    found = np.zeros(len(positions), dtype=bool)
+    if len(positions) < _MIN_JUDGED:
+        return found
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    away, back = steps[:-1], steps[1:]
+    over = np.linalg.norm(positions[2:] - positions[:-2], axis=1)
+    least = np.minimum(away, back)
+    found[1:-1] = (least > _JUMP_STEPS * np.percentile(steps, _FAST_PERCENT)) & (over < _BACK * least)
+    return found
 
 
 def describe_span(stamps_ns: IntArray) -> str:

@@ -16,6 +16,7 @@ from scipy.stats import chi2, wilcoxon
 
 from localization.evaluation.consistency import mean_band
 from localization.evaluation.metrics import relation_errors
+from localization.evaluation.reference_fit import find_lever, find_scatter
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report.runs import (
@@ -70,6 +71,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         *_consistency(best),
         *_exactness(best, reference),
         *_visibility(best, reference),
+        *_by_errors(best, reference),
         *_advice(lines, best, equals, reference),
     ]
 
@@ -300,6 +302,29 @@ def _visibility(best: PlottedRun, reference: ReferenceTrack | Relations) -> list
         return []
     noise = "" if floor == reference.position_noise_m else f" of {metres(reference.position_noise_m)}"
     return [f"Errors below {metres(floor)} cannot be seen with {reference.source}, by its own covariances{noise}."]
+
+
+def _by_errors(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
+    """Which point of the robot a reference without headings is of, and the scatter of one without covariances, by the errors."""
+    errors = None if best.result.accuracy is None else best.result.accuracy.errors
+    if errors is None or isinstance(reference, Relations):
+        return []
+    found, lever = [], find_lever(errors, reference)
+    if lever is not None:
+        (ahead, left), rest = lever
+        along = f"{metres(abs(ahead))} {'ahead of' if ahead > 0.0 else 'behind'} base_link"
+        across = f"{metres(abs(left))} to the {'left' if left > 0.0 else 'right'}"
+        found.append(
+            f"{capitalize(reference.source)} is of a point {along}, {across} (an antenna, a prism): without that, {metres(rest)} of the"
+            " error would be left."
+        )
+    scatter = find_scatter(errors, reference) if reference.position_noise_m is None else None
+    if scatter is not None:
+        found.append(
+            f"The positions of {reference.source} scatter by {metres(scatter)} from one to the next: errors below that cannot be seen"
+            " with it, and its slower errors are in all errors here."
+        )
+    return found
 
 
 def _test(name: str, mean: float, band: tuple[float, float], what: str, dof: int = _DOF) -> tuple[str, str]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from pathlib import Path
 
 import numpy as np
@@ -143,14 +145,25 @@ def test_reference_nmea_takes_the_date_of_rmc_else_the_logs(tmp_path):
         lat, lon = _degrees(x, y)
         return f"48{60 * (lat - 48):010.7f},N,011{60 * (lon - 11):010.7f},E"
 
-    gga = [f"$GNGGA,2213{20 + i * 0.1:04.1f},{words(x, y)},4,12,0.7,500.0,M,47.0,M,,*00" for i, (x, y, _) in enumerate(TRUTH)]
-    rmc = "$GNRMC,221320.0,A,4800.0,N,01100.0,E,0.1,0.0,141123,,,A*00"
+    def sentence(body: str) -> str:
+        return f"${body}*{functools.reduce(operator.xor, body.encode()):02X}"
+
+    gga = [sentence(f"GNGGA,2213{20 + i * 0.1:04.1f},{words(x, y)},4,12,0.7,500.0,M,47.0,M,,") for i, (x, y, _) in enumerate(TRUTH)]
+    rmc = sentence("GNRMC,221320.0,A,4800.0,N,01100.0,E,0.1,0.0,141123,,,A")
     found = _track(tmp_path / "a.nmea", [rmc, *gga])
     np.testing.assert_allclose(found.positions, TRUTH[:, :2], atol=0.02)
     np.testing.assert_array_equal(found.stamps_ns, STAMPS)
     found = _track(tmp_path / "b.txt", gga, log_stamps=lambda: STAMPS)
     np.testing.assert_array_equal(found.stamps_ns, STAMPS)
     assert "without a date" in found.warnings[0]
+    damaged = [line.replace("48", "58", 1) if i % 7 == 3 else line for i, line in enumerate(gga)]
+    found = _track(tmp_path / "c.nmea", [rmc, *damaged])
+    kept = np.array([i % 7 != 3 for i in range(len(gga))])
+    np.testing.assert_array_equal(found.stamps_ns, STAMPS[kept])
+    np.testing.assert_allclose(found.positions - found.positions[0], TRUTH[kept, :2] - TRUTH[0, :2], atol=0.02)
+    assert f"{(~kept).sum()} NMEA sentences with a wrong checksum" in found.warnings[0]
+    with pytest.raises(EvaluationError, match="checksums of all"):
+        _track(tmp_path / "d.nmea", ["$GNRMC,221320.0,A,4800.0,N,01100.0,E,0.1,0.0,141123,,,A*00"])
 
 
 @pytest.mark.parametrize(
