@@ -42,7 +42,7 @@ from tests.studies.entrance_base_logs import (
 )
 from tests.studies.entrance_command_cases import SCANS, both, changed, q, shifted, stamp_of
 from tests.studies.entrance_commands import Case, Edit, clouded, errors_of, initialized, replayed, warnings_in
-from tests.studies.entrance_edits import NAMES, driver_odometry, joints, rotated, table
+from tests.studies.entrance_edits import NAMES, driver_odometry, joints, rotated, stretched, table
 from tests.studies.entrance_hostile_cases import each
 from tests.studies.entrances import Found, choose_outcome, urdf_of
 
@@ -126,9 +126,9 @@ def to_unknown_type(message: Any) -> list[tuple[str, Any]]:
 
 
 def on_its_side(message: Any, t: float) -> Any:
-    """The IMU's x axis points up: x to z, z to -x."""
+    """The IMU is turned by a quarter about its x axis."""
     for v in (message.angular_velocity, message.linear_acceleration):
-        v.x, v.z = v.z, -v.x
+        v.y, v.z = v.z, -v.y
     return message
 
 
@@ -273,7 +273,7 @@ def nmea(noise_m: float, bad: float) -> Callable[[Trajectory], str]:
                 check = 0
                 for char in body.encode():
                     check ^= char
-                lines.append(f"${body if rng.random() > bad else body.replace('47', '49')}*{check:02X}")
+                lines.append(f"${body if rng.random() > bad else body.replace('47', '49', 1)}*{check:02X}")
         return "\r\n".join(lines) + "\r\n"
 
     return content
@@ -329,9 +329,9 @@ WHEELS = (
     ),
     based(
         "wheels",
-        "driver's ways and turns at half their size, real",
+        "driver's ways at half their size, real",
         RING,
-        changed("/odom", lambda m: _scaled_odometry(m, 0.5, 0.5)),
+        changed("/odom", stretched(0.5)),
         ["times those of the LiDAR", "times the LiDAR's"],
         is_open=True,
     ),
@@ -359,19 +359,10 @@ WHEELS = (
 )
 
 
-def _scaled_odometry(message: Any, way: float, turn: float) -> Any:
-    p = message.pose.pose
-    yaw = 2.0 * math.atan2(p.orientation.z, p.orientation.w)
-    p.position.x, p.position.y, p.orientation = way * p.position.x, way * p.position.y, bags.quaternion(turn * yaw)
-    message.twist.twist.linear.x *= way
-    message.twist.twist.angular.z *= turn
-    return message
-
-
 MOUNTS = (
     based("mounts", "yaw of 12 deg, real", SEMINAR, rotated(math.radians(12.0)), ["12 deg", "yaw of"]),
-    based("mounts", "accelerations in g", A300_LAPS, each(CLEARPATH_IMU, in_g), ["gravity", " g "]),
-    based("mounts", "IMU with x up, real", START_OF_DAY, each("/imu/data", on_its_side), ["gravity"]),
+    based("mounts", "accelerations in g", A300_LAPS, each(CLEARPATH_IMU, in_g), ["is in g"]),
+    based("mounts", "IMU on its side, real", START_OF_DAY, each("/imu/data", on_its_side), ["gravity"]),
 )
 
 TOPICS = (
