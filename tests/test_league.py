@@ -1,5 +1,6 @@
 """The league without its peers: what they are given, and the page."""
 
+import importlib
 import subprocess
 import sys
 
@@ -8,9 +9,11 @@ import pytest
 
 from motion_models import se2
 from tests.league import page
+from tests.league.__main__ import main
 from tests.league.logs import find_logs, peer_arrays
 from tests.league.peers.exchange import Drive, matrix, peak_memory_mb, planar
-from tests.league.systems import SYSTEMS
+from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE
+from tests.studies.hills import FRONT_ENDS
 
 
 def test_peer_arrays_put_walls_where_they_are(tmp_path):
@@ -68,3 +71,29 @@ def test_memory_of_a_process_is_its_own():
     code = "from tests.league.peers.exchange import peak_memory_mb; print(peak_memory_mb())"
     child = float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
     assert child < peak_memory_mb() - 0.5 * block.nbytes / 2**20
+
+
+@pytest.mark.parametrize("system", SYSTEMS_IN_SPACE)
+def test_systems_in_space_are_skidloc_or_front_ends_of_the_study(system):
+    assert system.in_space == "" or system.in_space in FRONT_ENDS
+
+
+def test_unknown_log_ends_with_those_there_are():
+    with pytest.raises(SystemExit, match="no log mars; there are fr079, csail, aces, hills-trees, hills-grass"):
+        main(["--log", "mars"])
+
+
+def test_robot_localization_drives_the_arc_of_its_odometry(monkeypatch):
+    """A constant twist is its model's constant velocity: once that is found, the motion is that of the wheels, but for
+    its steps along the heading before them (half of 0.05 s at 0.2 rad/s, over less than 5 m); the covariance grows."""
+    monkeypatch.syspath_prepend(str(PEERS))
+    estimate = importlib.import_module("robot_localization").estimate
+    stamps = np.arange(200) * 100_000_000
+    twist = np.array([0.5, 0.0, 0.2])
+    poses = se2.exp(np.arange(200)[:, None] * 0.1 * twist)
+    empty = np.zeros((0, 3))
+    drive = Drive(stamps, empty, np.zeros(200, int), poses, np.array([0.2, 0.0, 0.3]), np.array([0.0, 0.1, 1]), 10.0)
+    found, covariances = estimate(drive)
+    body = se2.compose(se2.compose([0.2, 0.0, 0.3], poses), se2.inverse(np.array([0.2, 0.0, 0.3])))
+    np.testing.assert_allclose(se2.between(found[100], found[-1]), se2.between(body[100], body[-1]), atol=0.5 * 0.05 * 0.2 * 5.0)
+    assert covariances[-1, 0, 0] > covariances[20, 0, 0] > 0.0

@@ -1,6 +1,6 @@
 """Run skidloc and its peers on the same logs, with the defaults of each, and judge them by evo and smfeval.
 
-python -m tests.league [--log fr079,csail,aces] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
+python -m tests.league [--log fr079,csail,aces,hills-trees,hills-grass] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
 
 Peers are installed into .league/, an environment of their own, from tests/league/requirements.txt; what cannot be installed or crashes
 is a row that says so, and is tried again by the next run. What has been run is kept in the output folder and is not run again: delete a
@@ -15,7 +15,7 @@ import argparse
 import json
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +25,14 @@ from localization.evaluation.metrics import relation_errors
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.trajectory import Trajectory
 from tests.league import page
+from tests.league.hills import HILLS, SECONDS
 from tests.league.logs import find_logs, peer_arrays
-from tests.league.systems import PEERS, SYSTEMS, System
+from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE, System
 from tests.studies.buildings import REFERENCE_SIGMA, SHORT_S, Building, Drive
 
 _ENVIRONMENT = Path(".league")
 _TIMEOUT_S = 3600.0
+_ALL = (*SYSTEMS, *SYSTEMS_IN_SPACE)
 
 
 def prepare_environment() -> None:
@@ -61,7 +63,10 @@ def run_system(system: System, log: str, out: Path, folder: Path | None) -> str:
     target = out / log / system.name
     if target.with_name(f"{system.name}.json").exists():
         return ""
-    if system.peer:
+    if system.in_space is not None:
+        peers = next((_ENVIRONMENT / "lib").glob("python*/site-packages"), _ENVIRONMENT)
+        command = [sys.executable, "-m", "tests.league.hills", log, system.in_space, str(peers), str(target)]
+    elif system.peer:
         command = [str(_python()), str(PEERS / f"{system.peer}.py"), str(out / log / "drive.npz"), str(target)]
     else:
         command = [
@@ -130,10 +135,27 @@ def rows_of(log: str, building: Building, systems: Sequence[System], out: Path, 
     return rows
 
 
-def _arguments(words: Sequence[str] | None, logs: Mapping[str, Building]) -> argparse.Namespace:
+def rows_in_space(log: str, systems: Sequence[System], out: Path) -> list[dict[str, Any]]:
+    """A row for each system with a 3D LiDAR on simulated hills."""
+    (out / log).mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for system in systems:
+        reason = run_system(system, log, out, None)
+        print(f"{log}: {system.name}: {reason or 'done'}", flush=True)
+        if reason:
+            rows.append({"log": log, "system": system.name, "failure": reason})
+            continue
+        target = out / log / system.name
+        cost = json.loads(Path(f"{target}.json").read_text())
+        scores = judge(Path(f"{target}.npz"), Path(f"{target} reference.npz"))
+        rows.append({"log": log, "system": system.name, **scores, "cpu_per_s": cost["cpu_s"] / SECONDS, "memory_mb": cost["memory_mb"]})
+    return rows
+
+
+def _arguments(words: Sequence[str] | None, logs: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--log", type=lambda text: text.split(","), default=list(logs))
-    parser.add_argument("--system", type=lambda text: text.split(","), default=[system.name for system in SYSTEMS])
+    parser.add_argument("--system", type=lambda text: text.split(","), default=[system.name for system in _ALL])
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("league-out"))
     return parser.parse_args(words)
@@ -144,16 +166,17 @@ def main(words: Sequence[str] | None = None) -> None:
     folder = argparse.ArgumentParser(add_help=False)
     folder.add_argument("--folder", type=Path)
     logs = find_logs(folder.parse_known_args(words)[0].folder)
-    options = _arguments(words, logs)
-    names = {system.name for system in SYSTEMS}
-    for given, known, what in ((options.log, logs, "log"), (options.system, names, "system")):
+    options = _arguments(words, [*logs, *HILLS])
+    names = {system.name for system in _ALL}
+    for given, known, what in ((options.log, (*logs, *HILLS), "log"), (options.system, names, "system")):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}.")
-    systems = [system for system in SYSTEMS if system.name in options.system]
+    systems, in_space = ([system for system in each if system.name in options.system] for each in (SYSTEMS, SYSTEMS_IN_SPACE))
     prepare_environment()
-    rows = [row for log in options.log for row in rows_of(log, logs[log], systems, options.out, options.folder)]
+    rows = [row for log in options.log if log in logs for row in rows_of(log, logs[log], systems, options.out, options.folder)]
+    rows += [row for log in options.log if log in HILLS for row in rows_in_space(log, in_space, options.out)]
     (options.out / "league.json").write_text(json.dumps(rows, indent=1))
-    page.write(rows, systems, options.out)
+    page.write(rows, [*systems, *in_space], options.out)
     print(f"{options.out / 'league.html'}")
 
 

@@ -48,7 +48,7 @@ def write(rows: Sequence[Mapping[str, Any]], systems: Sequence[System], out: Pat
 
 def _log_section(log: str, rows: Sequence[Mapping[str, Any]]) -> str:
     scored = [row for row in rows if "ate_m" in row]
-    best = {key: min((row[key] for row in scored), default=0.0) for key in ("ate_m", "rpe_m")}
+    best = {key: min((row[key] for row in scored if key in row), default=0.0) for key in ("ate_m", "rpe_m")}
     head = "".join(f"<th>{html.escape(title)}</th>" for title, _ in _COLUMNS.values())
     body = "".join(_table_row(row, best) for row in rows)
     sentence = f"<p>{html.escape(_summary(scored))}</p>" if scored else ""

@@ -21,6 +21,8 @@ class System:
     estimator: str = ""
     """Of skidloc."""
     matcher: str = "submap"
+    in_space: str | None = None
+    """With a 3D LiDAR on hills: its name in `tests.studies.hills`, empty for skidloc."""
 
 
 SYSTEMS: Sequence[System] = (
@@ -39,4 +41,13 @@ SYSTEMS: Sequence[System] = (
     System("small_gicp + wheels", "LiDAR, scan to model as in its examples, started from wheel odometry", peer="gicp"),
     System("Karto (yag_slam)", "wheels and LiDAR, slam_toolbox's matcher and graph: final poses", peer="karto"),
     System("MRPT icp-slam", "wheels and LiDAR, point map of its example icp-slam_demo_classic.ini: live poses", peer="mrpt"),
+)
+
+SYSTEMS_IN_SPACE: Sequence[System] = (
+    System("skidloc ekf in space", "wheels, IMU and 3D LiDAR, live", in_space=""),
+    System("KISS-ICP in space", "3D LiDAR alone, its defaults", in_space="KISS-ICP"),
+    System("KISS-ICP + our prediction", "started and deskewed by wheels, gyro and gravity of skidloc", in_space="KISS-ICP, our prediction"),
+    System("GenZ-ICP in space", "3D LiDAR alone, its defaults", in_space="GenZ-ICP"),
+    System("small_gicp + our prediction", "as KISS-ICP + our prediction; scan to model", in_space="small_gicp, our prediction"),
+    System("RKO-LIO", "3D LiDAR and IMU, its defaults", in_space="RKO-LIO"),
 )

@@ -201,7 +201,7 @@ def print_replays() -> None:
 
 CLOUD_DRIVES = ((1, "trees and walls"), (2, "trees and walls"), (3, "trees and walls"), (2, "open grass"))
 """Seed of the drive and scene. Seed 1 among trees was used for development, the others for verification alone."""
-_SCENES = {"trees and walls": (60, 4), "open grass": (4, 1)}
+SCENES = {"trees and walls": (60, 4), "open grass": (4, 1)}
 _CLOUD_DRIVE_S = 40.0
 _MAX_RANGE_M, _MIN_RANGE_M = 50.0, 0.3
 
@@ -214,7 +214,7 @@ def print_clouds(drives: Sequence[tuple[int, str]] = CLOUD_DRIVES, seconds: floa
     print("\n| seed | scene | estimator | ATE [m] | greatest error [m] | mean NEES (6 expected) | s of CPU |\n" + "|---" * 7 + "|")
     for seed, scene in drives:
         made = with_accelerometer_bias(drive(Wander(seed), seconds, seed=seed), seed)
-        clouds = list(scans(made, make_scene(made, seed, *_SCENES[scene]), seed=seed))
+        clouds = list(scans(made, make_scene(made, seed, *SCENES[scene]), seed=seed))
         begin = time.process_time()
         ours, _ = run_in_space(made, clouds)
         taken = time.process_time() - begin
@@ -243,7 +243,7 @@ def print_nees(drives: Sequence[tuple[int, str]] = NEES_DRIVES, seconds: float =
     means, ends = [], []
     for seed, scene in drives:
         made = with_gyro_bias(with_accelerometer_bias(drive(Wander(seed), seconds, seed=seed), seed), seed)
-        ours, _ = run_in_space(made, list(scans(made, make_scene(made, seed, *_SCENES[scene]), seed=seed)))
+        ours, _ = run_in_space(made, list(scans(made, make_scene(made, seed, *SCENES[scene]), seed=seed)))
         means.append(ours.nees[_SETTLED:].mean())
         ends.append(ours.nees[-1])
         print(f"| {seed} | {scene} | {ours.ate:.3f} | {means[-1]:.1f} | {ends[-1]:.1f} |", flush=True)
@@ -261,7 +261,7 @@ def print_ramp(seeds: Sequence[int] = (1, 2, 3)) -> None:
     for seed in seeds:
         scene = "open grass" if seed % 2 else "trees and walls"
         made = with_accelerometer_bias(drive(steady(0.7, 0.0), _RAMP_S, seed=seed, ground=RAMP), seed)
-        clouds = list(scans(made, make_scene(made, seed, *_SCENES[scene], ground=RAMP), seed=seed))
+        clouds = list(scans(made, make_scene(made, seed, *SCENES[scene], ground=RAMP), seed=seed))
         ours, _ = run_in_space(made, clouds)
         errors = ours.errors[_SETTLED:, :3]
         jump, largest = (np.linalg.norm(e, axis=1).max() for e in (np.diff(errors, axis=0), errors))

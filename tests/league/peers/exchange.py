@@ -97,7 +97,7 @@ def arguments() -> tuple[Drive, str]:
 
 
 def write(out: str, stamps_ns: NDArray[np.int64], poses: FloatArray, cpu_s: float, covariances: FloatArray | None = None) -> None:
-    """Write poses of the body (N, 3), covariances (N, 3, 3) of their right perturbations where there are any, and the cost."""
+    """Write poses of the body (N, 3), in space (N, 4, 4), covariances (N, 3, 3) of right perturbations if there are any, and the cost."""
     more = {} if covariances is None else {"covariances": covariances}
     np.savez_compressed(f"{out}.npz", stamps_ns=stamps_ns, poses=poses, **more)
     Path(f"{out}.json").write_text(json.dumps({"cpu_s": cpu_s, "memory_mb": peak_memory_mb()}))

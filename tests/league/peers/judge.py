@@ -1,17 +1,20 @@
 """Score a trajectory by outside tools: evo (errors) and smfeval (covariances). ``python judge.py estimate.npz reference.npz`` prints JSON.
 
-Both files hold stamps_ns (N,), poses (N, 3) [m, m, rad] and, where there are any, covariances (N, 3, 3) of right perturbations. The
+Both files hold stamps_ns (N,), poses (N, 3) [m, m, rad] and, where there are any, covariances (N, 3, 3) of right perturbations; in space
+poses (N, 4, 4) alone. The
 reference's poses are compared with the estimate of the same millisecond, nothing is interpolated.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from typing import Any
 
 import numpy as np
 from evo.core import metrics, sync
+from evo.core.filters import FilterException
 from evo.core.trajectory import PoseTrajectory3D
 from exchange import FloatArray, matrix, planar
 from smfeval.scoring import anees_consistency
@@ -25,24 +28,24 @@ _THIN_M2 = 1e-12
 
 
 def _trajectory(arrays: Any) -> PoseTrajectory3D:
-    return PoseTrajectory3D(poses_se3=list(matrix(arrays["poses"])), timestamps=arrays["stamps_ns"] * 1e-9)
+    poses = arrays["poses"]
+    return PoseTrajectory3D(poses_se3=list(poses if poses.ndim == 3 else matrix(poses)), timestamps=arrays["stamps_ns"] * 1e-9)
 
 
 def errors(estimate: Any, reference: Any) -> dict[str, float]:
-    """ATE (RMSE after alignment) and median relative error over 10 m of the reference's path [m], by evo."""
+    """ATE (RMSE after alignment) and, on a path long enough, median relative error over 10 m of the reference's path [m], by evo."""
     truth, track = sync.associate_trajectories(_trajectory(reference), _trajectory(estimate), max_diff=_SAME_INSTANT_S)
     rpe = metrics.RPE(
         metrics.PoseRelation.translation_part, delta=_RPE_M, delta_unit=metrics.Unit.meters, all_pairs=True, pairs_from_reference=True
     )
-    rpe.process_data((truth, track))
+    found: dict[str, float] = {"instants": truth.num_poses}
+    with contextlib.suppress(FilterException):  # a path that is shorter
+        rpe.process_data((truth, track))
+        found["rpe_m"] = rpe.get_statistic(metrics.StatisticsType.median)
     track.align(truth)
     ate = metrics.APE(metrics.PoseRelation.translation_part)
     ate.process_data((truth, track))
-    return {
-        "ate_m": ate.get_statistic(metrics.StatisticsType.rmse),
-        "rpe_m": rpe.get_statistic(metrics.StatisticsType.median),
-        "instants": truth.num_poses,
-    }
+    return {"ate_m": ate.get_statistic(metrics.StatisticsType.rmse), **found}
 
 
 def covariances(estimate: Any, reference: Any) -> dict[str, float | str]:
