@@ -136,7 +136,7 @@ def rows_of(log: str, building: Building, systems: Sequence[System], out: Path, 
 
 
 def rows_in_space(log: str, systems: Sequence[System], out: Path) -> list[dict[str, Any]]:
-    """A row for each system with a 3D LiDAR on simulated hills."""
+    """A row for each system with a 3D LiDAR on simulated hills, without memory, which is that of the simulator."""
     (out / log).mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
     for system in systems:
@@ -148,7 +148,7 @@ def rows_in_space(log: str, systems: Sequence[System], out: Path) -> list[dict[s
         target = out / log / system.name
         cost = json.loads(Path(f"{target}.json").read_text())
         scores = judge(Path(f"{target}.npz"), Path(f"{target} reference.npz"))
-        rows.append({"log": log, "system": system.name, **scores, "cpu_per_s": cost["cpu_s"] / SECONDS, "memory_mb": cost["memory_mb"]})
+        rows.append({"log": log, "system": system.name, **scores, "cpu_per_s": cost["cpu_s"] / SECONDS})
     return rows
 
 

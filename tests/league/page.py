@@ -25,6 +25,7 @@ body { font: 15px/1.5 system-ui, sans-serif; max-width: 1000px; margin: 2em auto
 table { border-collapse: collapse; width: 100% }
 th, td { padding: .3em .6em; text-align: right; border-bottom: 1px solid #8885 }
 th:first-child, td:first-child { text-align: left; white-space: nowrap }
+table.given td { text-align: left }
 .best { font-weight: bold }
 .scroll { overflow-x: auto }
 svg { max-width: 100%; height: auto; background: #fff }
@@ -41,7 +42,7 @@ def write(rows: Sequence[Mapping[str, Any]], systems: Sequence[System], out: Pat
         "Each system with its own defaults on the same logs. Errors by evo at the reference's instants; covariances by smfeval, with the"
         " reference's noise added; relations, which evo does not have, by skidloc. One drive is one sample."
     )
-    table = f"<h2>What each system is given</h2><div class=scroll><table>{given}</table></div>"
+    table = f"<h2>What each system is given</h2><div class=scroll><table class=given>{given}</table></div>"
     text = f"<!doctype html><html lang=en>{head}<h1>League</h1><p>{about}</p>{''.join(parts)}{table}</html>"
     (out / "league.html").write_text(text)
 
