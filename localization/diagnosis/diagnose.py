@@ -47,7 +47,7 @@ from localization.diagnosis.model_error import (
     size_error,
     unmodelled_by,
 )
-from localization.diagnosis.noise import Noise, count_sigmas, slip_sigmas, slow_turn_sigmas
+from localization.diagnosis.noise import Noise, reference_sigmas
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -353,8 +353,8 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
     """Findings, the table with its attributions, and the verdict that follows from it."""
     predictor, first, linearization, _, error = searched
     drive, problem, causes = predictor.drive, linearization.problem, linearization.causes
-    reference_sigmas = _reference_sigmas(predictor) if drive.kind == "log" else None
-    excess = [noise_excess(linearization, reference_sigmas, np.isfinite(first.rows[:, c]), c) for c in range(3)]
+    stated = reference_sigmas(predictor) if drive.kind == "log" else None
+    excess = [noise_excess(linearization, stated, np.isfinite(first.rows[:, c]), c) for c in range(3)]
     is_noise_own = max(excess) <= MAX_NOISE_OVER_REFERENCE and not predictor.unmodelled.slip_share
     chosen, gains, dropped = _keep_useful(linearization, chosen, config, is_noise_own)
     sizes, gained = problem.fit_by_likelihood(chosen)[0], problem.gain(chosen)
@@ -363,7 +363,7 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
     if has_other_contacts:
         findings = [dataclasses.replace(f, sigma=math.hypot(f.sigma, size_error(predictor, f.definition))) for f in findings]
     by_contacts = _by_contacts(predictor, first)
-    rows = attribute_rows(first, linearization, chosen, sizes, config.significance, reference_sigmas, by_contacts)
+    rows = attribute_rows(first, linearization, chosen, sizes, config.significance, stated, by_contacts)
     left = linearization.linear - linearization.signatures[..., list(chosen)] @ sizes
     spreads = problem.scale * np.where(np.isin(np.arange(len(causes)), chosen), 1.0, problem.tolerance)
     trends, left_gain = find_trends(predictor, linearization.noise, left, linearization.signatures, linearization.nuisances, spreads, rng)
@@ -437,14 +437,6 @@ def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> t
         return ()
     text = describe_clocks(offset, sigma, predictor.drive.maneuvers, predictor.drive.robot)
     return (text,) if text else ()
-
-
-def _reference_sigmas(predictor: DrivePredictor) -> FloatArray:
-    """(M, 3) noise that a drive has to have: of the motion reference, of the encoders' counts, of turns by wheels so slow that the model
-    was never measured, and of contacts that are not the model's."""
-    given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
-    given[:, 2] = np.hypot(given[:, 2], slow_turn_sigmas(predictor))
-    return np.asarray(np.hypot(np.hypot(given, count_sigmas(predictor)), slip_sigmas(predictor)))
 
 
 def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:

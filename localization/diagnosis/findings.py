@@ -232,7 +232,7 @@ class Replayed(NamedTuple):
         return self.after_m > _MAX_GROWTH * self.before_m and self.after_m**2 - self.before_m**2 > self.noise_m**2
 
 
-_CLEAR_SIGMAS = 3.0
+CLEAR_SIGMAS = 3.0
 """Sigmas of the drive's noise by which a half that was held out has to show a change: neighbouring windows share some of it."""
 
 
@@ -263,14 +263,8 @@ class HandoverCheck:
         What acts in few windows, as a slip in left turns, scatters over the windows by as much as it gains.
         """
         share, sigma = self.shown
-        is_gain = self.gain.low > 0.0 or share - _CLEAR_SIGMAS * sigma > 0.5
+        is_gain = self.gain.low > 0.0 or share - CLEAR_SIGMAS * sigma > 0.5
         return is_gain and not any(one.is_worse for one in self.replays.values())
-
-    @property
-    def is_refuted(self) -> bool:
-        """Whether the windows clearly show less than half of what the file changes, or half as much again."""
-        share, sigma = self.shown
-        return abs(share - 1.0) - _CLEAR_SIGMAS * sigma > 0.5
 
     def describe(self) -> str:
         """Errors of the half held out before and after, as a sentence without a stop."""

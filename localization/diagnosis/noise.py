@@ -135,6 +135,14 @@ def count_sigmas(predictor: DrivePredictor) -> FloatArray:
     return np.array([side_m / math.sqrt(2.0), 0.0, math.sqrt(2.0) * side_m * k / g.track_width_m])
 
 
+def reference_sigmas(predictor: DrivePredictor) -> FloatArray:
+    """(M, 3) noise that a drive has to have: of the motion reference, of the encoders' counts, of turns by wheels so slow that the model
+    was never measured, and of contacts that are not the model's."""
+    given = np.sqrt(np.diagonal(predictor.batch.cov, axis1=1, axis2=2)) * np.array(predictor.baseline.noise_over_reference)
+    given[:, 2] = np.hypot(given[:, 2], slow_turn_sigmas(predictor))
+    return np.asarray(np.hypot(np.hypot(given, count_sigmas(predictor)), slip_sigmas(predictor)))
+
+
 def given_noise(rows: FloatArray, sigmas: FloatArray, follows: NDArray[np.bool_]) -> Noise:
     """Independent numbers with the given ``sigmas`` (M, 6)."""
     known = np.isfinite(rows)
