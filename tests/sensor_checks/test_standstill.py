@@ -89,6 +89,17 @@ def test_wheels_that_read_zero_while_the_imu_shakes_are_unknown(shake_m_s2: floa
     assert (WHEELS_STANDING in checks.found) == is_found
 
 
+def test_knocks_at_rest_are_not_taken_for_shaking() -> None:
+    """One in each second, of 40 ms: the robot is loaded."""
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=lambda w: 0.0, has_scans=False)
+    rng = np.random.default_rng(1)
+    for k in range(300):
+        knock = 8.0 if k % 50 in (17, 18) else 0.05
+        robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([0.0, 0.0, 9.8]) + knock * rng.normal(size=3)))
+    assert robot.drive(6.0).found == {}
+    assert robot.applied[-1].is_standing
+
+
 @pytest.mark.parametrize(("rate", "is_found"), [(0.3, True), (0.06, False)])
 def test_wheels_that_read_zero_while_the_gyro_turns_are_unknown(rate: float, is_found: bool) -> None:
     """A robot that is turned by hand, or a gyro with a large bias."""
