@@ -30,6 +30,7 @@ from std_srvs.srv import Empty as EmptyService
 from tf2_msgs.msg import TFMessage
 
 PERIOD_NS = 80_000_000  # of the scans
+MATCHED_S = 0.5  # until the subscription knows of the publisher, too: what is sent before is lost to it (1 of 8 messages)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 QUALITY = {"/scan": qos_profile_sensor_data, "/imu/data": qos_profile_sensor_data, "/tf_static": LATCHED}
 
@@ -112,6 +113,7 @@ class Robot:
         end = time.monotonic() + 20.0
         while not publisher.get_subscription_count() and time.monotonic() < end:
             self.spin(0.1)
+        self.spin(MATCHED_S)
         publisher.publish(message)
         self.spin(1.0)
         self.node.destroy_publisher(publisher)

@@ -64,7 +64,7 @@ def save_map_over_dds(distro, running, folder):
     node.line("running skid_steer", timeout_s=_COMPILED_S)
     robot.do("play 11")
     robot.do(f"text /skidloc/save_map {path}")
-    node.line("keyframes are in", timeout_s=_COMPILED_S)  # the node may still compile
+    node.line("keyframes are in")
     robot.do(f"text /skidloc/save_map {path}")
     node.line("exists already")
     robot.leave()
