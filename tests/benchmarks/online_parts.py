@@ -110,13 +110,13 @@ class QuickTransport(LogTransport):
         """Those of the next 20 ms."""
         if self._begin is not None and not self.started:
             time.sleep(timeout_s)
-        if not self._left or (self._begin is not None and not self.started):
+        if not self.left or (self._begin is not None and not self.started):
             return []
-        begins_ns = self._left[0].received_ns if self._begin is None else self._begin
+        begins_ns = self.left[0].received_ns if self._begin is None else self._begin
         self._begin = begins_ns + (_TICK_NS if self._begin is not None else round(_SETTLED_S * 1e9))
         found = []
-        while self._left and self._left[0].received_ns < self._begin:
-            found.append(self._left.popleft())
+        while self.left and self.left[0].received_ns < self._begin:
+            found.append(self.left.popleft())
         return [message for message in found if message.topic in (self.subscribed if self.kept is None else self.kept)]
 
 
