@@ -243,7 +243,7 @@ def _noise_left(state: Linearization, predictor: DrivePredictor) -> float:
     """Noise of the drive beside the terms, over that of its motion reference, in the component of a log that has most; 1 for tables, whose
     noise is as they give it.
 
-    Of 64 laws (`tests.studies.unseen_effects`, draws 5 to 8) four leave 5 times the noise of scan matching and more, and their terms remove
+    Of 50 laws (`tests.studies.unseen_effects`, draws 5 to 8) four leave 5 times the noise of scan matching and more, and their terms remove
     0.26 of the law on a fresh drive at most (least -12); others leave up to 1.7 times in x and y.
     """
     stated = reference_sigmas(predictor) if predictor.drive.kind == "log" else None

@@ -173,7 +173,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         is_unmapped = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
         self.is_outside = is_unmapped and (likely is None or is_narrow(cov))  # what a search finds likely is where the map has walls
         if likely is None and place.contradicting >= _CONTRADICTING_SHARE:
-            tracked.doubt()
+            tracked.contradict()
         if likely is None or self.is_outside:
             return
         evidence = self._evidence(place, cov)

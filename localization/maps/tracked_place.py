@@ -21,17 +21,17 @@ class TrackedPlace:
     def __init__(self, log_odds: float, is_one_view: bool) -> None:
         """``log_odds``: of the search that found the place."""
         self._log_odds, self._is_one_view = log_odds, is_one_view
-        self._is_doubtful = is_one_view  # the last scan does not fit, as the first one does after the robot was carried unnoticed
+        self._is_bounded = is_one_view  # by `LIKELY`: one view, or the last scan does not fit, as after the robot was carried unnoticed
 
     def add(self, evidence: float, way_m: float) -> None:
         """A scan adds the log-odds ``evidence``, after ``way_m`` [m] with scans."""
         self._is_one_view &= evidence < FITTING or way_m < INDEPENDENT_M
-        self._is_doubtful = evidence < FITTING or self._is_one_view
+        self._is_bounded = evidence < FITTING or self._is_one_view
         self._log_odds = min(self._log_odds + evidence, log_odds(LIKELY) if self._is_one_view else _MAX_LOG_ODDS)
 
-    def doubt(self) -> None:
+    def contradict(self) -> None:
         """The last scan contradicts, and gives no pose."""
-        self._is_doubtful = True
+        self._is_bounded = True
 
     @property
     def probability(self) -> float:
@@ -46,4 +46,4 @@ class TrackedPlace:
     def probability_within(self, cov: Cov3) -> float:
         """That the robot is at the place, and its pose, with covariance ``cov`` (3, 3), right as by `within`."""
         probability = self.probability * within(cov)
-        return min(probability, LIKELY) if self._is_doubtful else probability
+        return min(probability, LIKELY) if self._is_bounded else probability

@@ -3,7 +3,7 @@
 python -m tests.league [--log fr079,csail,aces,hills-trees,hills-grass] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
 
 Peers are installed into .league/, an environment of their own, from tests/league/requirements.txt; what cannot be installed or crashes
-is a row that says so, and is tried again by the next run. What has been run is kept in the output folder and is not run again: delete a
+is a row with the reason, and is tried again by the next run. What has been run is kept in the output folder and is not run again: delete a
 file to run it anew. All of it takes some ten minutes. MRPT is of Debian (`apt install mrpt-apps mrpt-common`). The page
 league.html has tables, plots and settings; league.json the numbers. CPU seconds are those of the estimate alone, of all its threads,
 without reading the log. `--folder` adds NAME.mcap with NAME.toml and a reference NAME.tum, .csv, .txt or .relations beside it.

@@ -1,4 +1,4 @@
-"""A place that is tracked by one view stays doubtful until scans from elsewhere fit, and is refuted by a few that do not."""
+"""A place that is tracked by one view is likely at most until scans from elsewhere fit, and is refuted by a few that do not."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_tracked_place_after_one_scan_that_does_not_fit_is_at_most_likely() -> N
     place = TrackedPlace(4.0, is_one_view=False)
     place.add(2.5, way_m=2.0)
     assert place.probability_within(_NARROW) > 0.99
-    place.doubt()
+    place.contradict()
     assert place.probability_within(_NARROW) == LIKELY
     place.add(2.5, way_m=2.0)
     assert place.probability_within(_NARROW) > 0.99

@@ -226,7 +226,7 @@ def strafing(vehicle: Vehicle) -> Motion:
 
 
 def judge_mecanum(folder: Path) -> Found:
-    """Right where the EKF follows the LiDAR, and a sentence says that the robot moves to the side."""
+    """Right where the EKF follows the LiDAR, and a sentence names the motion to the side."""
     motion = strafing(MECANUM)
     log = bags.write_mcap(folder / "log.mcap", records_of(MECANUM, motion, Publishing()))
     (folder / "robot.toml").write_text(robot_toml(MECANUM.robot(), {}, ""))
