@@ -84,7 +84,7 @@ def published_over_dds(drive):
     for topic, kind in sent.items():
         transport.advertise(topic, kind, is_latched=topic == "/tf_static")
     for topic, kind in _TYPES.items():
-        transport.subscribe(topic, kind, is_latched=False, is_command=True)  # all of them, not the newest only
+        transport.subscribe(topic, kind, is_latched=False)  # keeps 200, a burst after a pause of either side
     decoders = {topic: decoder(kind) for topic, kind in _TYPES.items()}
     command = [sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--door", "dds", "--node.wait-s", "0.5"]
     node = subprocess.Popen([*command, "--domain", str(DOMAIN)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
