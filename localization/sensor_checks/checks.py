@@ -131,7 +131,7 @@ class SensorChecks:
             return estimate
         self._clocks.add(estimator)
         inflated = self._inflation.inflate(estimate)
-        if scan is not None and self._places.update(lambda: self._steps.window.profile(scan), record.pose):
+        if scan is not None and self._places.update(lambda: self._steps.window.scans.profile(scan), record.pose):
             self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on
         return inflated
 

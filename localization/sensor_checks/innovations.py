@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from localization.events import Step
 from motion_models.se2 import FloatArray
 
 BIN_S = 0.5
@@ -26,7 +27,7 @@ SECONDS, TURN, WAY, TURN_CHANGE = range(4)
 
 
 Regressors = tuple[float, float, float, float]
-_NONE: Regressors = (0.0, 0.0, 0.0, 0.0)
+NO_REGRESSORS: Regressors = (0.0, 0.0, 0.0, 0.0)
 
 
 class Pair(NamedTuple):
@@ -92,6 +93,16 @@ def _fit(x: FloatArray, innovation: FloatArray, variance: FloatArray) -> tuple[f
     return (product**2 / power, product / power) if power else (0.0, 0.0)
 
 
+def add_step(totals: Regressors, step: Step) -> Regressors:
+    """``totals`` of what causes are proportional to, with ``step``: seconds, turn and way are sums, the rate is that at its end."""
+    if step.duration == 0.0:
+        return totals
+    seconds, turns, ways, _ = totals
+    way, _, turn = step.predicted.delta.tolist() if step.has_wheels else (0.0, 0.0, 0.0)
+    rate = (turn if step.turn is None else step.turn.angle) / step.duration
+    return seconds + step.duration, turns + turn, ways + way, rate
+
+
 class InnovationWindows:
     """The innovations of one pair over the last minute: `add` each measurement."""
 
@@ -99,13 +110,15 @@ class InnovationWindows:
         self.pair = pair
         self.bins: list[Bin] = []
         self._innovation = self._variance = self._seconds = 0.0
-        self._regressors = _NONE
+        self._regressors = self._totals = NO_REGRESSORS
 
-    def add(self, innovation: float, variance: float, regressors: Regressors, now_s: float, poses: FloatArray) -> bool:
-        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``regressors`` since the last one; ``poses`` (5, 3)
-        after it."""
+    def add(self, innovation: float, variance: float, totals: Regressors, now_s: float, poses: FloatArray) -> bool:
+        """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``totals`` since the first step, as `add_step` has them;
+        ``poses`` (5, 3) after it."""
+        (a, b, c, d), (e, f, g, h), self._totals = totals, self._totals, totals
+        regressors = a - e, b - f, c - g, d - h
         if not self.bins:
-            self.bins.append(Bin(now_s - regressors[SECONDS], 0.0, 0.0, 0.0, _NONE, poses))
+            self.bins.append(Bin(now_s - regressors[SECONDS], 0.0, 0.0, 0.0, NO_REGRESSORS, poses))
         self._innovation, self._variance = self._innovation + innovation, self._variance + variance
         (a, b, c, d), (e, f, g, h) = self._regressors, regressors
         self._regressors = a + e, b + f, c + g, d + h
@@ -113,7 +126,7 @@ class InnovationWindows:
         if self._regressors[SECONDS] < BIN_S:
             return False
         self.bins.append(Bin(now_s, self._innovation, self._variance, self._seconds, self._regressors, poses))
-        self._regressors = _NONE
+        self._regressors = NO_REGRESSORS
         while self.bins[1].end_s < now_s - WINDOWS_S[-1]:
             del self.bins[0]
         return True

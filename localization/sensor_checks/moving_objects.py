@@ -102,11 +102,11 @@ class MovingObjects:
         if scan is None or not scan.is_planar or not step.has_wheels:
             return step
         lidar = self._views.of(scan.frame_id)
-        is_due = scan is self._window.registered
-        profile = self._window.profile(scan) if is_due or lidar.is_active else None
+        is_due = scan is self._window.scans.registered
+        profile = self._window.scans.profile(scan) if is_due or lidar.is_active else None
         if profile is None:
             return step
-        points, references = self._window.points_about_lidar(scan), lidar.references(now)
+        points, references = self._window.scans.points_about_lidar(scan), lidar.references(now)
         if references:
             is_quiet = not lidar.is_active and self._suspicion is None
             found = self._label(references[0], now, profile, points, _MIN_UNSURE if is_quiet else 0.0)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.innovations import TURN, TURN_CHANGE, InnovationWindows, Pair, Regressors
+from localization.sensor_checks.innovations import NO_REGRESSORS, TURN, TURN_CHANGE, InnovationWindows, Pair, add_step
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
 from localization.sensor_checks.reckoning import FILE, FILE_GYRO
 from localization.sensor_checks.scales import RADIUS, ScaleCheck
@@ -84,8 +84,7 @@ class SensorConsistency:
         self._faults, self._clipping, self._scales = faults, _Clipping(), ScaleCheck(faults)
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._reckoning = faults.inflation.reckoning
-        self._totals: Regressors = (0.0, 0.0, 0.0, 0.0)  # what causes are proportional to, since the first step
-        self._totals_at = dict.fromkeys(NAMED, self._totals)  # at the last measurement of each pair
+        self._totals = NO_REGRESSORS
         self._has_moved = False
         self._matched_s = -math.inf
         self._episodes: dict[SensorFault, _Episode] = {}
@@ -94,7 +93,7 @@ class SensorConsistency:
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
         self._has_moved |= not step.is_standing
-        self._add_totals(step)
+        self._totals = add_step(self._totals, step)
         if not self._has_moved:
             return  # before the first motion, the bias is measured
         if step.turn is not None and step.has_wheels:
@@ -103,21 +102,11 @@ class SensorConsistency:
         for pair, innovation in _innovations(step, residuals):
             if innovation is None:
                 continue
-            (a, b, c, d), (e, f, g, h), self._totals_at[pair] = self._totals, self._totals_at[pair], self._totals
-            regressors = a - e, b - f, c - g, d - h
-            if self._windows[pair].add(*innovation, regressors, self._faults.now_s, self._reckoning.poses):
+            if self._windows[pair].add(*innovation, self._totals, self._faults.now_s, self._reckoning.poses):
                 self._compare(pair)
                 has_ended = True
         if has_ended:
             self._compare_parameters(learned())
-
-    def _add_totals(self, step: Step) -> None:
-        if step.duration == 0.0:
-            return
-        seconds, turns, ways, _ = self._totals
-        way, _, turn = step.predicted.delta.tolist() if step.has_wheels else (0.0, 0.0, 0.0)
-        rate = (turn if step.turn is None else step.turn.angle) / step.duration
-        self._totals = seconds + step.duration, turns + turn, ways + way, rate
 
     def compare_estimate(self, nis: float | None) -> None:
         """Compare the estimate with dead reckonings while a pair differs; ``nis`` of the last scan, if one was matched."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,22 @@ _SHAKE_S = 2.0
 _NS = 1e-9
 
 
+@dataclass
+class _Stop:
+    """A time for which the wheels read zero [s]."""
+
+    stood_s: float = 0.0
+    """All of it."""
+    turned_s: float = 0.0
+    """Its end, while the gyro turns."""
+    rested_s: float = 0.0
+    """Its end, while gyro and IMU are at rest too."""
+    trusted_s: float = 0.0
+    """As far as it counted as standing and no scan has measured the pose since."""
+    is_confirmed: bool = False
+    """Gyro or IMU have shown that the robot moved meanwhile."""
+
+
 class Standstill:
     """Such wheels count as unknown, for as long as that lasts.
 
@@ -50,13 +66,9 @@ class Standstill:
     def __init__(self, faults: FaultLog, window: Window, config: StepConfig) -> None:
         self._faults, self._window, self._velocity = faults, window, UnknownVelocity(config.unknown_sigma)
         self._shaking: dict[str, ShakeDetector] = {}  # by the IMU's frame
-        self._stood_s = 0.0  # time for which the wheels read zero
-        self._turned_s = 0.0  # the same, while the gyro turns
-        self._is_confirmed = False  # that the robot moved meanwhile, by gyro or IMU
+        self._stop = _Stop()
         self._have_turned = False  # the wheels, so far
         self._is_dead = False  # wheels that have not, while the robot moved
-        self._rested_s = 0.0  # the same, while gyro and IMU are at rest too
-        self._trusted_s = 0.0  # the same, as far as it counted as standing and no scan has measured the pose since
 
     def insert_imu(self, sample: ImuSample) -> None:
         """Specific force shows whether the robot moves."""
@@ -69,37 +81,37 @@ class Standstill:
         if not step.is_standing:
             self._have_turned |= step.has_wheels and bool(step.predicted.delta.any())
             self._is_dead &= not self._have_turned
-            self._turned_s = self._stood_s = self._trusted_s = self._rested_s = 0.0
-            self._is_confirmed = False
+            self._stop = _Stop()
             if is_contradicted and step.has_wheels:
                 return step.without_wheels(self._velocity.increment(step.duration, has_turn=step.turn is not None))
             self._velocity.lasted_s = 0.0
             if step.has_wheels:
                 self._velocity.measured = step.twist
             return step
-        self._stood_s += step.duration
-        self._turned_s = self._turned_s + step.duration if _is_turning(step) else 0.0
+        stop = self._stop
+        stop.stood_s += step.duration
+        stop.turned_s = stop.turned_s + step.duration if _is_turning(step) else 0.0
         moving = self._moving()
-        contradicted_s = self._stood_s if moving else self._turned_s
-        if moving or self._turned_s >= _MIN_TURNING_S:
-            besides = _OR_OBJECTS if moving == _LIDAR_MOVED and not self._is_confirmed else ""
+        contradicted_s = stop.stood_s if moving else stop.turned_s
+        if moving or stop.turned_s >= _MIN_TURNING_S:
+            besides = _OR_OBJECTS if moving == _LIDAR_MOVED and not stop.is_confirmed else ""
             numbers = {"others": moving or "the gyro turned", "besides": besides}
             self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, numbers)
-            self._is_dead |= not self._have_turned and (self._is_confirmed or self._turned_s >= _MIN_TURNING_S)
+            self._is_dead |= not self._have_turned and (stop.is_confirmed or stop.turned_s >= _MIN_TURNING_S)
         if not contradicted_s and not self._is_dead:
-            self._trusted_s += step.duration
+            stop.trusted_s += step.duration
             self._velocity.lasted_s = 0.0
-            self._rested_s = self._rested_s + step.duration if self._is_at_rest(step) else 0.0
-            return replace(step, rested_s=self._rested_s) if self._rested_s else step
-        self._rested_s = 0.0
+            stop.rested_s = stop.rested_s + step.duration if self._is_at_rest(step) else 0.0
+            return replace(step, rested_s=stop.rested_s) if stop.rested_s else step
+        stop.rested_s = 0.0
         unknown_s = step.duration
         if moving:
-            unknown_s, self._trusted_s = unknown_s + self._trusted_s, 0.0
+            unknown_s, stop.trusted_s = unknown_s + stop.trusted_s, 0.0
         return step.without_wheels(self._velocity.increment(unknown_s, has_turn=step.turn is not None))
 
     def restart(self) -> None:
         """A matched scan measured the pose: what is unknown counts from here on."""
-        self._velocity.lasted_s = self._trusted_s = 0.0
+        self._velocity.lasted_s = self._stop.trusted_s = 0.0
 
     def _is_at_rest(self, step: Step) -> bool:
         """Whether wheels, gyro and IMU measure in ``step`` what they do on a robot at rest."""
@@ -113,12 +125,12 @@ class Standstill:
         bins = Bins.of(recent.rows[-_RECENT_BINS:][is_compared[-_RECENT_BINS:]])
         travelled, lasted = float(np.hypot(*bins.lidar[:, :2].T).sum()), float(bins.durations_s.sum())
         shaken_s = max((detector.lasted_s for detector in self._shaking.values()), default=0.0)
-        is_shaking = min(shaken_s, self._stood_s) >= _SHAKE_S
+        is_shaking = min(shaken_s, self._stop.stood_s) >= _SHAKE_S
         if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
             rates = bins.gyro / bins.durations_s
-            self._is_confirmed |= is_shaking or _has_turned(rates)
+            self._stop.is_confirmed |= is_shaking or _has_turned(rates)
             has_second = _is_working(rates) or any(detector.has_noise for detector in self._shaking.values())
-            return _LIDAR_MOVED if self._is_confirmed or not has_second else ""
+            return _LIDAR_MOVED if self._stop.is_confirmed or not has_second else ""
         return "the IMU shakes as if it moved" if is_shaking and not len(bins.rows) else ""
 
 

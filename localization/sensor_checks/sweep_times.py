@@ -83,17 +83,17 @@ class SweepTimes:
 
     def compare(self, window: Window) -> None:
         """Take the scan that ended a bin."""
-        scan, before, last = window.registered, self._before, self._last
+        scan, before, last = window.scans.registered, self._before, self._last
         if self._is_decided or scan is None or not len(scan.offsets):
             return
-        profile = window.profile(scan)
+        profile = window.scans.profile(scan)
         self._last = None if profile is None or (last is not None and scan is last[0]) else (scan, profile)
         rates = window.bins.lidar[-2:] / window.bins.durations_s[-2:, None]
         self._before = None
         if last is None or self._last is None or not np.isfinite(rates).all():
             return
         twist = rates.mean(axis=0)
-        times = times_by_bearing(window.points_about_lidar(last[0]), last[0].times_from_middle)
+        times = times_by_bearing(window.scans.points_about_lidar(last[0]), last[0].times_from_middle)
         now = self._before = TimedProfile(last[1], times_derivative(last[1], times, twist))
         if before is None or float(np.abs(rates[:, 2]).max()) < _MIN_RATE_RAD_S:
             return

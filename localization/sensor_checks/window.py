@@ -11,10 +11,10 @@ import numpy as np
 
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig
-from localization.sensor_checks.scan_motion import Profile, ScanOdometry, profile_of
+from localization.sensor_checks.mounted_scans import MountedScans
 from motion_models import se2
 from motion_models.robot import Mount
-from motion_models.se2 import FloatArray, Points2
+from motion_models.se2 import FloatArray
 
 BIN_S = 0.25
 WINDOW_BINS, MIN_BINS = 24, 10
@@ -50,8 +50,8 @@ class Window:
     """`add` each step. The LiDAR's motion is that of `scan_motion`, which uses neither the filter nor the other sensors."""
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
-        self._mounts, self._config = mounts, config
-        self._scans = ScanOdometry()
+        self.scans = MountedScans(mounts, config)
+        """The last that was registered is the one that ended the last bin."""
         self._open = _Accumulator()
         self.bins = Bins.of(np.empty((0, 9)))
         self.has_scans = self.has_gyro = False
@@ -60,8 +60,6 @@ class Window:
         """After the first step [s]."""
         self.is_scene_moving = False
         """Objects move in the scans: they show no way of the robot."""
-        self.registered: Scan | None = None
-        """The last scan that ended a bin."""
 
     def add(self, step: Step, now_s: float) -> bool:
         """Whether ``step`` ends a bin and there are enough to compare. A bin ends where it is long enough, at a scan if there are any."""
@@ -80,23 +78,11 @@ class Window:
 
     def _register(self, scan: Scan) -> FloatArray:
         """Motion (3,) in the open bin, which ``scan`` ends."""
-        motion = self._scans.register(self.profile(scan))
-        self.registered = scan
+        motion = self.scans.register(scan)
         if motion is None or not self._open.has_scan_at_start:
             return _UNKNOWN
         is_known = motion.has_translation and not self.is_scene_moving
         return motion.delta if is_known else np.array([np.nan, np.nan, motion.delta[2]])
-
-    def profile(self, scan: Scan) -> Profile | None:
-        """Profile of ``scan``; None for too few points."""
-        if scan is self.registered:
-            return self._scans.last
-        return profile_of(scan, self._mounts.get(scan.frame_id, Mount()), self._config)
-
-    def points_about_lidar(self, scan: Scan) -> Points2:
-        """(N, 2) all points of ``scan`` about its LiDAR, in the body's axes."""
-        R = self._mounts.get(scan.frame_id, Mount()).rotation
-        return np.ascontiguousarray(scan.points @ R[:2].T)
 
 
 @dataclass

@@ -195,8 +195,8 @@ def test_sums_of_innovations_exceed_a_limit_as_often_as_a_normal_variable(limit:
         windows = InnovationWindows(GYRO_WHEELS._replace(floor=0.0))
         for k in range(20):
             variance = float(rng.uniform(0.5, 2.0))
-            regressors = (0.1, 0.0, 0.03, 0.0)
-            windows.add(math.sqrt(variance) * float(rng.normal()), variance, regressors, 0.1 * (k + 1), np.zeros((3, 3)))
+            totals = (0.1 * (k + 1), 0.0, 0.03 * (k + 1), 0.0)
+            windows.add(math.sqrt(variance) * float(rng.normal()), variance, totals, 0.1 * (k + 1), np.zeros((3, 3)))
         worst = windows.worst()
         assert worst is not None
         beyond += worst.sigmas > limit
