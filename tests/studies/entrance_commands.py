@@ -1,7 +1,7 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [forum | closing | threads | last | other | more | hostile | KIND | part of a NAME ...] [-v]`
-prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the
+`python -m tests.studies.entrance_commands [mixed | forum | closing | threads | last | other | more | hostile | KIND | part of a NAME]
+[-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the
 EKF, with those of the same drive with nothing wrong in brackets.
 """
 
@@ -250,16 +250,26 @@ def main(arguments: Sequence[str]) -> None:
     from tests.studies.entrance_forum_cases import FORUM
     from tests.studies.entrance_hostile_cases import HOSTILE
     from tests.studies.entrance_last_cases import LAST
+    from tests.studies.entrance_mixed_cases import MIXED
     from tests.studies.entrance_more_cases import MORE
     from tests.studies.entrance_other_cases import OTHER
     from tests.studies.entrance_thread_cases import THREADS
 
     wanted = [a for a in arguments if not a.startswith("-")]
-    sets = {"more": MORE, "hostile": HOSTILE, "other": OTHER, "last": LAST, "threads": THREADS, "closing": CLOSING, "forum": FORUM}
+    sets = {
+        "more": MORE,
+        "hostile": HOSTILE,
+        "other": OTHER,
+        "last": LAST,
+        "threads": THREADS,
+        "closing": CLOSING,
+        "forum": FORUM,
+        "mixed": MIXED,
+    }
     found = []
     for case in (
         c
-        for c in (*FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
+        for c in (*MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
         if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:
