@@ -78,8 +78,27 @@ def test_lidar_whose_plane_stands_on_edge_is_taken_as_level() -> None:
     assert math.remainder(found.mount.yaw - math.pi, math.tau) == pytest.approx(0.0, abs=math.radians(2.5))
 
 
+@pytest.mark.parametrize("degrees", cases([12.0, -7.0, 18.0], ("12.0",)))
+def test_lidar_yaw_of_a_slides_size_shows_in_straight_driving(tmp_path: Path, degrees: float) -> None:
+    """Over 3 m: skid-steer robots slide in turns."""
+    vehicle = Vehicle(scan_hz=10.0, beams=180, imu_hz=0.0, seed=9)
+    how = Publishing(lidar_yaw=math.radians(degrees))
+    found = check_lidar(open_log(write(tmp_path / "log.mcap", vehicle, drive(vehicle), how), vehicle.robot()))
+    assert found is not None
+    assert found.mount is not None
+    assert math.degrees(found.mount.yaw) == pytest.approx(degrees, abs=1.0)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 3.0])
+def test_lidar_yaw_of_a_few_degrees_is_kept(tmp_path: Path, degrees: float) -> None:
+    vehicle = Vehicle(scan_hz=10.0, beams=180, seed=10)
+    how = Publishing(lidar_yaw=math.radians(degrees))
+    assert check_lidar(open_log(write(tmp_path / "log.mcap", vehicle, drive(vehicle), how), vehicle.robot())) is None
+
+
 @pytest.mark.parametrize("degrees", [0.0, 10.0, -10.0])
 def test_lidar_yaw_that_slides_explain_is_kept(degrees: float) -> None:
+    """Of a drive with less than 3 m straight ahead."""
     assert check_lidar(turned(opened(), degrees)) is None
 
 

@@ -1,8 +1,8 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
 `python -m tests.studies.entrance_commands [mixed | forum | closing | threads | last | other | more | hostile | KIND | part of a NAME]
-[-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of the
-EKF, with those of the same drive with nothing wrong in brackets.
+[-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of
+the EKF, with those of the same drive with nothing wrong in brackets.
 """
 
 from __future__ import annotations
