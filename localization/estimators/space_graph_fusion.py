@@ -12,21 +12,19 @@ from scipy.linalg import block_diag
 from localization.core.policies.excitation import Excitation
 from localization.core.space import SE3
 from localization.core.state import clip_eigenvalues
-from localization.errors import EstimatorError
 from localization.estimators.estimator import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
 from localization.estimators.keyframe_motion import MotionPreintegration
 from localization.estimators.position_queue import PositionQueue, align_map
-from localization.estimators.recorded_path import RecordedPath
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
+from localization.estimators.space_smoothing import SpaceSmoothing
 from localization.events import PositionSample, Step
-from localization.lidar.cloud_loops import find_loops, make_map_closures
-from localization.lifting import Pose3, SpaceTable, Trajectory3
+from localization.lidar.cloud_loops import make_map_closures
+from localization.lifting import Trajectory3
 from localization.maps import SpaceMap
-from localization.maps.space_map import in_units
-from localization.trajectory import IntArray, Trajectory
+from localization.trajectory import Trajectory
 from motion_models import se2, se3
 from motion_models.online_calibration import Corrections
 from motion_models.se2 import FloatArray, Points2, Pose2
@@ -67,19 +65,13 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         corrections, track_m = settings.corrections, settings.track_m
         self.odometry, self._corrections = odometry, corrections
         self._config = settings.config
-        self._path = RecordedPath(SE3) if settings.is_smoothing else None
+        self._smoothing = SpaceSmoothing(settings.range_noise_m, self._config.cloud_loops) if settings.is_smoothing else None
         self._map_T_odom = map_T_odom
         lever = np.array([settings.config.antenna_x_m, settings.config.antenna_y_m, 0.0])
         self.graph = SpaceGraph(block_diag(corrections.cov, _NO_SIGMA**2), odometry.accelerometer_sigma, lever=lever)
         self._queue = PositionQueue()
         self._excitation = Excitation(track_m, corrections.min_track_over_radius)
         self._wheels = MotionPreintegration(len(corrections.names))
-        self._range_noise_m = settings.range_noise_m
-        self._clouds: list[FloatArray | None] = []  # of keyframes, in the body frame, if poses are to be smoothed
-        self._sensors: list[FloatArray] = []
-        self._smoothed: Trajectory3 | None = None
-        self._map: SpaceMap | None = None
-        self._failure = ""
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate; a keyframe where the robot has gone or turned far enough."""
@@ -95,8 +87,8 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         if self.graph.poses:
             self._wheels.add(step.predicted, self._corrections, self._excitation.is_turning, np.zeros(len(self._corrections.names)))
             delta, cov = state.between("key", "pose")
-        if self._path is not None:
-            self._path.add(step.end_ns, state["pose"], cov)
+        if self._smoothing is not None:
+            self._smoothing.path.add(step.end_ns, state["pose"], cov)
         c, (way, turn) = self._config, (math.hypot(*delta[:3, 3]), math.hypot(*se3.rotation_vector(delta[:3, :3])))
         if not self.graph.poses or way > c.keyframe_distance_m or turn > c.keyframe_angle_rad:
             self._add_keyframe(delta, cov)
@@ -128,17 +120,14 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
             self.graph.wheels.append(wheels)
             self.graph.betweens.append(Between(n - 1, *between))
         self.graph.poses.append(state["pose"])
-        if self._path is not None:
-            self._path.add_node()
-            cloud = self.odometry.cloud
-            self._clouds.append(None if cloud is None else cloud.astype(np.float32))
-            self._sensors.append(self.odometry.lidar_position)
+        if self._smoothing is not None:
+            self._smoothing.add_keyframe(self.odometry.cloud, self.odometry.lidar_position)
         self._wheels = MotionPreintegration(len(self._corrections.names))
         self.odometry.start_key()
 
     def add_position(self, sample: PositionSample) -> None:
         """A position by GPS, for the smoothed poses; it is placed once the odometry has come to its stamp."""
-        if self._path is not None and self.graph.poses:
+        if self._smoothing is not None and self.graph.poses:
             self._queue.add(sample)
 
     def run_deferred(self) -> bool:
@@ -148,56 +137,14 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory projected to the plane, at the stamps of ``filtered``; None unless smoothing, or with one keyframe."""
         self.run_deferred()
-        path = self._path
-        if path is None or filtered is None or len(path.nodes) < 2:
+        if self._smoothing is None or filtered is None:
             return None
         self._align()
-        try:
-            keyframes = self.graph.smooth()
-            if self._config.cloud_loops:
-                self.graph.loops = find_loops(self._clouds, keyframes.poses, keyframes.relative_cov, self._range_noise_m)
-            if self.graph.loops:
-                keyframes = self.graph.smooth()
-        except EstimatorError as error:
-            self._failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
-            return None
-        stamps = path.stamps_ns
-        self._map = self._make_map(stamps[path.nodes], se3.lift(self._map_T_odom) @ keyframes.poses, keyframes.covs)
-        smoothed, spread = path.through(keyframes.poses, keyframes.covs)
-        smoothed = se3.lift(self._map_T_odom) @ smoothed
-        table, planar = SpaceTable(), filtered.poses.copy()
-        planar_covs = None if filtered.covariances is None else filtered.covariances.copy()
-        rows = np.searchsorted(filtered.stamps_ns, stamps)
-        for stamp, row, pose, cov in zip(stamps.tolist(), rows.tolist(), smoothed, spread, strict=True):
-            world = np.kron(np.eye(2), pose[:3, :3])
-            in_space = Pose3(pose[:3, 3], pose[:3, :3], world @ cov @ world.T)
-            table.add(stamp, in_space)
-            planar[row], above = in_space.from_above()
-            if planar_covs is not None:
-                planar_covs[row] = above
-        self._smoothed = table.trajectory()
-        return Trajectory(filtered.stamps_ns, planar, planar_covs)
-
-    def _make_map(self, stamps_ns: IntArray, poses: FloatArray, covs: FloatArray) -> SpaceMap:
-        """The map of keyframes at ``stamps_ns`` (K,), smoothed to ``poses`` (K, 4, 4) with covariances (K, 6, 6)."""
-        betweens, loops = self.graph.betweens, self.graph.loops
-        points, counts = in_units([np.empty((0, 3)) if cloud is None else cloud.astype(float) for cloud in self._clouds])
-        return SpaceMap(
-            stamps_ns=stamps_ns,
-            poses=poses,
-            covariances=0.5 * (covs + covs.swapaxes(1, 2)),
-            points=points,
-            counts=counts,
-            sensors=np.array(self._sensors),
-            edges=np.array([(b.k, b.k + 1) for b in betweens] + [(loop.a, loop.b) for loop in loops], dtype=np.int64).reshape(-1, 2),
-            edge_deltas=np.array([b.delta for b in betweens] + [loop.delta for loop in loops]).reshape(-1, 4, 4),
-            edge_information=np.array([b.information for b in betweens] + [np.linalg.inv(loop.cov) for loop in loops]).reshape(-1, 6, 6),
-            edge_is_loop=np.arange(len(betweens) + len(loops)) >= len(betweens),
-        )
+        return self._smoothing.finish(self.graph, self._map_T_odom, filtered)
 
     def keyframe_map(self) -> SpaceMap | None:
         """Keyframes as they can be saved, once `finish` has smoothed them."""
-        return self._map
+        return None if self._smoothing is None else self._smoothing.map
 
     def _align(self) -> None:
         """The map's place and heading among the positions, where these suffice."""
@@ -215,7 +162,7 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
     @property
     def smoothed_in_space(self) -> Trajectory3 | None:
         """Poses in space by all measurements, once `finish` has smoothed them."""
-        return self._smoothed
+        return None if self._smoothing is None else self._smoothing.trajectory
 
     def counts(self) -> Mapping[str, int]:
         """Counts of the filter, of keyframes and of positions in the graph."""
@@ -231,7 +178,8 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
 
     def warnings(self) -> list[str]:
         """Warnings of the filter, of a failed smoothing, and of positions that could not be used."""
-        found = [*self.odometry.warnings(), *([self._failure] if self._failure else [])]
+        failure = "" if self._smoothing is None else self._smoothing.failure
+        found = [*self.odometry.warnings(), *([failure] if failure else [])]
         return found + self._queue.warnings(self._n_positions, len(self.graph.positions) - self._n_positions)
 
     def map_points(self) -> Points2:
