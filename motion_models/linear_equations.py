@@ -52,6 +52,23 @@ def solve(a: FloatArray, b: FloatArray) -> Triple:
     return solve_3x3(rows, b[0], b[1], b[2])
 
 
+@subroutine
+def invert(a: FloatArray) -> FloatArray:
+    """Inverse (n, n) of the symmetric positive definite ``a`` (n, n), which becomes the unit matrix: Gauss-Jordan elimination, which needs
+    no pivots there (Golub and Van Loan 2013, 4.2)."""
+    n = a.shape[0]
+    inverse = np.eye(n)
+    for p in range(n):
+        scale = 1.0 / a[p, p]
+        for q in range(n):
+            a[p, q], inverse[p, q] = a[p, q] * scale, inverse[p, q] * scale
+        for r in range(n):
+            factor = a[r, p] if r != p else 0.0
+            for q in range(n):
+                a[r, q], inverse[r, q] = a[r, q] - factor * a[p, q], inverse[r, q] - factor * inverse[p, q]
+    return inverse
+
+
 _SWEEPS = 6
 """Jacobi's method converges quadratically: three sweeps give single precision, six double."""
 

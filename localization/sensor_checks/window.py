@@ -21,6 +21,7 @@ WINDOW_BINS, MIN_BINS = 24, 10
 """Bins that are compared (6 s), and the fewest (2.5 s)."""
 _MAX_BIN_S = 1.0
 """How long a bin waits for a scan: LiDARs give 2 to 40 scans a second."""
+_COLUMNS = 12
 _UNKNOWN = np.full(3, np.nan)
 
 
@@ -28,7 +29,7 @@ class Bins(NamedTuple):
     """Motion over the last quarters of a second or more, the oldest first. NaN is what was not measured."""
 
     rows: FloatArray
-    """(n, 9) all of what follows."""
+    """(n, 12) all of what follows."""
     durations_s: FloatArray
     """(n,) [s]"""
     wheels: FloatArray
@@ -39,11 +40,13 @@ class Bins(NamedTuple):
     """(n, 3) by the scans [m, m, rad]; NaN is the way where the scene does not show it."""
     is_standing: FloatArray
     """(n,) 1 where the wheels stand, else 0."""
+    across: FloatArray
+    """(n, 3) way by the scans across the surfaces of which there are most [m], and its unit vector; known in any scene."""
 
     @classmethod
     def of(cls, rows: FloatArray) -> Bins:
-        """Columns of ``rows`` (n, 9)."""
-        return cls(rows, rows[:, 0], rows[:, 1:4], rows[:, 4], rows[:, 5:8], rows[:, 8])
+        """Columns of ``rows`` (n, 12)."""
+        return cls(rows, rows[:, 0], rows[:, 1:4], rows[:, 4], rows[:, 5:8], rows[:, 8], rows[:, 9:])
 
 
 class Window:
@@ -53,7 +56,7 @@ class Window:
         self.scans = MountedScans(mounts, config)
         """The last that was registered is the one that ended the last bin."""
         self._open = _Accumulator()
-        self.bins = Bins.of(np.empty((0, 9)))
+        self.bins = Bins.of(np.empty((0, _COLUMNS)))
         self.has_scans = self.has_gyro = False
         """Whether any scan, or turn by a gyro, has come."""
         self.begin_s = self.end_s = 0.0
@@ -69,20 +72,23 @@ class Window:
         waits_for_scan = self.has_scans and step.scan is None
         if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else BIN_S):
             return False
-        lidar = _UNKNOWN if step.scan is None else self._register(step.scan)
+        lidar, across = (_UNKNOWN, _UNKNOWN) if step.scan is None else self._register(step.scan)
         closed, self._open = self._open, _Accumulator(has_scan_at_start=step.scan is not None)
-        row = np.array([[closed.duration_s, *closed.wheels, closed.gyro, *lidar, closed.is_standing]])
+        row = np.array([[closed.duration_s, *closed.wheels, closed.gyro, *lidar, closed.is_standing, *across]])
         self.bins = Bins.of(np.concatenate((self.bins.rows[1 - WINDOW_BINS :], row)))
         self.begin_s, self.end_s = max(now_s - float(self.bins.durations_s.sum()), 0.0), now_s
         return len(self.bins.rows) >= MIN_BINS
 
-    def _register(self, scan: Scan) -> FloatArray:
-        """Motion (3,) in the open bin, which ``scan`` ends."""
+    def _register(self, scan: Scan) -> tuple[FloatArray, FloatArray]:
+        """Motion (3,) in the open bin, which ``scan`` ends, and `Bins.across` (3,)."""
         motion = self.scans.register(scan)
         if motion is None or not self._open.has_scan_at_start:
-            return _UNKNOWN
-        is_known = motion.has_translation and not self.is_scene_moving
-        return motion.delta if is_known else np.array([np.nan, np.nan, motion.delta[2]])
+            return _UNKNOWN, _UNKNOWN
+        turn_alone = np.array([np.nan, np.nan, motion.delta[2]])
+        if self.is_scene_moving:
+            return turn_alone, _UNKNOWN
+        across = np.array([motion.delta[:2] @ motion.normal, *motion.normal])
+        return motion.delta if motion.has_translation else turn_alone, across
 
 
 @dataclass

@@ -12,7 +12,7 @@ from motion_models.linear_equations import Matrix3
 diagonalize, multiply, transform_symmetric = (
     kernel(f) for f in (linear_equations.diagonalize, linear_equations.multiply, linear_equations.transform_symmetric)
 )
-solve, solve_3x3 = kernel(linear_equations.solve), kernel(linear_equations.solve_3x3)
+solve, solve_3x3, invert = (kernel(f) for f in (linear_equations.solve, linear_equations.solve_3x3, linear_equations.invert))
 
 
 def random_matrices(n: int = 200) -> list[np.ndarray]:
@@ -29,6 +29,15 @@ def test_diagonalize_gives_eigenvalues_and_orthogonal_eigenvectors() -> None:
         assert np.allclose(np.sort(np.diag(D)), np.linalg.eigvalsh(A), rtol=1e-12, atol=1e-12 * np.abs(A).max())
         assert np.allclose(V @ np.diag(np.diag(D)) @ V.T, A, rtol=0.0, atol=1e-13 * np.abs(A).max())
         assert np.allclose(V.T @ V, np.eye(3), atol=1e-14)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 6])
+def test_invert_gives_the_inverse(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for _ in range(100):
+        B = rng.normal(size=(n, n + 2)) * 10.0 ** rng.uniform(-3.0, 3.0, size=n)[:, None]
+        A = B @ B.T
+        assert np.allclose(invert(A.copy()) @ A, np.eye(n), atol=1e-4)
 
 
 @pytest.mark.parametrize("A", [np.zeros((3, 3)), np.eye(3), np.diag([3.0, 1.0, 2.0]), np.ones((3, 3))])

@@ -19,14 +19,27 @@ def _gain_of_ways(rng: np.random.Generator, degrees: float, noise_m: float, turn
     robot that slides in turns."""
     turn, noise = np.array(turns), noise_m * rng.normal(size=(2, len(turns)))
     ways = (0.07 + 1j * slide_m_per_rad * turn) * np.exp(1j * math.radians(degrees)) + noise[0] + 1j * noise[1]
-    rows = np.zeros((len(turn), 9))
+    rows = np.zeros((len(turn), 12))
     rows[:, 0], rows[:, 1], rows[:, 3], rows[:, 5], rows[:, 6] = 0.25, 0.07, turn, ways.real, ways.imag
+    rows[:, 9], rows[:, 11] = ways.imag, 1.0
+    return Comparison(WAY, "wheels", "LiDAR").gain(Bins.of(rows))
+
+
+def _gain_in_corridor(rng: np.random.Generator, degrees: float, bearing_deg: float = 0.0, wheels: float = 1.0) -> Gain:
+    """Of a robot that travels 7 cm in each bin along a corridor, which lies ``bearing_deg`` to its left; its LiDAR is turned by
+    ``degrees``, and its wheels count ``wheels`` times the way."""
+    normal = np.exp(1j * math.radians(bearing_deg + degrees + 90.0))
+    way = 0.07 * np.exp(1j * math.radians(degrees))
+    rows = np.full((24, 12), np.nan)
+    rows[:, 0], rows[:, 1:4] = 0.25, (0.07 * wheels, 0.0, 0.0)
+    rows[:, 7], rows[:, 9] = 0.0, (way * normal.conjugate()).real + 0.005 * rng.normal(size=24)
+    rows[:, 10:] = normal.real, normal.imag
     return Comparison(WAY, "wheels", "LiDAR").gain(Bins.of(rows))
 
 
 def _gain_of_turns(wheels: np.ndarray, gyro: np.ndarray) -> Gain:
     """Of turns (n,) in bins of a quarter of a second [rad]."""
-    rows = np.full((len(wheels), 9), np.nan)
+    rows = np.full((len(wheels), 12), np.nan)
     rows[:, 0], rows[:, 3], rows[:, 4] = 0.25, wheels, gyro
     return Comparison(TURN, "wheels", "gyro").gain(Bins.of(rows))
 
@@ -45,6 +58,25 @@ def test_direction_of_a_turned_lidar_is_certain(turns: list[float]) -> None:
     assert gain.angle - gain.bound > SLIDE_RAD
     assert not gain.is_equal
     assert math.degrees(gain.angle) == pytest.approx(26.0, abs=math.degrees(gain.bound))
+
+
+@pytest.mark.parametrize("degrees", [-26.0, 20.0])
+def test_direction_of_a_turned_lidar_is_certain_where_scans_show_no_way_along_a_corridor(degrees: float) -> None:
+    gain = _gain_in_corridor(np.random.default_rng(4), degrees)
+    assert math.degrees(gain.angle) == pytest.approx(degrees, abs=math.degrees(gain.bound))
+    assert abs(gain.angle) - gain.bound > SLIDE_RAD
+
+
+@pytest.mark.parametrize("wheels", [1.0, 1.5, 3.0])
+def test_direction_accuses_no_lidar_of_wheels_that_spin_along_a_corridor(wheels: float) -> None:
+    found = [_gain_in_corridor(np.random.default_rng(seed), 0.0, wheels=wheels) for seed in range(1000)]
+    assert sum(abs(gain.angle) - gain.bound > math.radians(2.0) for gain in found) <= 2
+    assert all(gain.is_equal for gain in found)
+
+
+def test_direction_is_unknown_towards_a_wall() -> None:
+    """No wall along the way shows its direction."""
+    assert _gain_in_corridor(np.random.default_rng(5), 0.0, bearing_deg=90.0).bound > SLIDE_RAD
 
 
 def test_sign_of_turns_is_hardly_ever_wrong_by_chance() -> None:

@@ -18,6 +18,7 @@ from localization.sensor_checks.contradictions import (
 )
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
+from tests.helpers import corridors
 from tests.helpers.checked_drive import CheckedDrive, turned
 from tests.helpers.event_faults import bump_lidar, named_faults, turn_scans, without_gyro
 from tests.helpers.fault_drives import in_room, run
@@ -153,3 +154,12 @@ def test_lidar_bumped_at_rest_is_in_the_covariance_of_the_place_it_jumps_to(has_
 def test_gyro_that_repeats_zero_is_no_scene_that_moves() -> None:
     outcome = run(in_room(), named_faults()["gyro stuck at 0"])
     assert outcome.worst[0] < 0.05
+
+
+@pytest.mark.extended
+def test_turned_lidar_in_a_bare_corridor_is_found_before_it_leads_the_estimate_away() -> None:
+    """Scans show no way along the walls, and that across them shows the direction."""
+    outcome = run(corridors.in_corridor("healthy", 0), turn_scans(20.0))
+    assert outcome.is_wrong_at.sum() == 0
+    assert outcome.worst[0] < 1.0
+    assert "by the LiDAR the robot travels 20 deg to the left" in outcome.warnings[0]

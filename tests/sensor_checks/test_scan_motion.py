@@ -42,6 +42,8 @@ def test_register_in_corridor_has_no_translation() -> None:
     assert found is not None
     assert not found.has_translation
     assert abs(found.delta[2]) < 0.01
+    assert abs(found.normal[0]) < 0.01  # across the walls, along which nothing shows the way
+    assert abs(found.delta[:2] @ found.normal) < 0.01
 
 
 @pytest.mark.parametrize("n", [0, 1, 50])
