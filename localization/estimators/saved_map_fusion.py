@@ -9,6 +9,7 @@ from typing import Any
 
 from localization.errors import MapError
 from localization.estimators.filtered_odometry import Filter, FilteredOdometry
+from localization.estimators.localization_times import LocalizationTimes
 from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer
 from localization.maps.space_localizer import SpaceLocalizer
@@ -49,10 +50,7 @@ class SavedMapFusion(FilteredOdometry[Filter]):
 
     def __init__(self, odometry: Filter) -> None:
         self.odometry = odometry
-        self._seconds = dict.fromkeys(("searching", "localized", "lost"), 0.0)
-        self._outside_s = 0.0
-        self._first_s: float | None = None
-        self._n_losses, self._waiting_s = 0, 0.0
+        self._times, self._waiting_s = LocalizationTimes(), 0.0
 
     @abstractmethod
     def set_pose(self, pose: Pose2, cov: Cov3) -> None:
@@ -72,10 +70,7 @@ class SavedMapFusion(FilteredOdometry[Filter]):
         """The localizer has moved the last keyframe."""
 
     def _count(self, duration_s: float) -> None:
-        if self.localizer.state == "localized" and self._first_s is None:
-            self._first_s = sum(self._seconds.values())
-        self._seconds[self.localizer.state] += duration_s
-        self._outside_s += duration_s if self._is_outside else 0.0
+        self._times.add(duration_s, self.localizer.state, self._is_outside)
         self._waiting_s += duration_s
 
     def _advance_search(self) -> None:
@@ -106,11 +101,8 @@ class SavedMapFusion(FilteredOdometry[Filter]):
             "state": self.localizer.state,
             "probability": self.probability,
             "pose": self._from_above(self.localizer.pose),
-            **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
+            **self._times.as_json(),
             "is_outside": self._is_outside,
-            "outside_s": self._outside_s,
-            "first_localized_s": self._first_s,
-            "losses": self._n_losses,
             "places": [{"pose": self._from_above(place.pose), "probability": place.probability} for place in places],
         }
 
@@ -120,15 +112,15 @@ class SavedMapFusion(FilteredOdometry[Filter]):
 
     def warnings(self) -> list[str]:
         """Problems of the measurements so far: those of the filter, and for how long the place in the map was not known."""
-        found, total = list(self.odometry.warnings()), sum(self._seconds.values())
-        if self._first_s is None and self.odometry.counts()["scans"]:
+        found, times = list(self.odometry.warnings()), self._times
+        if times.first_s is None and self.odometry.counts()["scans"]:
             found.append(
                 "the robot was never localized in the map. It may be of another place, or much may have changed: check --map, or give "
                 "--initial-pose."
             )
-        elif self._n_losses:
+        elif times.n_losses:
             found.append(
-                f"the place in the map was lost {self._n_losses} times, for {self._seconds['lost']:.0f} of {total:.0f} s, and is "
+                f"the place in the map was lost {times.n_losses} times, for {times.lost_s:.0f} of {times.total_s:.0f} s, and is "
                 f"{self.localizer.state} at the end: poses of that time are by odometry alone. The robot was carried, or the map is out of "
                 "date."
             )

@@ -76,9 +76,9 @@ class SpaceMapFusion(SavedMapFusion[SpaceFusion]):
         cloud, self._cloud = self._cloud, None
         self._advance_search()
         if cloud is not None:
-            was_localized = self.localizer.state == "localized"
+            before = self.localizer.state
             self.localizer.add(cloud, self._motion_since_keyframe(), self.odometry.state["pose"][:3, :3])
-            self._n_losses += was_localized and self.localizer.state == "lost"
+            self._times.add_keyframe(before, self.localizer.state)
             self.odometry.start_key()
             self._has_key = True
             self._record(cloud)
