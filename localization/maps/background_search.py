@@ -13,7 +13,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from localization.maps.place_search import Place, PlaceMap
-from motion_models import se2
+from localization.maps.search_pacing import SearchPacing
+from localization.maps.uncertain_pose import UncertainPose
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 Found = TypeVar("Found")
@@ -66,7 +67,19 @@ Search = TypeVar("Search", bound=BackgroundSearch[Any])
 class BackgroundSearcher(ABC, Generic[Search]):
     """What runs at most one search beside the estimates."""
 
-    _running: Search | None = None
+    def __init__(self, is_background: bool) -> None:
+        """``is_background``: searches run beside the estimates, and `advance` takes their results when they are due; else at once."""
+        self._is_background, self._pacing = is_background, SearchPacing()
+        self._running: Search | None = None
+
+    def _is_search_due(self) -> bool:
+        """Whether to search at this keyframe."""
+        return self._running is None and self._pacing.add_keyframe()
+
+    def _start(self, search: Search) -> None:
+        self._running = search
+        if not self._is_background:
+            self.finish_search()
 
     def advance(self, duration_s: float) -> bool:
         """``duration_s`` more have passed in the log; returns whether the result of a search was due, and has been taken."""
@@ -94,17 +107,15 @@ class PlanarSearch(BackgroundSearch[Place]):
         places: PlaceMap,
         points: Points2,
         near: tuple[Pose2, FloatArray] | None,
-        is_by_fix: bool = False,
         way_m: float = 0.0,
     ) -> None:
         """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
-        ``is_by_fix``: it is about a measured position. ``way_m``: way from the first to the last of the scans [m]."""
-        self.n_points, self.is_by_fix, self.way_m, self.is_whole = len(points), is_by_fix, way_m, near is None
-        self.moved, self.cov = np.zeros(3), np.zeros((3, 3))
-        """(3,) motion since the scans, with its covariance (3, 3)."""
+        ``way_m``: way from the first to the last of the scans [m]."""
+        self.n_points, self.way_m, self.is_whole = len(points), way_m, near is None
+        self.since = UncertainPose(np.zeros(3), np.zeros((3, 3)))
+        """Motion since the scans."""
         super().__init__(places, points, *(near or ()), due_s=places.search_s)
 
     def move(self, delta: Pose2, cov: Cov3) -> None:
         """The robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) meanwhile."""
-        A = se2.adjoint(se2.inverse(delta))
-        self.moved, self.cov = se2.compose(self.moved, delta), A @ self.cov @ A.T + cov
+        self.since = self.since.move(delta, cov)

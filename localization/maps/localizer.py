@@ -14,19 +14,20 @@ from typing import Literal
 import numpy as np
 
 from localization.lidar.correlative_search import prior_outlier_cov
-from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow, mahalanobis
+from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow
 from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
 from localization.maps.background_search import BackgroundSearcher, PlanarSearch
-from localization.maps.found_places import SAME_COV, FoundPlaces, agree
+from localization.maps.found_places import FoundPlaces, agree
 from localization.maps.grid import Grid
 from localization.maps.place_probability import LIKELY, NEAR_WEIGHTS, PlaceHypothesis, log_odds, weigh, with_fix
 from localization.maps.place_search import CELL_M, Place, PlaceMap
 from localization.maps.position_plane import PositionFix
 from localization.maps.recent_scans import RecentMotion, RecentScans
-from localization.maps.search_pacing import SearchPacing
+from localization.maps.search_area import SearchArea, around
 from localization.maps.tracked_place import FITTING, INDEPENDENT_M, TrackedPlace
+from localization.maps.uncertain_pose import UncertainPose
 from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
+from motion_models.se2 import Cov3, Points2, Pose2
 
 State = Literal["searching", "localized", "lost"]
 
@@ -57,8 +58,6 @@ _ONE_VIEW = 0.98
 """Probability from which on one view of a place is enough to track it, in a search of the whole map: after the robot was carried in
 three logs, 34 of 93 views have more, and all are right; of the wrong ones none has more than 0.26, and of 164 searches in maps of other
 buildings none more than 0.81."""
-_INITIAL_KEYFRAMES = 10
-"""Keyframes after which a given pose that no scan confirms is dropped."""
 INITIAL_COV = np.diag([0.5, 0.5, 0.26]) ** 2
 """Covariance of a pose that a person gives [m^2, m^2, rad^2]: the default of RViz's tool for /initialpose."""
 
@@ -75,23 +74,21 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
     ) -> None:
         """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3). With ``is_background``, searches
         run beside the estimates, and `advance` takes their results when they are due; else `add` returns with them."""
-        self.places, self._is_background = place_map, is_background
+        super().__init__(is_background)
+        self.places = place_map
         self.state: State = "searching"
-        self.pose, self._cov = place_map.centre, np.zeros((3, 3))
+        self._at, self._area = UncertainPose(place_map.centre, np.zeros((3, 3))), SearchArea()
         self._tracked: TrackedPlace | None = None
-        self._recent, self._found, self._pacing = RecentScans(place_map.range_noise_m), FoundPlaces(), SearchPacing()
-        self._initial_left = 0
+        self._recent, self._found = RecentScans(place_map.range_noise_m), FoundPlaces()
         self.is_outside = False
         """Whether most of the last scan is where the map has nothing: the tracked pose is by odometry meanwhile."""
-        self._is_reckoned = False  # the pose is by odometry since it was tracked, and was not refuted
-        self._fix: PositionFix | None = None
         if initial is not None:
             self.set_pose(initial, initial_cov)
 
     def set_pose(self, pose: Pose2, cov: Cov3 = INITIAL_COV) -> None:
         """Search near ``pose`` (3,) with covariance ``cov`` (3, 3), as a person gives it."""
-        self.state, self._tracked, self._is_reckoned = "searching", None, False
-        self.pose, self._cov, self._initial_left = np.asarray(pose, dtype=float), cov, _INITIAL_KEYFRAMES
+        self.state, self._tracked, self._at = "searching", None, UncertainPose(np.asarray(pose, dtype=float), cov)
+        self._area.give()
         self._found = FoundPlaces(log_odds=0.0)
         self._pacing.restart()
         self._recent.clear()
@@ -99,12 +96,18 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
 
     def add_position(self, fix: PositionFix) -> None:
         """The robot was at ``fix`` at the last keyframe, as by GNSS: it narrows the search, and a place that contradicts it is left."""
-        self._fix = fix
+        self._area.fix = fix
 
     def search_everywhere(self) -> None:
         """Forget the place, and search the whole map by the scans from now on."""
         self.set_pose(self.places.centre, np.zeros((3, 3)))
-        self._initial_left, self._found = 0, FoundPlaces()
+        self._area.open()
+        self._found = FoundPlaces()
+
+    @property
+    def pose(self) -> Pose2:
+        """(3,) ``map_T_body``."""
+        return self._at.pose
 
     @property
     def hypotheses(self) -> Sequence[PlaceHypothesis]:
@@ -120,15 +123,14 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         """`probability` when the robot has moved by ``delta`` (3,) with covariance ``cov`` (3, 3) since the last keyframe."""
         if self._tracked is None or self.state != "localized":
             return self._found.probability
-        A = se2.adjoint(se2.inverse(delta))
-        return self._tracked.probability_within(A @ self._cov @ A.T + cov)
+        return self._tracked.probability_within(self._at.move(delta, cov).cov)
 
     @property
     def covariance(self) -> Cov3:
         """(3, 3) of the right perturbation of `pose`, with the map's own; of a place that is not known, with the extent of the map."""
-        if self.state == "localized" or (self.state == "searching" and self._is_reckoned):
-            return np.asarray(self._cov + self.places.map_cov(self.pose))
-        return self._cov if self._initial_left else np.asarray(self._cov + self.places.extent_cov)
+        if self.state == "localized" or (self.state == "searching" and self._area.is_reckoned):
+            return np.asarray(self._at.cov + self.places.map_cov(self.pose))
+        return self._at.cov if self._area.is_given else np.asarray(self._at.cov + self.places.extent_cov)
 
     def add(self, points: Points2, delta: Pose2, cov: Cov3) -> None:
         """A keyframe with the scan ``points`` (N, 2) of the body frame [m]: moved by ``delta`` (3,) with covariance ``cov`` (3, 3) since
@@ -137,24 +139,23 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         if not is_narrow(cov):  # carried, or driven blind: scans before and after do not belong together
             self._running, self._found = None, FoundPlaces(log_odds=self._found.log_odds)
             self._pacing.restart()
-        A = se2.adjoint(se2.inverse(delta))
-        self.pose, self._cov = se2.compose(self.pose, delta), A @ self._cov @ A.T + cov
+        self._at = self._at.move(delta, cov)
         self._found.move(delta, cov)
-        self._fix = None if self._fix is None else self._fix._replace(way_m=self._fix.way_m + math.hypot(delta[0], delta[1]))
+        self._area.move(delta)
         if self._running is not None:
             self._running.move(delta, cov)
         if len(points) < MIN_POINTS:
-            if self._tracked is not None and not _is_trackable(self._cov):
+            if self._tracked is not None and not _is_trackable(self._at.cov):
                 self._reckon()
             return
         self._recent.add(points)
-        if self._tracked is not None and _is_trackable(self._cov):
+        if self._tracked is not None and _is_trackable(self._at.cov):
             self._track(self._tracked, points)
-        elif self._tracked is not None or self._is_reckoned:
+        elif self._tracked is not None or self._area.is_reckoned:
             self._reckon()
         if self.state == "localized":
             self._running = None
-        elif self._running is None and self._pacing.add_keyframe():
+        elif self._is_search_due():
             self._start_search()
 
     @property
@@ -168,21 +169,21 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
 
     def _track(self, tracked: TrackedPlace, points: Points2) -> None:
         """Align with the map near the pose. Where that contradicts, the place stays a hypothesis beside the search until it is refuted."""
-        likely, cov = self._align(points), self._cov
-        place = likely or self.places.align(points, self.pose, cov)
+        likely, at = self._align(points), self._at
+        place = likely or self.places.align(points, at.pose, at.cov)
         is_unmapped = place.on_walls + place.in_free < _KNOWN_SHARE and place.contradicting < _CONTRADICTING_SHARE
-        self.is_outside = is_unmapped and (likely is None or is_narrow(cov))  # what a search finds likely is where the map has walls
+        self.is_outside = is_unmapped and (likely is None or is_narrow(at.cov))  # what a search finds likely is where the map has walls
         if likely is None and place.contradicting >= _CONTRADICTING_SHARE:
             tracked.contradict()
         if likely is None or self.is_outside:
             return
-        evidence = self._evidence(place, cov)
+        evidence = self._evidence(place, at)
         if evidence < -_TRACK_GAIN:  # the odometry may be an outlier, as by slip in a turn
-            wide = cov + prior_outlier_cov(cov)
-            again = self.places.align(points, self.pose, wide)
+            wide = replace(at, cov=at.cov + prior_outlier_cov(at.cov))
+            again = self.places.align(points, wide.pose, wide.cov)
             of_again = self._evidence(again, wide)
             if of_again >= FITTING:
-                place, cov, evidence = again, wide, of_again
+                place, at, evidence = again, wide, of_again
         tracked.add(evidence, self._recent.way_m)
         self._tracked = None if tracked.is_refuted else tracked
         if self.state == "localized" and tracked.probability < _LOST:
@@ -190,85 +191,62 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
         elif self.state == "lost" and tracked.probability >= LIKELY:
             self.state = "localized"
         measured, R = _measurement(place)
-        if not self._is_outlier(measured, cov + R):
-            K = np.linalg.solve(cov + R, cov).T
-            self.pose = se2.retract(self.pose, K @ se2.local(self.pose, measured))
-            self._cov = np.asarray((np.eye(3) - K) @ cov @ (np.eye(3) - K).T + K @ R @ K.T)
+        if not _is_outlier(at, measured, R):
+            self._at = at.update(measured, R)
 
-    def _evidence(self, place: Place, cov: Cov3) -> float:
-        """Log-odds that ``place`` adds to the one that is tracked, whose pose has covariance ``cov`` (3, 3)."""
-        measured, R = _measurement(place)
-        if self._is_outlier(measured, cov + R) or self._is_beyond_fix(place.pose):
+    def _evidence(self, place: Place, at: UncertainPose) -> float:
+        """Log-odds that ``place`` adds to the one that is tracked, whose pose is ``at``."""
+        if _is_outlier(at, *_measurement(place)) or self._area.contradicts(place.pose):
             return -_TRACK_GAIN
         return _TRACK_GAIN * (place.on_walls - _CONTRADICTION * place.contradicting)
-
-    def _is_beyond_fix(self, pose: Pose2) -> bool:
-        """Whether a measured position contradicts ``pose`` (3,) of the map."""
-        return self._fix is not None and self._fix.squared_mahalanobis(pose[:2], SAME_COV[:2, :2]) > OUTLIER_SIGMAS**2
-
-    def _is_outlier(self, measured: Pose2, cov: Cov3) -> bool:
-        return mahalanobis(self.pose, measured, cov) > OUTLIER_SIGMAS**2
 
     def _align(self, points: Points2) -> Place | None:
         """Near the pose. Where that is wider than the basin of an alignment, the last scans are searched within 3 sigma, and None where
         that is not `LIKELY`: where much is unmapped, another place than the right one may have more on walls."""
-        if is_narrow(self._cov):
-            return self.places.align(points, self.pose, self._cov)
+        if is_narrow(self._at.cov):
+            return self.places.align(points, self._at.pose, self._at.cov)
         joined = self._recent.joined(_JOINED_M, _TRACKED_SCANS)
-        found = self.places.search(joined, self.pose, _three_sigma(self._cov))
+        found = self.places.search(joined, *around(self._at))
         return found[0] if found and weigh(found, len(joined), NEAR_WEIGHTS, is_narrowed=True)[0].probability >= LIKELY else None
 
     def _reckon(self) -> None:
         """The pose is too wide to align scans: search about it, or everywhere where it is wider than that."""
         if self._tracked is not None:
             self._found = FoundPlaces()
-        self._tracked, self._is_reckoned = None, True
-        is_near = np.trace(self._cov[:2, :2]) < _NEAR_M**2 and self._cov[2, 2] < _NEAR_RAD**2
-        self.state = "searching" if is_near else "lost"
+        self._tracked, self._area.is_reckoned = None, True
+        self.state = "searching" if _is_within(self._at.cov, _NEAR_M, _NEAR_RAD) else "lost"
 
     def _lose(self) -> None:
         """The place was wrong, or the map is: search anywhere, by the last scan and those from now on."""
-        self.state, self._is_reckoned, self._found = "lost", False, FoundPlaces()
+        self.state, self._area.is_reckoned, self._found = "lost", False, FoundPlaces()
         self._pacing.restart()
         self._recent.keep_last()
 
     def _start_search(self) -> None:
         """Search the merged scans of the last keyframes."""
-        is_near = self._initial_left > 0 or (self._is_reckoned and self.state == "searching")
-        near = (self.pose, _three_sigma(self._cov)) if is_near else self._near_fix()
-        if self._initial_left:
-            self._initial_left -= 1
-            self._cov = self._cov if self._initial_left else np.zeros((3, 3))
-        is_by_fix = near is not None and not is_near
-        self._running = PlanarSearch(self.places, self._recent.joined(_JOINED_M), near, is_by_fix, self._recent.way_m)
-        if not self._is_background:
-            self.finish_search()
-
-    def _near_fix(self) -> tuple[Pose2, FloatArray] | None:
-        """Where a measured position has the robot: pose (3,), and half the window (3,) about it; None where it narrows nothing."""
-        if self._fix is None or np.trace(self._fix.cov) > np.trace(self.places.extent_cov[:2, :2]):
-            return None
-        radius = 3.0 * math.sqrt(float(np.trace(self._fix.cov)))
-        return np.array([*self._fix.position, 0.0]), np.array([radius, radius, math.pi])
+        is_near = self._area.is_given or (self._area.is_reckoned and self.state == "searching")
+        near = around(self._at) if is_near else self._area.around_fix(self.places.extent_cov)
+        if self._area.take_given():
+            self._at = replace(self._at, cov=np.zeros((3, 3)))
+        self._start(PlanarSearch(self.places, self._recent.joined(_JOINED_M), near, self._recent.way_m))
 
     def _take(self, search: PlanarSearch) -> None:
         """Take the best place of ``search`` if it is probable and the search before agrees, or if nothing else in the map is like it: then
         the probability is at most `LIKELY` until scans from elsewhere fit."""
-        before, moved = self._found, search.moved
-        weighed = weigh(search.result(), search.n_points, is_narrowed=search.is_by_fix)
-        places = [replace(place, pose=se2.compose(place.pose, moved)) for place in weighed]
+        before, since = self._found, search.since
+        weighed = weigh(search.result(), search.n_points, is_narrowed=not search.is_whole)
+        places = [replace(place, pose=se2.compose(place.pose, since.pose)) for place in weighed]
         if not places:
             self._found = FoundPlaces()
             return
-        best, *others = places if self._fix is None else with_fix(places, self._fix)
-        A = se2.adjoint(se2.inverse(moved))
-        cov = np.asarray(A @ (best.cov + _BEND) @ A.T + search.cov)
+        best, *others = places if self._area.fix is None else with_fix(places, self._area.fix)
+        cov = UncertainPose(best.pose, best.cov + _BEND).move(since.pose, since.cov).cov
         is_repeated = search.way_m >= INDEPENDENT_M and before.has(best.pose)
         is_fitting = self._is_fitting(best.pose, cov)
         is_confirmed = (is_repeated or self._is_reckoned_at(best.pose)) and is_fitting
         is_unmistakable = search.is_whole and best.probability >= _ONE_VIEW and is_fitting
         probability = best.probability if is_confirmed else min(best.probability, LIKELY)
-        self._found = FoundPlaces([replace(best, probability=probability), *others], log_odds(probability), search.cov)
+        self._found = FoundPlaces([replace(best, probability=probability), *others], log_odds(probability), since.cov)
         if probability >= _PROMISING:
             self._pacing.restart()
         if (is_confirmed or is_unmistakable) and probability >= LIKELY and is_narrow(best.cov):
@@ -286,15 +264,16 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
     def _is_reckoned_at(self, pose: Pose2) -> bool:
         """Whether the odometry leads to ``pose`` (3,) from where the robot was tracked: nearly, where it is wide as after being carried."""
         if self.state == "searching":
-            return self._is_reckoned and agree(self.pose, pose, self._cov)
+            return self._area.is_reckoned and agree(self.pose, pose, self._at.cov)
         off = se2.between(self.pose, pose)
-        return self._is_reckoned and math.hypot(off[0], off[1]) < _STAYED_M and abs(off[2]) < _STAYED_RAD
+        return self._area.is_reckoned and math.hypot(off[0], off[1]) < _STAYED_M and abs(off[2]) < _STAYED_RAD
 
     def _begin_tracking(self, pose: Pose2, cov: Cov3, is_one_view: bool) -> None:
         """The robot is at ``pose`` (3,) with covariance ``cov`` (3, 3), the first of the places that were found."""
-        self.state, self.pose, self._cov = "localized", pose, cov
+        self.state, self._at = "localized", UncertainPose(pose, cov)
         self._tracked = TrackedPlace(self._found.log_odds, is_one_view)
-        self._is_reckoned, self.is_outside, self._initial_left = False, False, 0
+        self.is_outside = False
+        self._area.open()
         self._pacing.restart()
 
 
@@ -304,11 +283,14 @@ def _measurement(place: Place) -> tuple[Pose2, Cov3]:
     return measured, place.measured_cov + _BEND
 
 
+def _is_outlier(at: UncertainPose, measured: Pose2, R: Cov3) -> bool:
+    return at.squared_distance(measured, R) > OUTLIER_SIGMAS**2
+
+
 def _is_trackable(cov: Cov3) -> bool:
-    return bool(np.trace(cov[:2, :2]) < _TRACKED_M**2 and cov[2, 2] < _TRACKED_RAD**2)
+    return _is_within(cov, _TRACKED_M, _TRACKED_RAD)
 
 
-def _three_sigma(cov: Cov3) -> FloatArray:
-    """(3,) half the window of a search [m, m, rad], along any axes."""
-    radius = math.sqrt(float(np.trace(cov[:2, :2])))
-    return 3.0 * np.array([radius, radius, math.sqrt(cov[2, 2])])
+def _is_within(cov: Cov3, sigma_m: float, sigma_rad: float) -> bool:
+    """Whether a pose with ``cov`` (3, 3) has at most these sigmas of position and heading."""
+    return bool(np.trace(cov[:2, :2]) < sigma_m**2 and cov[2, 2] < sigma_rad**2)

@@ -54,8 +54,9 @@ apart at the range that eight of ten points are nearer than."""
 _CHUNK, _MAX_BLOCKS = 200, 24_000
 """Blocks of 8 cells that are refined at once, and at most: with 6,000 three of four wrong starts in MIT-CSAIL had their right place in the
 block that is 6,800th to 10,600th by its bound, of 150,000."""
-_SHARE_OF_BEST = 0.85
-"""A place is a candidate where its score is above this share of the best."""
+_SHARE_OF_BEST, _SHARE_WHERE_ALONE = 0.85, 0.7
+"""A place is a candidate where its score is above the first share of the best. Where one of the whole map is alone, the search goes on to
+the second: by how much it is better than the next one is what its probability depends on most."""
 _APART_M, _APART_RAD = 0.6, 0.3
 """Poses nearer than both are one place."""
 _MAX_PLACES = 12
@@ -97,6 +98,13 @@ class Place:
     def score(self) -> float:
         """By which places compete: points in free space contradict the map, those in unknown space do not."""
         return self.on_walls - 2.0 * self.in_free
+
+    @property
+    def left_out_score(self) -> float:
+        """What a place has at most that is left out where this one is alone: a search's score is 0.4 + 0.6 w - 0.8 f, and w - 2 f is no
+        more than w - 4/3 f."""
+        searched = _UNKNOWN_SCORE + (1.0 - _UNKNOWN_SCORE) * self.on_walls + (_FREE_SCORE - _UNKNOWN_SCORE) * self.in_free
+        return (_SHARE_WHERE_ALONE * searched - _UNKNOWN_SCORE) / (1.0 - _UNKNOWN_SCORE)
 
 
 class PlaceMap:
@@ -180,16 +188,18 @@ class PlaceMap:
         parts = np.arange(2 * _BLOCK) / (2 * _BLOCK)  # every other one is a pose's, those between are middles of blocks
         yaws = step * (turns[:, None] + parts).ravel()
         turned = se2.transform(np.column_stack([np.zeros((len(yaws), 2)), yaws])[:, None, :], some)
-        poses, scores = self._branch_and_bound(np.ascontiguousarray(turned / CELL_M + _PADDING), starts)
-        if not len(scores):
-            return []
-        found = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
-        places = [self.align(points, pose) for pose in _distinct(found, scores)]
-        return sorted(places, key=lambda place: -place.score)
+        turned, found = np.ascontiguousarray(turned / CELL_M + _PADDING), []
+        for share in (_SHARE_OF_BEST, _SHARE_WHERE_ALONE) if near is None else (_SHARE_OF_BEST,):
+            poses, scores = self._branch_and_bound(turned, starts, share)
+            poses = np.column_stack([CELL_M * poses[:, :2] + self._walls.origin, yaws[poses[:, 2].astype(np.intp)]])
+            found = _distinct(poses, scores, share)
+            if len(found) != 1:
+                break
+        return sorted((self.align(points, pose) for pose in found), key=lambda place: -place.score)
 
-    def _branch_and_bound(self, turned: FloatArray, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _branch_and_bound(self, turned: FloatArray, starts: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
         """The best poses (K, 3) of blocks, as x, y [cells] and row of ``turned`` (Y, N, 2), and their scores (K,): in blocks about
-        ``starts`` (C, 2) [m] and of headings of ``turned``, 8 rows each."""
+        ``starts`` (C, 2) [m] and of headings of ``turned``, 8 rows each, and all that come to a ``share`` of the best."""
         wide, which = np.unique(np.floor(starts / (2.0 * _BLOCK_M)), axis=0, return_inverse=True)
         centres = 2.0 * _BLOCK_M * (wide + 0.5)
         column, row = (starts > centres[which.ravel()]).T
@@ -202,10 +212,10 @@ class PlaceMap:
         poses, scores, best = [], [], 0.0
         for begin in range(0, len(order), _CHUNK):
             chunk = order[begin : begin + _CHUNK]
-            if bounds[chunk[0]] < _SHARE_OF_BEST * best:
+            if bounds[chunk[0]] < share * best:
                 break
             turn, block = np.divmod(chunk, len(wide))
-            one, score = _refine_blocks(self._scores, turned, middles[block], is_start[block], 2 * _BLOCK * turn, best)
+            one, score = _refine_blocks(self._scores, turned, middles[block], is_start[block], 2 * _BLOCK * turn, best, share)
             poses.append(one[score > 0.0])
             scores.append(score[score > 0.0])
             best = max(best, float(score.max()))
@@ -235,10 +245,10 @@ def _look_up(image: NDArray[Any], points: Points2, outside: float = 0.0) -> Floa
     return found
 
 
-def _distinct(poses: FloatArray, scores: FloatArray) -> list[Pose2]:
-    """The best pose of each place, the best first, of all that score almost as well."""
+def _distinct(poses: FloatArray, scores: FloatArray, share: float) -> list[Pose2]:
+    """The best pose of each place, the best first, of all that have a ``share`` of the best score."""
     order = np.argsort(-scores, kind="stable")
-    order = order[scores[order] >= _SHARE_OF_BEST * scores[order[0]]]
+    order = order[scores[order] >= share * scores.max(initial=0.0)]
     found: list[Pose2] = []
     rest = poses[order]
     while len(rest) and len(found) < _MAX_PLACES:
@@ -274,17 +284,23 @@ def _bound_blocks(image: FloatArray, turned: FloatArray, middles: FloatArray) ->
 
 @threaded_kernel
 def _refine_blocks(
-    images: tuple[FloatArray, ...], turned: FloatArray, middles: FloatArray, is_start: NDArray[np.bool_], rows: IntArray, best: float
+    images: tuple[FloatArray, ...],
+    turned: FloatArray,
+    middles: FloatArray,
+    is_start: NDArray[np.bool_],
+    rows: IntArray,
+    best: float,
+    share: float,
 ) -> tuple[FloatArray, FloatArray]:
     """The best pose (8 K, 3) in each block of 4 cells and two headings within those of 8 cells about ``middles`` (K, 2) [cells] and four
     headings from ``rows`` (K,) of ``turned`` (Y, N, 2) on, where ``is_start`` (K, 4); and its score (8 K,), -1 for what cannot come to a
-    share of the ``best``.
+    ``share`` of the ``best``.
     """
     poses, scores, n = np.zeros((8 * middles.shape[0], 3)), np.full(8 * middles.shape[0], -1.0), turned.shape[1]
     for k in range(8 * middles.shape[0]):
         block, part, row = k // 8, k // 2 % 4, rows[k // 8] + 4 * (k % 2)
         x, y = middles[block, 0] + 4 * (part // 2) - 2, middles[block, 1] + 4 * (part % 2) - 2
-        spare = n * (1.0 - _SHARE_OF_BEST * best)
+        spare = n * (1.0 - share * best)
         if not is_start[block, part] or _mean(images[2], turned[row + 1], x - _SHIFTS[2], y - _SHIFTS[2], spare) < 0.0:
             continue
         for j in range(8):

@@ -19,8 +19,8 @@ from localization.maps.background_search import BackgroundSearch, BackgroundSear
 from localization.maps.grid import Grid
 from localization.maps.localizer import INITIAL_COV, State
 from localization.maps.place_probability import LIKELY, sigmoid, within
-from localization.maps.search_pacing import SearchPacing
 from localization.maps.space_places import SpacePlace, SpacePlaces
+from localization.maps.uncertain_pose import UncertainPose
 from motion_models import se3
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 from motion_models.se3 import Transform3
@@ -86,11 +86,11 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
     ) -> None:
         """``initial`` (3,): about where the robot is in the map, with covariance ``initial_cov`` (3, 3). ``is_background``: searches run
         beside the estimates (`BackgroundSearch`), and `advance` counts the time until they are due."""
-        self.places, self._is_background = places, is_background
+        super().__init__(is_background)
+        self.places = places
         self.state: State = "searching"
         self.hypotheses: list[SpaceHypothesis] = []
         """Places that the last search found, the most probable first."""
-        self._cov: FloatArray = np.zeros((6, 6))
         self.is_outside = False
         """Whether most of the last cloud is where the map has nothing: the tracked pose is by odometry meanwhile."""
         if initial is None:
@@ -101,17 +101,21 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
     def set_pose(self, pose: Pose2, cov: Cov3 = INITIAL_COV) -> None:
         """Search near ``pose`` (3,) with covariance ``cov`` (3, 3), as a person gives it."""
         self.search_everywhere()
-        self._near_left, self.pose = _NEAR_KEYFRAMES, self.places.on_ground(pose, np.eye(3))
-        self._cov[np.ix_(_PLANAR, _PLANAR)] = cov
+        self._near_left, self._at = _NEAR_KEYFRAMES, UncertainPose(self.places.on_ground(pose, np.eye(3)), _level(cov))
 
     def search_everywhere(self) -> None:
         """Forget the place, and search the whole map from now on."""
         self.state = "searching"
         self.hypotheses, self._log_odds, self.is_outside = [], -_MAX_LOG_ODDS, False
-        self.pose, self._running = self.places.on_ground(self.places.centre, np.eye(3)), None
-        self._since = self._before = _NO_MOTION  # since the clouds of the last search, and those of the search before until then
-        self._pacing = SearchPacing()
-        self._forget()
+        self._running = None
+        self._since = self._before = UncertainPose(*_NO_MOTION)  # since the clouds of the last search, and the search before until then
+        self._pacing.restart()
+        self._forget(self.places.on_ground(self.places.centre, np.eye(3)))
+
+    @property
+    def pose(self) -> Transform3:
+        """(4, 4) ``map_T_body``."""
+        return self._at.pose
 
     @property
     def probability(self) -> float:
@@ -122,8 +126,7 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
         """`probability` when the robot has moved by ``motion`` since the last keyframe."""
         if self.state != "localized":
             return min(sigmoid(self._log_odds), LIKELY)
-        A = se3.adjoint(se3.inverse(motion.delta))
-        return sigmoid(self._log_odds) * within((A @ self._cov @ A.T + motion.cov)[np.ix_(_PLANAR, _PLANAR)])
+        return sigmoid(self._log_odds) * within(self._at.move(*motion).cov[np.ix_(_PLANAR, _PLANAR)])
 
     @property
     def grid(self) -> Grid | None:
@@ -137,96 +140,90 @@ class SpaceLocalizer(BackgroundSearcher[BackgroundSearch[SpacePlace]]):
     @property
     def covariance(self) -> FloatArray:
         """(6, 6) of the right perturbation of `pose`, with the map's own."""
-        return np.asarray(self._cov + self.places.mapped.cov_at(self.pose))
+        return np.asarray(self._at.cov + self.places.mapped.cov_at(self.pose))
 
     def add(self, cloud: FloatArray, motion: SpaceMotion, rotation: FloatArray) -> None:
         """A keyframe with ``cloud`` (N, 3) of the body frame [m], after ``motion`` since the one before.
 
         ``rotation`` (3, 3): by the odometry, from the body's axes to level ones.
         """
-        A = se3.adjoint(se3.inverse(motion.delta))
-        self.pose, self._cov = self.pose @ motion.delta, A @ self._cov @ A.T + motion.cov
-        self._since = SpaceMotion(self._since.delta @ motion.delta, A @ self._since.cov @ A.T + motion.cov)
+        self._at, self._since = self._at.move(*motion), self._since.move(*motion)
         self.hypotheses = [replace(found, pose=found.pose @ motion.delta) for found in self.hypotheses]
-        if self.state == "localized" and _is_within(self._cov, _TRACKED_M, _TRACKED_RAD):
+        if self.state == "localized" and _is_within(self._at.cov, _TRACKED_M, _TRACKED_RAD):
             self._running = None
             self._track(cloud)
             return
         if self.state == "localized":  # by odometry for long: the place is searched about the pose, or everywhere
             self.state, self.hypotheses, self._log_odds = "searching", [], -_MAX_LOG_ODDS
             self._near_left = _NEAR_KEYFRAMES
-        if self._running is None and self._pacing.add_keyframe():
+        if self._is_search_due():
             self._search(cloud, rotation)
-
-    def _take(self, search: BackgroundSearch[SpacePlace]) -> None:
-        self._conclude(search.result())
 
     def _track(self, cloud: FloatArray) -> None:
         """Register near the pose. Where that contradicts, again and again, the robot is lost."""
-        place = self.places.align(cloud, self.pose, self._cov + _BEND)
+        place = self.places.align(cloud, self._at.pose, self._at.cov + _BEND)
         self.is_outside = place.on_surfaces + place.off_surfaces < _KNOWN_SHARE
         if self.is_outside:
             return
-        R = place.cov + _BEND
-        off = se3.local(self.pose, place.match.measured)
-        is_outlier = bool(off @ np.linalg.solve(self._cov + R, off) > _OUTLIER)
+        measured, R = place.match.measured, place.cov + _BEND
+        is_outlier = self._at.squared_distance(measured, R) > _OUTLIER
         evidence = min(_evidence(place), -1.0) if is_outlier else _evidence(place)
         self._log_odds = min(self._log_odds + 0.5 * evidence, _MAX_LOG_ODDS)
         if sigmoid(self._log_odds) < _LOST:
             self._lose()
         elif not is_outlier:
-            K = np.linalg.solve(self._cov + R, self._cov).T
-            self.pose = se3.retract(self.pose, K @ off)
-            self._cov = np.asarray((np.eye(6) - K) @ self._cov @ (np.eye(6) - K).T + K @ R @ K.T)
+            self._at = self._at.update(measured, R)
 
     def _lose(self) -> None:
         """The place was wrong, or the map is."""
         self.state, self.hypotheses, self._log_odds = "lost", [], -_MAX_LOG_ODDS
         self._pacing.restart()
-        self._forget()
+        self._forget(self.pose)
 
-    def _forget(self) -> None:
-        """The robot may be anywhere in the map."""
-        self._near_left, self._cov = 0, _LEVEL_COV.copy()
-        self._cov[np.ix_(_PLANAR, _PLANAR)] = self.places.extent_cov
+    def _forget(self, pose: Transform3) -> None:
+        """The robot may be anywhere in the map, at the height and the tilt of ``pose`` (4, 4)."""
+        self._near_left, self._at = 0, UncertainPose(pose, _level(self.places.extent_cov))
 
     def _search(self, cloud: FloatArray, rotation: FloatArray) -> None:
         """Search ``cloud`` (N, 3) of the last keyframe, and take the best place where searches over some way agree."""
         yaw = math.atan2(rotation[1, 0], rotation[0, 0])
         level = se3.rotation(np.array([0.0, 0.0, -yaw])) @ rotation
         near: tuple[FloatArray, ...] = ()
-        if self._near_left and _is_within(self._cov, _NEAR_M, _NEAR_RAD):
+        if self._near_left and _is_within(self._at.cov, _NEAR_M, _NEAR_RAD):
             at = np.array([*self.pose[:2, 3], math.atan2(self.pose[1, 0], self.pose[0, 0])])
-            near = at, 3.0 * np.sqrt(np.diagonal(self._cov)[_PLANAR])
+            near = at, 3.0 * np.sqrt(np.diagonal(self._at.cov)[_PLANAR])
         if self._near_left:
             self._near_left -= 1
             if not self._near_left:
-                self._forget()
-        self._before, self._since = self._since, _NO_MOTION
-        if self._is_background:
-            due_s = _NEAR_SEARCH_S if near else _SEARCH_S
-            self._running = BackgroundSearch(self.places, cloud, level, *near, due_s=due_s)
-        else:
-            self._conclude(self.places.search(cloud, level, *near))
+                self._forget(self.pose)
+        self._before, self._since = self._since, UncertainPose(*_NO_MOTION)
+        self._start(BackgroundSearch(self.places, cloud, level, *near, due_s=_NEAR_SEARCH_S if near else _SEARCH_S))
 
-    def _conclude(self, places: Sequence[SpacePlace]) -> None:
-        """Take the best of ``places``, which are those of the last search's cloud, if it is probable and the searches before agree."""
-        earlier, delta = self.hypotheses, self._since.delta
-        A = se3.adjoint(se3.inverse(delta))
-        self.hypotheses = [replace(found, pose=found.pose @ delta) for found in _weigh(places)]
+    def _take(self, search: BackgroundSearch[SpacePlace]) -> None:
+        """Take the best place of ``search`` if it is probable and the searches before agree."""
+        earlier, since = self.hypotheses, self._since
+        self.hypotheses = [replace(found, pose=found.pose @ since.pose) for found in _weigh(search.result())]
         self._log_odds = -_MAX_LOG_ODDS
         if not self.hypotheses:
             return
         best = self.hypotheses[0]
         self._log_odds = math.log(best.probability / (1.0 - best.probability))
-        cov = A @ self._before.cov @ A.T + _SAME_COV
+        cov = self._before.move(since.pose, _SAME_COV).cov
         way = max((found.way_m for found in earlier if _agree(found.pose, best.pose, cov)), default=-math.inf)
-        way = max(way + math.hypot(*self._before.delta[:3, 3]), 0.0)
+        way = max(way + math.hypot(*self._before.pose[:3, 3]), 0.0)
         self.hypotheses[0] = replace(best, way_m=way)
         if best.probability >= LIKELY and way >= _INDEPENDENT_M:
-            self.state, self.pose, self._cov = "localized", best.pose, A @ (best.cov + _BEND) @ A.T + self._since.cov
+            self.state = "localized"
+            self._at = UncertainPose(best.pose, UncertainPose(best.pose, best.cov + _BEND).move(since.pose, since.cov).cov)
             self._near_left = 0
             self._pacing.restart()
+
+
+def _level(cov: Cov3) -> FloatArray:
+    """(6, 6) of a pose on the map's ground and level by gravity, of which x, y and yaw have ``cov`` (3, 3)."""
+    full = _LEVEL_COV.copy()
+    full[np.ix_(_PLANAR, _PLANAR)] = cov
+    return full
 
 
 def _is_within(cov: FloatArray, sigma_m: float, sigma_rad: float) -> bool:

@@ -64,7 +64,8 @@ def test_background_search_written_and_read_searches_again(office: PlaceMap) -> 
     search.advance(0.1)
     again = deserialize(*serialize(search, {"map": office}), {"map": office})
     np.testing.assert_array_equal([p.pose for p in again.result()], [p.pose for p in search.result()])
-    np.testing.assert_array_equal(again.moved, search.moved)
+    np.testing.assert_array_equal(again.since.pose, search.since.pose)
+    np.testing.assert_array_equal(again.since.cov, search.since.cov)
     assert not again.advance(office.search_s - 0.11)
     assert again.advance(0.02)
 

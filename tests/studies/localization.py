@@ -4,7 +4,8 @@
 the other half, and it drives for ``--seconds``; keyframes and truth are those of the smoothed graph of the whole log. They are counted
 three ways: all; those whose last scan has a score of at least 0.5 in the map, at the true pose; and those mapped, for which all that the
 robot has measured, its scans joined at the true poses, has it. Of a robot that comes from ground that the map does not have, the last scan
-alone may be mapped, and most of what it has to search with is not. Right is within 0.5 m and 0.2 rad. Times are medians of mapped starts
+alone may be mapped, and most of what it has to search with is not. Where a start is not mapped, the right answer is that the place is not
+known; those localized all the same are counted apart. Right is within 0.5 m and 0.2 rad. Times are medians of mapped starts
 that are localized. *Reliability*: of all keyframes by the probability that was given, and of all searches by weights that were fitted to
 the other buildings. *Drives*: the second half of each log, replayed in the map of the first, and the reverse; errors while the state is
 localized, where the map has most of the walls and outside of it, where the pose is by odometry. *Carried*: the same drives with cuts
@@ -129,12 +130,20 @@ def table(title: str, found: Sequence[Start]) -> str:
         _right([s.is_right for s in mapped]),
         f"{sum(s.is_right or s.rank > 0 for s in mapped)}",
         f"{sum(s.state == 'localized' for s in mapped)}",
+        " / ".join(str(n) for n in _unmapped(found)),
         f"{len(localized)} / {sum(not s.is_right for s in localized)}",
         str(wrong),
         f"{np.median([s.localized_after_s for s in first]):.1f}" if first else "-",
         f"{np.median([s.cpu_s for s in first]):.2f}" if first else "-",
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def _unmapped(found: Sequence[Start]) -> tuple[int, int, int, int]:
+    """Of the starts that are not mapped: how many there are, localized and right, not localized, localized and wrong."""
+    rest = [s for s in found if not s.is_mapped]
+    right = [s.is_right for s in rest if s.state == "localized"]
+    return len(rest), sum(right), len(rest) - len(right), len(right) - sum(right)
 
 
 def _right(are_right: Sequence[bool]) -> str:
@@ -229,8 +238,9 @@ def main(words: Sequence[str] | None = None) -> None:
     drives = {name: BUILDINGS[name].open() for name in options.log.split(",")}
     maps = {name: dense_map(drive) for name, drive in drives.items()}
     columns = "right of all | of those with a mapped last scan | of those mapped | listed, mapped | localized, mapped"
-    print(f"| map, starts | {columns} | localized / wrong, all | wrong above 0.9 | driving, median [s] | CPU until then [s] |")
-    print("|---" * 10 + "|")
+    unmapped = "not mapped: starts / localized and right / not localized / wrong"
+    print(f"| map, starts | {columns} | {unmapped} | localized / wrong, all | wrong above 0.9 | driving, median [s] | CPU until then [s] |")
+    print("|---" * 11 + "|")
     same: list[Start] = []
     moments: list[Moment] = []
     searches: list[Search] = []

@@ -3,12 +3,14 @@
 ``python -m tests.studies.localization_carried`` cuts 30 s out of every 70 s of the second half of each log, replayed in the map of the
 first, and the reverse; ``--phases`` [s] shift where the cuts are. The first table splits the time after the cut: until the state is no
 longer ``localized``, until the right place is the most probable of those listed and stays so, and until it is localized there. The second
-one counts three ways, for a place that the map does not have cannot be found:
+one counts four ways, for a place that the map does not have cannot be found:
 
 - *all*: every cut with ten seconds or more before the next one, from the cut on;
 - *ground*: those whose first ten seconds the map has: the scans joined at their true poses have a score of at least 0.5, as of starts;
 - *scan*: those with one scan of that score, ten seconds or more before the next cut, from that scan on; and by the time of driving alone,
-  for until a robot has driven 1 m its scans are one view of the place.
+  for until a robot has driven 1 m its scans are one view of the place;
+- *outside*: those of all that are not on mapped ground. That the place is not known is the right answer there; that another one was taken,
+  at any keyframe, is not.
 """
 
 from __future__ import annotations
@@ -150,13 +152,15 @@ def delays_row(found: Carried) -> str:
 
 
 def counts_row(found: Carried) -> str:
-    """How many were found and within ten seconds: of all, of those on mapped ground, and of those with a mapped scan."""
+    """How many were found and within ten seconds: of all, on mapped ground and outside of it, and of those with a mapped scan."""
     pairs = list(zip(found.carries, found.has_ground, strict=True))
     every = [carry for carry, _ in pairs if carry.left_s >= FOUND_WITHIN_S]
     ground = [carry for carry, has_ground in pairs if carry.left_s >= FOUND_WITHIN_S and has_ground]
+    outside = [carry for carry, has_ground in pairs if carry.left_s >= FOUND_WITHIN_S and not has_ground]
     scan = [carry for carry in found.carries if carry.is_found or not math.isnan(carry.mapped[0])]
     of_driving = sum(carry.after(carry.mapped)[1] <= FOUND_WITHIN_S for carry in scan)
     cells = [_counts(every, [carry.cut for carry in every]), _counts(ground, [carry.cut for carry in ground])]
+    cells += [f"{_counts(outside, [carry.cut for carry in outside])} / {sum(carry.wrong_s > 0.0 for carry in outside)}"]
     cells += [f"{_counts(scan, [carry.mapped for carry in scan])} / {of_driving}"]
     wrong_s = max((carry.wrong_s for carry in found.carries), default=0.0)
     return _row([found.title, *cells, f"{wrong_s:.1f}", f"{found.n_wrong} of {found.n_above}"])
@@ -190,8 +194,8 @@ def print_tables(drives: dict[str, Drive], maps: dict[str, KeyframeMap], phases:
     print("| carried | found | lost reported after [s] | right place first after | localized there after |\n" + "|---" * 5 + "|")
     print("\n".join(delays_row(found) for found in runs))
     counted = "cuts / found / within 10 s"
-    print(f"\n| carried | all: {counted} | ground: {counted} | scan: {counted} / of driving | wrong, longest [s] | wrong above 0.9 |")
-    print("|---" * 6 + "|")
+    columns = f"all: {counted} | ground: {counted} | outside: {counted} / wrong | scan: {counted} / of driving"
+    print(f"\n| carried | {columns} | wrong, longest [s] | wrong above 0.9 |\n" + "|---" * 7 + "|")
     print("\n".join(counts_row(found) for found in runs), flush=True)
 
 
