@@ -8,13 +8,9 @@ import functools
 import io
 import json
 import math
-import multiprocessing
-import os
-import queue
 import re
 import resource
 import tempfile
-import time
 import traceback
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -32,6 +28,7 @@ from localization.trajectory import read_tum
 from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import Record, S
+from tests.helpers.guarded_process import Ended, GuardedProcess
 from tests.helpers.rooms import drive
 from tests.helpers.sensor_faults import SENSOR_FAULTS
 
@@ -44,7 +41,7 @@ FAR_M, MOST_SIGMA = 1.0, 5.0
 NEAR_M = 0.3
 """A peer (wheels alone, KISS-ICP alone) that ends so near to the truth is right."""
 _MOST_CPU_S, _MOST_IDLE_S = 120.0, 60.0
-"""CPU time [s] after which a replay hangs, and time [s] without any: on a busy machine time on the wall shows neither."""
+"""CPU time [s] after which a replay hangs, and time [s] without any."""
 _MOST_BYTES = 4 << 30  # of address space: numba, gtsam and the log itself take 2 GB of it, and a fault may take 2 GB more
 
 
@@ -384,47 +381,17 @@ def _end_sigma_m(out: Path, name: str) -> float:
 
 def run_guarded(jobs: Iterable[tuple[Case, Path, Path, Path]]) -> Iterable[tuple[Case, Outcome, float]]:
     """`run_case` of each in another process, which is replaced where it hangs or dies, with its CPU time [s]."""
-    worker: _Worker | None = None
+    process: GuardedProcess | None = None
     for case, *job in jobs:
-        worker = worker or _Worker()
-        outcome, took = worker.run([case, *job])
-        if outcome.kind in ("hang", "memory"):
-            worker.stop()
-            worker = None
+        process = process or GuardedProcess(_work, _MOST_CPU_S, _MOST_IDLE_S)
+        outcome, took = process.run([case, *job])
+        if isinstance(outcome, Ended):
+            outcome = Outcome("hang" if outcome.is_hanging else "memory", math.nan, math.nan, outcome.message)
+            process.stop()
+            process = None
         yield case, outcome, took
-    if worker is not None:
-        worker.stop()
-
-
-class _Worker:
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._jobs, self._outcomes = context.Queue(), context.Queue()
-        self._process = context.Process(target=_work, args=(self._jobs, self._outcomes), daemon=True)
-        self._process.start()
-
-    def run(self, job: list[Any]) -> tuple[Outcome, float]:
-        """Outcome of a case, and its CPU time [s]."""
-        self._jobs.put(job)
-        begin_s, cpu_s, worked_at = self._cpu_seconds(), 0.0, time.monotonic()
-        while cpu_s < _MOST_CPU_S and time.monotonic() - worked_at < _MOST_IDLE_S:
-            try:
-                return self._outcomes.get(timeout=1.0), self._cpu_seconds() - begin_s
-            except queue.Empty:
-                if not self._process.is_alive():
-                    return Outcome("memory", math.nan, math.nan, f"the process died with code {self._process.exitcode}"), cpu_s
-            before_s, cpu_s = cpu_s, self._cpu_seconds() - begin_s
-            worked_at = time.monotonic() if cpu_s > before_s else worked_at
-        return Outcome("hang", math.nan, math.nan, f"not done after {cpu_s:.0f} s of CPU time"), cpu_s
-
-    def _cpu_seconds(self) -> float:
-        """CPU time of the process so far [s], as proc(5) has it: fields 14 and 15, after the name in brackets."""
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-    def stop(self) -> None:
-        self._process.kill()
-        self._process.join()
+    if process is not None:
+        process.stop()
 
 
 def _work(jobs: Any, outcomes: Any) -> None:
