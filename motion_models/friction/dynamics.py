@@ -175,7 +175,8 @@ def _weighted(sums: tuple[float, float, float, float], xi: float, eta: float, t:
 def _shifted_loads(xi_0: float, eta_0: float, lean_x: float, lean_y: float, warp: float, sums: _WheelSums) -> tuple[float, float]:
     """xi and eta of loads that shift under the acceleration which they cause: 3.21-3.23 with 3.24 and 3.25, linear until a wheel lifts.
 
-    ``xi_0, eta_0`` are those without friction; ``lean_x, lean_y`` are mu z_G over four half wheelbases and half tracks. Newton's method.
+    ``xi_0, eta_0`` are those without friction; ``lean_x, lean_y`` are mu z_G over four half wheelbases and half tracks. Newton's method;
+    where all load is on one axle or side, of the other direction alone.
     """
     xi, eta = _inside(xi_0), _inside(eta_0)
     for _ in range(_CLOSURE_STEPS):
@@ -187,6 +188,10 @@ def _shifted_loads(xi_0: float, eta_0: float, lean_x: float, lean_y: float, warp
         whole = 1.0 / (a * d - b * c)
         new_xi = _inside(xi - whole * (d * off_x - b * off_y))
         new_eta = _inside(eta - whole * (a * off_y - c * off_x))
+        if abs(new_xi) == 1.0:
+            new_eta = _inside(eta - (off_y + c * (new_xi - xi)) / d)
+        elif abs(new_eta) == 1.0:
+            new_xi = _inside(xi - (off_x + b * (new_eta - eta)) / a)
         moved = abs(new_xi - xi) + abs(new_eta - eta)
         xi, eta = new_xi, new_eta
         if moved < 1e-14:

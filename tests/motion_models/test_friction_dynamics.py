@@ -181,6 +181,17 @@ def test_dynamics_of_braking_load_the_front_and_tip():
             assert margin == pytest.approx(1 - 0.9 * height / 0.26, abs=1e-4)
 
 
+def test_dynamics_of_a_robot_held_upright_are_continuous():
+    """All load on one axle or side: forces that jump with a rounding of the twist leave an implicit step without a solution."""
+    rng, jumps = np.random.default_rng(1), []
+    while len(jumps) < 400:
+        wheels, twist, cg = rng.uniform(-4, 4, 2), rng.uniform(-1, 1, 3) * (0.6, 0.3, 0.8), rng.uniform((-0.05, -0.03), (0.08, 0.03))
+        a, margin = BODY.accelerations(wheels, twist, Influence.of_cg(cg))
+        if margin < 0.0:
+            jumps.append(np.abs(BODY.accelerations(wheels, twist + 1e-7, Influence.of_cg(cg))[0] - a).max())
+    assert max(jumps) < 1e-2
+
+
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.integers(0, 10_000))
 @settings(max_examples=60, deadline=None)
 def test_dynamics_loads_agree_with_accelerations(x, y, seed):
