@@ -12,7 +12,7 @@ import numpy as np
 
 from localization.bounded_settings import Count, Probability, Seed, Settings
 from localization.calibration.calibrate import describe_clocks
-from localization.diagnosis.causes import MISSING_MESSAGES
+from localization.diagnosis.causes import FROZEN_ENCODER, MISSING_MESSAGES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, Unmodelled
@@ -24,6 +24,7 @@ from localization.diagnosis.findings import (
     Gain,
     confirmed_findings,
     correctable_findings,
+    describe_encoder_losses,
     describe_loss,
     describe_standstill_turn,
     evidence,
@@ -158,7 +159,7 @@ def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: D
     of sizes that no robot has: others stand for what has no name, and what they had taken of it is unexplained as well."""
     d = found.diagnosis
     confirmed = confirmed_findings(d)
-    kept = {f.definition.key for f in d.findings if f in confirmed or f.cause == MISSING_MESSAGES.id or not f.is_plausible}
+    kept = {f.definition.key for f in d.findings if f in confirmed or f.is_counted or not f.is_plausible}
     if d.verdict != "unexplained" or all(f.definition.key in kept for f in d.findings):
         return found
     linearization = searched.linearization if kept else searched.first
@@ -531,15 +532,11 @@ def _within_tolerance(
 
 
 def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
-    """``d`` with its sentence, with missing messages as a finding, and without a consistent verdict where measurements contradict each
-    other."""
-    verdict, findings, loss = d.verdict, d.findings, drive.message_loss
+    """``d`` with its sentence, with what was counted where the log was read as findings, and without a consistent verdict where
+    measurements contradict each other."""
+    verdict, findings = d.verdict, (*_counted_findings(d, drive), *d.findings)
+    verdict = "explained" if verdict == "consistent" and findings else verdict
     contradictions = () if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),)
-    if loss is not None and loss.share > MISSING_MESSAGES.negligible and loss.gaps >= _MIN_GAPS:
-        none = Gain(*(float("nan"),) * 2, 0.0, 0.0, 0.0) if d.gain is None else Gain(d.gain.after, d.gain.after, 0.0, 0.0, 0.0)
-        sigma = loss.share * math.sqrt(2.0 / loss.gaps)
-        findings = (Finding(MISSING_MESSAGES, loss.share, sigma, 0.0, (), describe_loss(loss), none), *findings)
-        verdict = "explained" if verdict == "consistent" else verdict
     if contradictions and verdict == "consistent":
         verdict = "unexplained"
     suspected, next_drive = (d.suspected, d.next_drive) if verdict == d.verdict or d.suspected is None else (None, "")
@@ -547,6 +544,22 @@ def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
         d, verdict=verdict, findings=findings, contradictions=contradictions, suspected=suspected, next_drive=next_drive
     )
     return dataclasses.replace(d, sentence=sentence(d))
+
+
+def _counted_findings(d: Diagnosis, drive: Drive) -> list[Finding]:
+    """Missing messages, and the encoder that lost most, beyond what is tolerated; their shares are as certain as their spells are many."""
+    loss, frozen = drive.message_loss, sorted(drive.encoder_losses, key=lambda one: -one.share)
+    shares = []
+    if loss is not None and loss.gaps >= _MIN_GAPS:
+        shares.append((MISSING_MESSAGES, loss.share, loss.gaps, describe_loss(loss)))
+    if frozen:
+        shares.append((FROZEN_ENCODER, frozen[0].share, frozen[0].spells, describe_encoder_losses(frozen)))
+    none = Gain(*(float("nan"),) * 2, 0.0, 0.0, 0.0) if d.gain is None else Gain(d.gain.after, d.gain.after, 0.0, 0.0, 0.0)
+    return [
+        Finding(cause, share, share * math.sqrt(2.0 / spells), 0.0, (), text, none)
+        for cause, share, spells, text in shares
+        if share > cause.negligible
+    ]
 
 
 def _is_gain_significant(gain: Gain) -> bool:

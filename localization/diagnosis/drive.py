@@ -47,6 +47,15 @@ _STEP_S = 0.05
 _SIGMA_M = 0.01  # of a vision error, before the runs' own scatter is estimated
 
 
+class EncoderLoss(NamedTuple):
+    """What the encoder of a wheel joint lost, which the other wheels of its side replaced."""
+
+    joint: str
+    share: float
+    """Share of the messages in which wheels roll."""
+    spells: int
+
+
 class MessageLoss(NamedTuple):
     """Messages of the wheels that are missing, by the gaps between their stamps."""
 
@@ -98,6 +107,9 @@ class Drive:
     range_slopes: FloatArray | None = None
     """(W, 3) change of the measured motion per metre that is added to all ranges; None where no LiDAR measured it."""
     message_loss: MessageLoss | None = None
+    encoder_losses: tuple[EncoderLoss, ...] = ()
+    rolling_messages: int = 0
+    """Messages of the wheels in which these had turned since the one before."""
     standstill_turn: StandstillTurn | None = None
     is_lidar_reference: bool = True
     """Whether the LiDAR measured the motion: of tables, whose motion was measured by scan matching, too."""
@@ -245,7 +257,8 @@ def drive_of_log(
         note = f"the antenna was estimated at ({x:.3f} +- {sigma_x:.2g}, {y:.3f} +- {sigma_y:.2g}) m, and counts as known there."
         drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
         drive = dataclasses.replace(drive, warnings=(*drive.warnings, note))
-    return dataclasses.replace(drive, warnings=(*drive.warnings, *log.warnings()))
+    losses = tuple(EncoderLoss(f.joint, f.messages / max(drive.rolling_messages, f.messages), f.spells) for f in log.frozen_wheels())
+    return dataclasses.replace(drive, encoder_losses=losses, warnings=(*drive.warnings, *log.warnings()))
 
 
 def drive_of_events(
@@ -262,6 +275,7 @@ def drive_of_events(
     recorder, imu = _Recorder(inner), ImuRecord(robot, mounts)
     frame = ""
     wheel_stamps: list[int] = []
+    wheel_angles: list[FloatArray] = []
 
     def record_events() -> Iterable[Event]:
         nonlocal frame
@@ -270,6 +284,7 @@ def drive_of_events(
                 imu.insert(event)
             elif isinstance(event, WheelSample):
                 wheel_stamps.append(event.stamp_ns)
+                wheel_angles.append(event.position)
             elif isinstance(event, Scan):
                 frame = event.frame_id
             yield event
@@ -295,6 +310,7 @@ def drive_of_events(
         payload_link=_gripper(postures),
         range_slopes=recorder.range_slopes(),
         message_loss=find_message_loss(np.array(wheel_stamps, dtype=np.int64)),
+        rolling_messages=int(np.count_nonzero(np.diff(np.reshape(wheel_angles, (-1, 2)), axis=0).any(axis=1))),
         standstill_turn=find_standstill_turn(imu.gyro, recorder.standstills, spans) if imu.stamps else None,
         is_lidar_reference=by_lidar,
         lidar_frame=frame,

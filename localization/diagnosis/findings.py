@@ -10,10 +10,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from localization.diagnosis.causes import CAUSES, MISSING_MESSAGES
+from localization.diagnosis.causes import CAUSES, COUNTED
 from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.causes.gyro_and_ranging import RANGE_BIAS, RANGE_SCALE
-from localization.diagnosis.drive import MessageLoss, StandstillTurn
+from localization.diagnosis.drive import EncoderLoss, MessageLoss, StandstillTurn
 from localization.diagnosis.drive_predictor import CHANNELS
 from localization.diagnosis.noise import Noise
 from motion_models.calibration.cross_validation import Interval
@@ -87,6 +87,11 @@ class Finding:
     def cause(self) -> str:
         """The cause's id."""
         return self.definition.id
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether it was counted where the log was read, and not estimated from the motion."""
+        return self.definition in COUNTED
 
     @property
     def is_plausible(self) -> bool:
@@ -373,6 +378,12 @@ def describe_loss(loss: MessageLoss) -> str:
     return f"{loss.gaps} gaps of up to {loss.longest_s:.2g} s between messages that come every {1e3 * loss.period_s:.3g} ms"
 
 
+def describe_encoder_losses(losses: Sequence[EncoderLoss]) -> str:
+    """Which encoders lost how much; the largest first."""
+    each = [f"'{one.joint}' in {one.spells} spell{'' if one.spells == 1 else 's'}, {100.0 * one.share:.2g} %" for one in losses]
+    return f"{', '.join(each)} of the messages; the other wheels of its side replace it"
+
+
 def describe_standstill_turn(turn: StandstillTurn) -> str:
     """A gyro that turns while the wheels stand, and what to check."""
     first = f"first at {turn.first_s:.0f} s" if turn.first_s >= 0.0 else f"first {-turn.first_s:.0f} s before it drove"
@@ -461,7 +472,7 @@ def correctable_findings(d: Diagnosis) -> list[Finding]:
     whose size depends on one of these; where a part stays unexplained, only what by itself improves windows that it was not fitted to, and
     nothing that changes within the drive: it may be a step in the place of an unknown change; and no ranges where the wheels explain the
     drive as well."""
-    estimated = [f for f in d.findings if f.cause != MISSING_MESSAGES.id]
+    estimated = [f for f in d.findings if not f.is_counted]
     contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
     contested |= {f.cause for f in estimated if not f.is_plausible}
     if d.verdict == "unexplained":
@@ -481,7 +492,7 @@ def confirmed_findings(d: Diagnosis) -> list[Finding]:
 def sentence(d: Diagnosis) -> str:
     """What to do, in one or two sentences."""
     contradiction = f" {d.contradictions[0][0].upper()}{d.contradictions[0][1:]}" if d.contradictions else ""
-    missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.cause == MISSING_MESSAGES.id]
+    missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.is_counted]
     if d.verdict == "undecidable":
         cannot = f"{d.model} cannot be diagnosed on this drive: {d.too_little}" if d.too_little else _NOT_SHOWN.format(d.model)
         found = "".join(f" {text[0].upper()}{text[1:]}." for text in missing)

@@ -371,6 +371,11 @@ class JointsToWheels:
             self._stats.count(f"{self._topic}, joint '{self._names[i]}'", Oddity.FROZEN_WHEEL)
         yield WheelSample(reading.stamp_ns, self._side_means(velocity), self._side_means(publisher.angle))
 
+    def frozen_wheels(self) -> tuple[FrozenWheel, ...]:
+        """Joints whose encoders failed, so far."""
+        lost = zip(self._names, self._failing.lost.tolist(), strict=True)
+        return tuple(FrozenWheel(name, messages, spells) for name, (messages, spells) in lost if spells)
+
     def _hold_unknown(self, reading: JointReading) -> JointReading:
         """``reading`` with the last angles of joints whose angles are NaN while others have some."""
         unknown = ~np.isfinite(reading.position)
@@ -430,6 +435,14 @@ class JointsToWheels:
         return np.array([sum(numbers[: self._left]) / self._left, sum(numbers[self._left :]) / (len(numbers) - self._left)])
 
 
+class FrozenWheel(NamedTuple):
+    """A wheel joint whose angle did not change while another wheel of its side turned."""
+
+    joint: str
+    messages: int
+    spells: int
+
+
 class FailingEncoders:
     """Joints whose angles do not change while another wheel of their side turns: what that one turns is theirs, until they count again.
 
@@ -441,8 +454,11 @@ class FailingEncoders:
         self._sides = (np.arange(left), np.arange(left, n))
         self._missing = np.zeros(n)  # what the others have turned on average since a joint last turned [rad]
         self._idle = np.zeros(n)  # the sizes of their steps
+        self._silent = np.zeros(n, dtype=int)  # messages of these
         self.joints: list[int] = []
         """Those that fail now."""
+        self.lost = np.zeros((n, 2), dtype=int)
+        """Messages and spells of each joint in which it failed, so far."""
 
     def replace(self, step: FloatArray) -> FloatArray:
         """Increments (n,) with those of failing joints replaced; where one is found, with what it has lost."""
@@ -450,6 +466,7 @@ class FailingEncoders:
         if not self.joints and (all(is_turning) or not any(is_turning)):
             if is_turning[0]:
                 self._missing[:] = self._idle[:] = 0.0
+                self._silent[:] = 0
             return step
         found, before = step.copy(), frozenset(self.joints)
         self.joints = []
@@ -460,11 +477,14 @@ class FailingEncoders:
                 if is_turning[i]:
                     found[i] = mean if i in before and turning else step[i]  # counts again, from wherever
                     self._missing[i] = self._idle[i] = 0.0
+                    self._silent[i] = 0
                     continue
                 self._missing[i] += mean
                 self._idle[i] += abs(mean)
+                self._silent[i] += mean != 0.0
                 if self._idle[i] > _FROZEN_AFTER_RAD:
                     self.joints.append(int(i))
+                    self.lost[i] += (mean != 0.0, 0) if i in before else (self._silent[i], 1)
                     found[i] = mean if i in before else self._missing[i]
         return found
 

@@ -22,7 +22,7 @@ from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
 from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, odd_rates, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
-from localization.logs.event_decoder import EventDecoder, TopicDecoder, decode_item, late_ns, rate_error
+from localization.logs.event_decoder import EventDecoder, FrozenWheel, TopicDecoder, decode_item, late_ns, rate_error
 from localization.logs.reference_topics import reference_decoder
 from localization.logs.serialization import LogDeserializer
 from localization.logs.split import SplitSource
@@ -80,6 +80,7 @@ class Log:
         for channel in sorted(self.channels, key=lambda c: -c.count):  # of a topic with two types, the more frequent one counts
             self.types.setdefault(channel.topic, channel.type)
         self._stats_by_topic: dict[str, MessageStats] = {}
+        self._decoder: EventDecoder | None = None  # of the last `events`
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
         roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge, self._mean_point)
@@ -233,12 +234,16 @@ class Log:
             found += stats.describe()
         return list(dict.fromkeys(found))
 
+    def frozen_wheels(self) -> tuple[FrozenWheel, ...]:
+        """Wheel joints whose encoders failed in the `events` that were read last, so far; what they lost is replaced there."""
+        return () if self._decoder is None else self._decoder.from_joints.frozen_wheels()
+
     def add_notes(self, notes: Iterable[str]) -> None:
         """Add sentences to `warnings`, before those about topics."""
         self._choice_notes = [*notes, *self._choice_notes]
 
     def _events(self, stats: MessageStats) -> Iterator[Event]:
-        decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats, self.period_s)
+        decoder = self._decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, stats, self.period_s)
         for payload in merge(self._items(decoder.decoders, stats), self._clocks, stats):
             yield from decoder.events(payload)
 

@@ -416,7 +416,6 @@ def diagnose_events(events: Sequence[Event], request: Request) -> Status:
 
 def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
     """Verdict and sentence, as the command prints them, then what to do about findings to be corrected and about missing messages."""
-    from localization.diagnosis.causes import MISSING_MESSAGES
     from localization.diagnosis.corrected_robot import correct_robot
     from localization.diagnosis.findings import confirmed_findings, describe_sizes
 
@@ -430,7 +429,7 @@ def _status_of(found: DiagnosisResult, robot: Robot, name: str) -> Status:
         values[f"finding_{i}"] = f"{finding.cause} {finding.size:+.4g} +- {finding.sigma:.2g} {finding.definition.unit}"
         if finding.aliases:
             values[f"or_{i}"] = describe_sizes(finding.aliases)
-        if (finding in corrected and finding.definition.spell is None) or finding.cause == MISSING_MESSAGES.id:
+        if (finding in corrected and finding.definition.spell is None) or finding.is_counted:
             values[f"remedy_{i}"] = finding.definition.remedy.format(g=robot.geometry, c=robot.clock, r=robot)
             remedies.append(f"{finding.definition.label}: {values[f'remedy_{i}']}.")
     is_good = d.verdict in ("consistent", "undecidable") and not d.findings

@@ -28,9 +28,12 @@ def test_every_case_can_be_simulated() -> None:
 
 @pytest.mark.slow
 def test_encoder_that_loses_few_counts_is_named() -> None:
-    """Two spells in a minute, 0.9 % of the counts: 20 mrad in a window, where the noise is 0.3 mrad."""
+    """Two spells in a minute, 0.9 % of the counts. The longer one is replaced by the other wheel of its side where the log is read, so that
+    it is counted, and hardly anything of it is left in the motion; the other one is shorter than half a radian."""
     row = run(case_of(1005), has_rivals=False)
+    assert row["verdict"] == "explained"
     assert [finding["cause"] for finding in row["findings"]] == ["encoder_dropout"]
+    assert row["findings"][0]["size"] == pytest.approx(0.009, abs=0.004)
 
 
 @pytest.mark.slow

@@ -311,3 +311,20 @@ def test_frozen_wheel_is_excluded_and_named(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[-1].position, single[-1].position, atol=0.05)
     assert f"/joint_states, joint '{ROBOT.joints.left[0]}': " in warnings_of(log)
     assert "its side turns; it was left out" in warnings_of(log)
+
+
+def test_frozen_wheels_are_counted_by_joint(tmp_path: Path) -> None:
+    """A joint that does not count from 5 to 8 s, nor from 12 to 14 s: 250 of the messages, but for where the wheels turn too slowly."""
+    records, held = drive(20.0), 0.0
+    for topic, message, at_ns in records:
+        if topic == "/joint_states":
+            t_s = (at_ns - START) / S
+            angles = np.array(message.position)
+            held = held if 5.0 <= t_s < 8.0 or 12.0 <= t_s < 14.0 else float(angles[0])
+            message.position = np.r_[held, angles[1:]]
+    log = opened(tmp_path, records)
+    assert log.frozen_wheels() == ()
+    list(log.events())
+    (frozen,) = log.frozen_wheels()
+    assert (frozen.joint, frozen.spells) == (ROBOT.joints.left[0], 2)
+    assert frozen.messages == pytest.approx(250, abs=3)

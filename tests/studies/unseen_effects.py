@@ -7,8 +7,8 @@ developed on afterwards. Robots are off their files by what files are accurate t
 changes, heading and time, of which half are not in the library of terms (saturation, dead zones, roots, one side only), and are drawn
 again where a single cause would explain 80 % of them. Scores: names printed first that are wrong, with and without `--extend`, and
 written; nulls that are not consistent; laws with a term of the right component and variable, or unexplained with such a trend; the share
-of a law that the written file removes on a fresh drive, of what the true law would remove; and intervals of sizes that hold them. Causes
-count where the drive shows them to three sigma.
+of a law that the written file removes on a fresh drive, of what the true law would remove, where that drive shows the law; and intervals
+of sizes that hold them. Causes count where the drive shows them to three sigma.
 """
 
 from __future__ import annotations
@@ -241,11 +241,21 @@ def run(case: Case, draw: int, folder: Path) -> dict[str, Any]:
     law = law_of(case, draw, plain)
     answers, extended = _answers(hide(plain, law))
     floor = simulate(case, case.routes[1], {}, folder)
-    share = removed_share(extended, hide(floor, law), floor, plain.robot, None)
+    is_shown = _squares_on(law, floor) > _LEAST_SQUARES
+    share = removed_share(extended, hide(floor, law), floor, plain.robot, None) if is_shown else None
     by_oracle = _oracle_share(law, plain, floor)
     right = any(_is_right(law, text) for text in answers["parts"])
     truth = f"{law.component}[{law.text}]"
     return row | answers | {"truth": truth, "size": law.size, "removed": share, "oracle": by_oracle, "is_right": right}
+
+
+def _squares_on(law: Law, floor: Drive) -> float:
+    """Squares that the ``law`` adds to the fresh drive ``floor``, over the reference's noise."""
+    model = make_model(default_model(floor.robot), floor.robot)
+    with_law, without = (make_predictor(d, model) for d in (hide(floor, law), floor))
+    sigmas = np.sqrt(np.diagonal(without.batch.cov, axis1=1, axis2=2))
+    rows = with_law.discrepancies(Hypothesis()) - without.discrepancies(Hypothesis())
+    return float(np.nansum((rows[:, :3] / sigmas) ** 2))
 
 
 def _oracle_share(law: Law, plain: Drive, floor: Drive) -> float:
@@ -318,7 +328,8 @@ def report(rows: list[dict[str, Any]]) -> str:
     nulls, laws, causes = ([r for r in rows if r["kind"] == kind] for kind in ("null", "law", "cause"))
     strong = [r for r in causes if r["significance"] is None or r["significance"] >= _STRONG_SIGMAS]
     covered = [abs(r["estimate"][0] - r["size"]) < _TWO_SIDED_95 * r["estimate"][1] for r in causes if r["estimate"]]
-    shares = [min(r["removed"], 1.0) / r["oracle"] for r in laws if r["has_file"]]
+    scored = [r for r in laws if r["removed"] is not None]
+    shares = [min(r["removed"], 1.0) / r["oracle"] for r in scored if r["has_file"]]
     lines = {
         "nulls not consistent": _count([r["verdict"] != "consistent" for r in nulls]),
         "nulls with a name, or with a file by --extend": _count([bool(r["printed"]) or r["has_file"] for r in nulls]),
@@ -330,9 +341,10 @@ def report(rows: list[dict[str, Any]]) -> str:
         "laws with a wrong cause written": _count([bool(r["written"]) for r in laws]),
         "laws that are consistent": _count([r["verdict"] == "consistent" and not r["names"] for r in laws]),
         "laws with a term or trend of the right component and variable": _count([r["is_right"] for r in laws]),
+        "laws that the fresh drive hardly shows, not in the shares": _count([r["removed"] is None for r in laws]),
         "laws with a file by --extend": _count([r["has_file"] for r in laws]),
         "share of the law that the file removes, over the true law's: mean and least": (
-            f"{np.mean(shares):.2f}, {np.min(shares):.2f}; of all laws {np.sum(shares) / len(laws):.2f}" if shares else "-"
+            f"{np.mean(shares):.2f}, {np.min(shares):.2f}; of all laws {np.sum(shares) / len(scored):.2f}" if shares else "-"
         ),
     }
     return "\n".join(f"{name:75s} {value}" for name, value in lines.items())
@@ -358,7 +370,8 @@ def main() -> None:
                 file.write(json.dumps(row) + "\n")
         hidden = f"{row.get('truth', 'nothing')} {row.get('size', 0.0):+.3g}"
         named, extended = (", ".join(names[:3]) for names in (row["printed"], row.get("names", [])))
-        found = f"{row['verdict']:12s} {named} | {extended} {row.get('removed', math.nan):.2f}"
+        removed = row.get("removed")
+        found = f"{row['verdict']:12s} {named} | {extended} {'-' if removed is None else f'{removed:.2f}'}"
         print(f"{number:3d} {row['source']:9s} {row['robot']:10s} {hidden:44s} -> {found}", flush=True)
     print(report([row for row in rows if row["draw"] == options.draw]))
 

@@ -52,6 +52,8 @@ CAUSES: MutableMapping[str, Cause] = {
     "grip": slopes.GRIP,
 }
 """All causes by id, in the order in which ties are decided."""
-MISSING_MESSAGES = wheels.MISSING_MESSAGES
+MISSING_MESSAGES, FROZEN_ENCODER = wheels.MISSING_MESSAGES, wheels.FROZEN_ENCODER
+COUNTED = (MISSING_MESSAGES, FROZEN_ENCODER)
+"""Causes that are counted where the log is read, and not estimated from the motion."""
 STIFFNESS_EXPONENT = "stiffness_exponent"
 """Id of the cause of a healthy drive alone (`weigh.stiffness_exponent_cause`): how slow turns differ from fast ones."""

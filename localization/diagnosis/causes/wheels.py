@@ -67,6 +67,8 @@ ENCODER_DROPOUT = Cause(
     is_shown_by_headings=True,
     one_sided=True,
 )
+FROZEN_ENCODER = dataclasses.replace(ENCODER_DROPOUT, inject=lambda b, s: b)
+"""An encoder whose loss was counted, and replaced, where the log was read."""
 WHEEL_LAG = Cause(
     "wheel_lag",
     *("s", "the body follows the wheels with this time constant", 0.05, 0.008, add("wheel_lag_s")),
