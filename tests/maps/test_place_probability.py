@@ -17,12 +17,20 @@ def place(on_walls: float, in_free: float, x: float = 0.0) -> Place:
 
 
 def test_wrong_place_alone_down_to_085_of_its_score_is_not_likely() -> None:
-    """As searches found them: another room of fr079, where the map does not have the robot's, twice, and a corridor of ACES. With nothing
-    as the next place they would be more probable, and are less with what a search may have left out."""
+    """As searches found them, and what came next: another room of fr079, where the map does not have the robot's, twice; a corridor of
+    ACES."""
     for on_walls, in_free, next_score, n in ((0.79, 0.19, 0.28, 566), (0.78, 0.21, 0.27, 640), (0.65, 0.06, 0.27, 187)):
-        best = place(on_walls, in_free)
-        assert weigh([best, place(next_score, 0.0, 5.0)], n)[0].probability < LIKELY
-        assert weigh([best], n)[0].probability < weigh([best, place(0.0, 0.0, 5.0)], n)[0].probability
+        assert weigh([place(on_walls, in_free), place(next_score, 0.0, 5.0)], n)[0].probability < LIKELY
+
+
+def test_place_alone_is_weighed_against_what_the_search_left_out() -> None:
+    best = place(0.79, 0.19)
+    assert weigh([best], 566)[0].probability < LIKELY < weigh([best, place(0.0, 0.0, 5.0)], 566)[0].probability
+
+
+def test_wrong_place_by_one_view_of_a_hundred_points_is_not_taken() -> None:
+    """In a corridor of ACES, 7 m off, with a margin of 0.36."""
+    assert weigh([place(0.77, 0.01), place(0.39, 0.0, 5.0)], 112)[0].probability < 0.98
 
 
 def test_place_alone_that_fits_well_is_certain() -> None:
