@@ -12,6 +12,11 @@ _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 """Upper bounds of the variances of x, y and yaw; yaw: that of a uniform distribution from -pi to pi [rad^2]."""
 _MIN_REPORTED_S = 0.05
 """Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
+_LONG_S = 60.0
+_PAUSED = (
+    "Where no other sensor has data either, the recorder was paused, or the computer's clock was set forward: `skidloc info` has the gaps;"
+    " if it was the clock, cut the log there."
+)
 
 
 class UnknownVelocity:
@@ -47,4 +52,5 @@ class UnknownVelocity:
         """How long there were no wheel data in all."""
         if self._total_s < _MIN_REPORTED_S:
             return []
-        return [f"no wheel data for {self._total_s:.1f} s in all: motion there is predicted with a wide covariance."]
+        text = f"no wheel data for {self._total_s:.1f} s in all: motion there is predicted with a wide covariance."
+        return [text if self._total_s < _LONG_S else f"{text} {_PAUSED}"]

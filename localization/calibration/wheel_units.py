@@ -38,6 +38,10 @@ _MAX_BIAS = 3.0
 """Largest bias of a gyro in deg/s: 0.05 rad/s."""
 _FASTEST_M_S = 3.0
 """Speed of such robots; velocities that mean more are no rad/s."""
+_BACKWARDS = 0.1
+"""Part of a wheel's fast rate from where on it goes backwards, in half a second's mean."""
+_NO_ROBOT_M_S = 6.0
+"""Speed that no skid-steer robot has: a Warthog has 5 m/s."""
 _SCALE_UNKNOWN_M2_PER_M = 0.2
 """Noise of the distance where its scale is known to 10 % alone: 1 m after 10 m is 0.1 x^2 / x."""
 _MAX_SQUARES = 0.25
@@ -107,6 +111,7 @@ def check_units(signals: WheelSignals, robot: Robot) -> UnitReport:
     right = next((what for what, unit in measured.items() if unit is not None and what not in wrong), None)
     for what, unit in wrong.items():
         report = _name_unit(report, signals, what, unit if right is None else _of_messages(signals, what) or unit)
+    report = _name_unsigned(report, signals)
     return _name_range(report, signals)
 
 
@@ -263,11 +268,12 @@ def _names(what: str, radius: float) -> dict[str, float]:
         return {
             "revolutions per minute": math.tau / 60.0,
             "degrees per second": _DEG,
+            "tenths of a degree per second": 0.1 * _DEG,
             "turns per second": math.tau,
             "metres per second": 1.0 / radius,
             "millimetres per second": 1e-3 / radius,
         }
-    return {"degrees": _DEG, "turns": math.tau, "metres": 1.0 / radius, "millimetres": 1e-3 / radius}
+    return {"degrees": _DEG, "tenths of a degree": 0.1 * _DEG, "turns": math.tau, "metres": 1.0 / radius, "millimetres": 1e-3 / radius}
 
 
 def _name_unit(report: UnitReport, signals: WheelSignals, what: str, unit: _Unit) -> UnitReport:
@@ -306,6 +312,41 @@ def _is_plausible(signals: WheelSignals, robot: Robot) -> bool:
     """Whether the velocities can be rad/s by their size."""
     rates = signals.rates[np.isfinite(signals.rates)]
     return not len(rates) or float(np.abs(rates).max()) * robot.geometry.wheel_radius_m <= _FASTEST_M_S
+
+
+def name_speed(report: UnitReport, signals: WheelSignals) -> UnitReport:
+    """``report`` of a whole log with speeds that no robot has, where no turn and no other sensor shows the unit: named, and in the
+    covariance."""
+    if report.ratios:
+        return report
+    robot, rates = report.robot, np.abs(signals.joint_rates)
+    fastest = float(np.nanmax(rates, initial=0.0)) * robot.geometry.wheel_radius_m
+    if fastest <= _NO_ROBOT_M_S:
+        return report
+    text = (
+        f"by rates and radius the wheels reach {fastest:.3g} m/s, which no such robot does: another unit than rad/s and rad, as revolutions"
+        " per minute (9.55 times too large) or degrees (57.3), or another radius. No turn and no other sensor shows which, nothing is"
+        " corrected, and the covariance is wide. Turn in place, or write joints.rate_unit_rad_s and joints.angle_unit_rad."
+    )
+    noise = replace(robot.wheel_noise, longitudinal_m2_per_m=100.0 * _SCALE_UNKNOWN_M2_PER_M)  # of 100 %, not of 10 %
+    return replace(report, robot=replace(robot, wheel_noise=noise), findings=(*report.findings, text))
+
+
+def _name_unsigned(report: UnitReport, signals: WheelSignals) -> UnitReport:
+    """Velocities without a sign, where positions go backwards."""
+    known = np.isfinite(signals.rates) & np.isfinite(signals.angle_rates)
+    rates, of_angles = signals.rates[known], signals.angle_rates[known]
+    fast = float(np.percentile(np.abs(of_angles), 95.0)) if len(of_angles) else 0.0
+    is_backwards = of_angles < -_BACKWARDS * fast
+    if is_backwards.sum() < _MIN_INTERVALS or rates.min() < -1e-3 * np.abs(rates).max() or rates[is_backwards].min() <= 0.0:
+        return report
+    factor = math.sqrt(float(of_angles @ of_angles) / float(rates @ rates))
+    size = "" if 1 / MAX_RATIO <= factor <= MAX_RATIO else f", and are {1.0 / factor:.3g} times those of the positions"
+    text = (
+        f"velocities of the wheels have no sign: they are positive while positions go backwards{size}. Angles are used, rates only where"
+        " an angle is missing: let the driver publish signed rad/s, or no velocities."
+    )
+    return replace(report, findings=(*report.findings, text))
 
 
 def is_in_degrees(ratio: float) -> bool:

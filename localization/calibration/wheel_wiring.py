@@ -36,6 +36,7 @@ from localization.calibration.wheel_units import (
     expected_scaling,
     gyro_in_degrees,
     is_in_degrees,
+    name_speed,
 )
 from localization.events import Scan
 from localization.logs import Log, TopicOverrides, open_log
@@ -77,6 +78,9 @@ _MAX_DEAD = 1e-6
 _MIN_ROLLING = 0.2
 """Spread of the difference of two wheels of a side, of that of all rates, from where on they turn against each other: skid-steer wheels
 have 0.01 to 0.1."""
+_SAME_WHEELS, _UNEQUAL = 0.98, 1.2
+"""Correlation about zero of two wheels of a side from where on one is a multiple of the other, and factor that is named: of wheels with an
+encoder each it is 0.9 to 1.1."""
 _MIN_AGREEMENT = 0.8
 """Share of the mean square of a side's wheels that their mean has."""
 
@@ -165,7 +169,7 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
         signals = read_signals(log) or signals
     if any(key.startswith("clock.") for key in found.keys):
         return _joined(found, check_wiring(log, is_clock_known=True))
-    units = _units_of(log, signals, found.robot)
+    units = name_speed(_units_of(log, signals, found.robot), signals)
     wheels = " and ".join(source.topic for source in log.sources.all_wheels)
     sentences = (*found.findings, *(text if text.startswith("the gyro") else f"{wheels}: {text}" for text in units.findings))
     is_ambiguous = found.is_ambiguous or units.is_ambiguous
@@ -310,8 +314,29 @@ def _wiring_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bo
         signals = with_lidar(log, signals)
     measured = correlations(signals, rates, base)
     if _is_accepted(signals, rates, base):
-        return signals, WiringReport(log.robot, _rollers(signals, rates, base), correlations=measured)
+        texts = _unequal(signals, rates, base) or _rollers(signals, rates, base)
+        return signals, WiringReport(log.robot, texts, correlations=measured)
     return signals, _corrected(log, signals, base, measured)
+
+
+def _unequal(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> tuple[str, ...]:
+    """A sentence where one of the two wheels of a side turns by a factor of the other one."""
+    found = []
+    for side in (side for side in (wiring.left, wiring.right) if len(side) == 2):
+        a, b = rates[np.isfinite(rates).all(axis=1)][:, list(side)].T
+        size = math.sqrt(float(a @ a) * float(b @ b))
+        if len(a) < _MIN_CLOCK_INTERVALS or size == 0.0 or float(a @ b) < _SAME_WHEELS * size:
+            continue
+        factor = math.sqrt(float(b @ b) / float(a @ a))
+        if abs(math.log(factor)) > math.log(_UNEQUAL):
+            first, second = (signals.joints[i] for i in side)
+            found.append(f"{second} turns {factor:.2f} times as fast as {first}")
+    if not found:
+        return ()
+    return (
+        f"{', '.join(found)}, which is on the same side: ticks per turn, gear or unit of one of both is wrong. The mean of both is used,"
+        " and the ways are wrong by half of that. Correct the driver, or leave the wrong wheel out of joints.left and joints.right.",
+    )
 
 
 def _rollers(signals: WheelSignals, rates: FloatArray, wiring: Wiring) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """Clock, scale and axes of a reference, by its speed and turning rate against those of the robot's sensors.
 
 Lengths and turns of chords do not depend on the frame. Both are compared at all offsets of the clocks; where one offset makes them
-alike, the ratio of lengths is the scale, and the sign of the turns shows mirrored axes.
+alike, the ratio of lengths is the scale, the sign of the turns shows mirrored axes, and the direction of chords in the body's frame shows a
+body whose x axis is not the robot's. Clocks of other rates have other offsets in both halves of a drive.
 A reference is contradicted only if no run agrees with it better.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +47,12 @@ _MIN_OFFSET_S = 0.3
 """What is named: GPS receivers and mocap bridges are late by up to 0.2 s [s]."""
 _MAX_SCALE = 1.4
 """Radius of tyres and slip change the way by some 10 %, in bad cases 30 %."""
+_MIN_RATE_OFFSET_S, _MAX_RATE_OFFSET_S, _RATE_MARGIN = 0.25, 5.0, 0.002
+"""Difference of the offsets of both halves of a drive that is named as another rate, the largest that is searched [s], and what 1 less the
+correlation loses beside twice itself: in healthy logs the offsets differ by 0.12 s at most, or neither half prefers its own."""
+_MIN_HEADING_RAD, _MIN_HEADING_LIKENESS = math.radians(15.0), 0.9
+"""Angle between the body axes of reference and robot that is named, and share of the chords that agree on it: mocap bodies are defined by
+hand, to some degrees."""
 _MIN_WAY_M, _MIN_TURN_RAD = 2.0, 0.1
 """Way of the sensors in all, and RMS turn between chords, that are compared."""
 _MIN_SNR = 4.0
@@ -64,6 +71,8 @@ class _Motion:
     """(N,) cross product of a chord and the next one [m^2]: the turn of the path."""
     turns: FloatArray | None
     """(N,) change of the heading over a chord [rad]."""
+    travel: FloatArray | None
+    """(N,) complex, chords in the body's frame at their begin [m]."""
 
 
 def reference_contradictions(trajectories: Sequence[Trajectory], reference: ReferenceTrack) -> tuple[str, ...]:
@@ -85,7 +94,17 @@ def compare_reference(trajectories: Sequence[Trajectory], reference: ReferenceTr
                 best = found
         if best is not None and best.likeness > _ALIKE:
             break
+    if best is not None and best.sigmas < _MIN_SIGMAS and reference.yaws is not None:
+        inverse = (_compare(trajectory, _inverse(reference, reference.yaws), _CHORDS_S[0]) for trajectory in usable)
+        return replace(best, is_inverse=any(found is not None and found.sigmas >= _MIN_SIGMAS for found in inverse))
     return best
+
+
+def _inverse(reference: ReferenceTrack, yaws: FloatArray) -> ReferenceTrack:
+    """``reference`` with each pose inverted."""
+    x, y = reference.positions.T
+    c, s = np.cos(yaws), np.sin(yaws)
+    return replace(reference, positions=np.stack([-c * x - s * y, s * x - c * y], axis=1), yaws=-yaws)
 
 
 @dataclass(frozen=True)
@@ -107,10 +126,20 @@ class ReferenceComparison:
     """Correlation of the turns of the path, -1 to 1; None where it hardly turns."""
     turn: float | None
     """Correlation of the turns of the headings, -1 to 1; None where one of both has none, or hardly turns."""
+    rate: float = 0.0
+    """How much faster its clock runs, as a share; 0 where that is not seen."""
+    heading_rad: float = 0.0
+    """Its headings less those of the sensors, against the directions of motion of both; 0 where these do not agree on one."""
+    is_inverse: bool = False
+    """The inverse of its poses has the sensors' motion, its poses have not."""
 
     def sentences(self, name: str, has_times: bool = True) -> tuple[str, ...]:
         """What contradicts the sensors, of a reference of this ``name``; its clock only where it ``has_times`` of its own."""
         found = []
+        if self.is_inverse:
+            return (
+                f"{name}: the inverse of its poses has the motion of the robot's sensors: it is the world in the body's frame. Invert it.",
+            )
         if self.sigmas < _MIN_SIGMAS:
             path = self.unshifted if self.bend is None else max(self.unshifted, self.bend)
             if self.unshifted >= _SAME_RUN * self.most and (self.bend is None or path >= _SAME_PATH * self.most):
@@ -127,6 +156,11 @@ class ReferenceComparison:
                 f"{name}: its clock is {abs(self.offset_s):.1f} s {way} that of the sensors{leap}. {undo} {abs(self.offset_s):.1f} s"
                 f" {'from' if self.offset_s > 0 else 'to'} its stamps."
             )
+        if has_times and self.rate:
+            found.append(
+                f"{name}: its clock runs {abs(self.rate):.2%} {'faster' if self.rate > 0.0 else 'slower'} than that of the sensors: in both"
+                " halves of the drive it has other offsets. Synchronize the clocks, or scale its stamps."
+            )
         if not 1.0 / _MAX_SCALE < self.scale < _MAX_SCALE:
             found.append(f"{name}: {self._scale_words()}")
         if self.bend is not None and self.bend < _MIRRORED:
@@ -137,6 +171,12 @@ class ReferenceComparison:
             )
         elif self.turn is not None and self.turn < _MIRRORED:
             found.append(f"{name}: its headings turn opposite to the sensors', its path does not: they count clockwise. Invert them.")
+        elif self.heading_rad:
+            found.append(
+                f"{name}: its headings are {abs(math.degrees(self.heading_rad)):.0f} deg {'left' if self.heading_rad > 0.0 else 'right'} of"
+                " those of the sensors, against the direction of motion: its body's x axis does not point ahead. Turn its headings back by"
+                " that."
+            )
         return tuple(found)
 
     def _scale_words(self) -> str:
@@ -150,9 +190,9 @@ class ReferenceComparison:
         )
 
 
-def _is_clear(likeness: float, unshifted: float) -> bool:
+def _is_clear(likeness: float, unshifted: float, margin: float = 0.01) -> bool:
     """Whether motions are clearly more alike at another offset of the clocks, by ``likeness``, than at none."""
-    return 1.0 - unshifted > 2.0 * (1.0 - likeness) + 0.01
+    return 1.0 - unshifted > 2.0 * (1.0 - likeness) + margin
 
 
 def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) -> ReferenceComparison | None:
@@ -176,6 +216,7 @@ def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) 
     if not _is_clear(float(scores[best]), float(scores[n_offset])):  # the second half of a drive may mirror the first
         best = n_offset
     part = _shifted(found, best, len(grid))
+    rate = _rate(sensors, found, best)
     use = np.isfinite(part.lengths) & np.isfinite(sensors.lengths)
     scale = float(np.sqrt(np.mean(part.lengths[use] ** 2) / np.mean(sensors.lengths[use] ** 2)))
     n_independent = float(np.count_nonzero(use)) * _STEP_S / max(chord_s, _INDEPENDENT_S)
@@ -193,7 +234,40 @@ def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) 
         1.0 / math.sqrt(1.0 + 2.0 * (noise / spread) ** 2),
         _correlation(sensors.bends, part.bends) if bends else None,
         _correlation(sensors.turns, part.turns) if turns and part.turns is not None and sensors.turns is not None else None,
+        rate,
+        _heading(sensors, part),
     )
+
+
+def _rate(sensors: _Motion, found: _Motion, offset: int) -> float:
+    """How much faster the clock of ``found`` runs by its offsets in both halves, about ``offset``; 0 where they do not differ clearly."""
+    half, n = len(sensors.lengths) // 2, round(_MAX_RATE_OFFSET_S / _STEP_S)
+    offsets = range(max(offset - n, 0), min(offset + n, len(found.lengths) - 2 * half) + 1)
+    peaks, tables = [], []
+    for begin in (0, half):
+        own = _shifted(sensors, begin, half)
+        scores = np.array([_likeness(own, _shifted(found, begin, len(found.lengths)), k) for k in offsets])
+        if not np.isfinite(scores).any():
+            return 0.0
+        peaks.append(int(scores.argmax()))
+        tables.append(scores)
+    later_s = (peaks[1] + _peak(tables[1], peaks[1]) - peaks[0] - _peak(tables[0], peaks[0])) * _STEP_S
+    both = zip(tables, peaks, peaks[::-1], strict=True)  # each half at its own offset, and at that of the other
+    is_sure = all(_is_clear(float(scores[own]), float(scores[other]), _RATE_MARGIN) for scores, own, other in both)
+    return later_s / (half * _STEP_S) if is_sure and abs(later_s) >= _MIN_RATE_OFFSET_S else 0.0
+
+
+def _heading(sensors: _Motion, part: _Motion) -> float:
+    """Headings of ``part`` less those of the sensors against the directions of their chords [rad]; 0 for a small one, or for none."""
+    if sensors.travel is None or part.travel is None:
+        return 0.0
+    product = part.travel.conj() * sensors.travel
+    product = product[np.isfinite(product)]
+    size = float(np.abs(product).sum())
+    mean = complex(product.sum())
+    if size == 0.0 or abs(mean) < _MIN_HEADING_LIKENESS * size or abs(np.angle(mean)) < _MIN_HEADING_RAD:
+        return 0.0
+    return float(np.angle(mean))
 
 
 def _motion(positions: FloatArray, yaws: FloatArray | None, n: int) -> _Motion:
@@ -202,11 +276,12 @@ def _motion(positions: FloatArray, yaws: FloatArray | None, n: int) -> _Motion:
     bends = np.full(len(positions), np.nan)
     ahead, behind = chords[n:], chords[:-n]
     bends[n:] = behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0]
-    turns = None
+    turns = travel = None
     if yaws is not None:
-        turns = np.full(len(positions), np.nan)
+        turns, travel = np.full(len(positions), np.nan), np.full(len(positions), np.nan, dtype=complex)
         turns[n:] = se2.wrap_angle(yaws[n:] - yaws[:-n])
-    return _Motion(np.hypot(chords[:, 0], chords[:, 1]), bends, turns)
+        travel[n:] = (chords[n:, 0] + 1j * chords[n:, 1]) * np.exp(-1j * yaws[:-n])
+    return _Motion(np.hypot(chords[:, 0], chords[:, 1]), bends, turns, travel)
 
 
 def _interpolated(reference: ReferenceTrack, start_ns: int, grid: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -223,7 +298,8 @@ def _interpolated(reference: ReferenceTrack, start_ns: int, grid: FloatArray) ->
 
 def _shifted(motion: _Motion, offset: int, n: int, stride: int = 1) -> _Motion:
     part = slice(offset, offset + n, stride)
-    return _Motion(motion.lengths[part], motion.bends[part], None if motion.turns is None else motion.turns[part])
+    of_yaws = (None if values is None else values[part] for values in (motion.turns, motion.travel))
+    return _Motion(motion.lengths[part], motion.bends[part], *of_yaws)
 
 
 def _likeness(sensors: _Motion, found: _Motion, offset: int) -> float:

@@ -224,6 +224,11 @@ class TopicClock:
         return drift_of(self._least_latency)
 
     @property
+    def behind_ns(self) -> int:
+        """Time of recording less stamp of the message with the least latency, without the shift of all topics [ns]."""
+        return self._common - self._min_latency_offset_ns
+
+    @property
     def accepted(self) -> int:
         """Plausible messages so far."""
         return self._accepted
@@ -386,6 +391,10 @@ class Merger:
     def shift_ns(self, topic: str) -> int:
         """Shift of the stamps of ``topic``, whose clock was set or is not the common one."""
         return self._clocks[topic].shift_ns if topic in self._clocks else 0
+
+    def behind_s(self, at_least: int) -> dict[str, float]:
+        """`TopicClock.behind_ns` of topics with ``at_least`` so many plausible messages [s]."""
+        return {topic: 1e-9 * clock.behind_ns for topic, clock in self._clocks.items() if clock.accepted >= at_least}
 
     def flush(self) -> Iterator[Any]:
         """Release everything that is held, at the end of the messages."""

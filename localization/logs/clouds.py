@@ -2,11 +2,13 @@
 
 ROS has no convention for these times: drivers publish seconds, milliseconds, microseconds or nanoseconds, or the part of the sweep that has
 passed, since the header's stamp, since 1970, or since the sensor was switched on. Two second sources decide: the header's stamp, which
-absolute times are near in one unit only, and the period of the scans, which a sweep fills and does not exceed.
+absolute times are near in one unit only, and the period of the scans, which a sweep fills and does not exceed. A field that is the azimuth
+of its points in some unit, whatever its name, is the part of a turn.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +27,10 @@ _MAX_POINTS = 10_000_000  # points; LiDARs have up to 300,000 a scan, and this m
 _MAX_START_OFFSET_S = 0.5  # a scan begins at the stamp of its header, or ends there
 _UNITS_NS = (1_000_000_000, 1_000_000, 1_000, 1)
 """A factor of 1000 apart, so that a sweep of a thousandth of its turn on is taken in the right one."""
+_ANGLE_UNITS_RAD = tuple(math.radians(unit) for unit in (0.01, 0.1, 1.0, math.degrees(1.0)))
+_MIN_ANGLE_LIKENESS, _MAX_ONE_SIDE, _COMPARED_POINTS = 0.995, 0.7, 500
+"""Length of the mean of unit vectors at field less azimuth, from where on one is the other: times in microseconds come near at 26 to 29 Hz
+alone. Largest length of the mean of unit vectors at the azimuths, which go round. Points of the first cloud that are compared."""
 _USUAL_PERIOD_S = 0.1  # of LiDARs that turn, for a log with one cloud
 
 
@@ -44,7 +50,7 @@ def cloud_decoder(period_s: float | None) -> Callable[[Any, int], Scan]:
         offsets: FloatArray = np.empty(0)
         time_fields = [name for name in table.dtype.names or () if name not in ("x", "y", "z")]
         if time_fields:
-            times = convert(table[time_fields[0]].ravel(), good, stamp)
+            times = convert(table[time_fields[0]].ravel(), good, stamp, points)
             if np.isfinite(times[good]).any():
                 good &= np.isfinite(times)
                 offsets = times[good]
@@ -96,14 +102,21 @@ class _PointTimes:
         self._period_s = period_s
         self._largest = 0.0
         """Largest of the times so far, in the unit of the field: parts of a sweep never exceed 1."""
+        self._angle_unit_rad: float | None = None
+        """Where the field is an azimuth; 0 where it is none, None before the first cloud."""
 
-    def __call__(self, times: Any, good: Any, stamp: int) -> FloatArray:
-        """Seconds after ``stamp`` [ns] of each of ``times`` (N,), of which ``good`` (N,) belong to points; NaN where it has none."""
+    def __call__(self, times: Any, good: Any, stamp: int, points: FloatArray) -> FloatArray:
+        """Seconds after ``stamp`` [ns] of each of ``times`` (N,), of which ``good`` (N,) belong to ``points`` (N, 3); NaN where it has
+        none."""
         is_whole = np.issubdtype(times.dtype, np.integer)
         values = times.astype(np.int64 if is_whole else float)
         known = values[good] if is_whole else values[good & np.isfinite(values)]
         if len(known) == 0:
             return np.full(len(values), 0.0 if is_whole else np.nan)
+        if self._angle_unit_rad is None:
+            self._angle_unit_rad = _angle_unit(values[good], points[good])
+        if self._angle_unit_rad:
+            return np.asarray(values * (self._angle_unit_rad / math.tau * self._period_s), dtype=float)
         first, spread, longest = known.min(), float(np.ptp(known)), MAX_PERIODS * self._period_s
         start_s = max(_MAX_START_OFFSET_S, longest)
         for unit_ns in _UNITS_NS:
@@ -117,6 +130,19 @@ class _PointTimes:
         if abs(float(first) * unit_ns * 1e-9) <= start_s:
             return _seconds(values, unit_ns, 0)
         return _seconds(values - first, unit_ns, 0)  # an unknown clock: the scan begins at the header's stamp
+
+
+def _angle_unit(values: Any, points: FloatArray) -> float:
+    """Radians for each unit of ``values`` (N,) that are the azimuths of ``points`` (N, 3) up to sign and origin; 0 for others."""
+    chosen = slice(None, None, max(len(values) // _COMPARED_POINTS, 1))
+    azimuth = np.arctan2(points[chosen, 1], points[chosen, 0])
+    if not len(azimuth) or abs(np.exp(1j * azimuth).mean()) > _MAX_ONE_SIDE or not np.isfinite(values[chosen]).all():
+        return 0.0
+    for unit in _ANGLE_UNITS_RAD:
+        for sign in (1.0, -1.0):
+            if abs(np.exp(1j * (unit * values[chosen] - sign * azimuth)).mean()) > _MIN_ANGLE_LIKENESS:
+                return unit
+    return 0.0
 
 
 def _seconds(values: Any, unit_ns: int, origin_ns: int) -> FloatArray:

@@ -369,7 +369,7 @@ def _of_messages(dropped: Sequence[str], silent: Mapping[str, float]) -> Status:
     values |= {f"silent {topic}": f"{seconds:.1f} s" for topic, seconds in silent.items()}
     if silent:
         return Status("messages", ERROR, f"no messages on {', '.join(silent)}: check their drivers and the network", values)
-    return Status("messages", WARN if dropped else OK, "some were corrected or dropped: " + dropped[0] if dropped else "ok", values)
+    return Status("messages", WARN if dropped else OK, "some are late, corrected or dropped: " + dropped[0] if dropped else "ok", values)
 
 
 Run = Callable[[Connection, Request], None]

@@ -15,7 +15,7 @@ from localization.errors import CheckpointError
 from localization.events import CgSample, Event
 from localization.logs.clock_sync import Merger
 from localization.logs.decode import ArmReading, MessageStats, Oddity
-from localization.logs.event_decoder import EventDecoder, JointsToWheels, OdometryToWheels, decode_item
+from localization.logs.event_decoder import CLOCKS, EventDecoder, JointsToWheels, OdometryToWheels, decode_item
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
 from localization.ros.discovery import DiscoveredTopics
@@ -28,6 +28,8 @@ _OLDEST_S, _NEWEST_S = 3600.0, 1.0
 _LATE = "dropped (came after newer ones)"
 _SILENT_S, _PERIODS = 1.0, 5.0
 _NEAR, _PAST, _LONGEST_S = 0.95, 1.1, 0.12
+_MIN_BEHIND_S, _MAX_LATENCY_S, _MIN_MESSAGES = 0.3, 0.1, 50
+"""Time of receiving less stamp [s] of a clock that may be off, and the largest of one that is not; messages before they are compared."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,21 @@ class LiveStream:
         """
         lidar = self.sources.lidar
         return 0.0 if lidar is None else self.topic_rates[lidar.topic].rest(now_ns, (_NEAR, _PAST))
+
+    def behind(self) -> list[str]:
+        """Topics whose stamps are off the times of receiving, while those of the other sensors are not, as sentences."""
+        sensors = {source.topic: CLOCKS[source.kind] for source in self.sources.used() if source.kind in CLOCKS}
+        behind = {topic: late_s for topic, late_s in self._merger.behind_s(_MIN_MESSAGES).items() if topic in sensors}
+        found = []
+        for topic, late_s in behind.items():
+            others = [abs(other) for name, other in behind.items() if sensors[name] != sensors[topic]]
+            if others and abs(late_s) >= _MIN_BEHIND_S and max(others) <= _MAX_LATENCY_S:
+                way, queue = ("behind", ", or it comes late with stamps that are right") if late_s > 0.0 else ("ahead of", "")
+                found.append(
+                    f"{topic}: its stamps are {abs(late_s):.2f} s {way} the times of receiving, those of the other sensors at most"
+                    f" {max(others):.2f} s: its clock is off{queue}. Synchronize the clocks."
+                )
+        return found
 
     def dropped(self) -> list[str]:
         """Messages that were corrected or dropped, as sentences."""

@@ -296,7 +296,8 @@ class Node:
 
     def warnings(self) -> list[str]:
         """Everything that was lost or corrected, as sentences."""
-        return list(dict.fromkeys([*self._checks.notes, *self.inputs.stream.dropped(), *self.session.pipeline.warnings()]))
+        stream = self.inputs.stream
+        return list(dict.fromkeys([*self._checks.notes, *stream.behind(), *stream.dropped(), *self.session.pipeline.warnings()]))
 
     @property
     def seconds(self) -> float:

@@ -37,7 +37,9 @@ class NodeStatus:
         self.report_problems(session)
         inputs = self._inputs
         silent = inputs.stream.silent(now_ns)
-        self.statuses = session.health.statuses(session.pipeline, inputs.stream.dropped(), silent, session.troubles)
+        self.statuses = session.health.statuses(
+            session.pipeline, [*inputs.stream.behind(), *inputs.stream.dropped()], silent, session.troubles
+        )
         problems = [problem for problem in (inputs.conflicts.current(), inputs.transforms.problem) if problem is not None]
         self.statuses.append(Status("transforms", ERROR, " ".join(problems)) if problems else Status("transforms"))
         if inputs.payloads.loads:

@@ -29,8 +29,11 @@ DIFFERENCES: Mapping[Pair, SensorFault] = {
 """What is reported of each pair that differs."""
 PARAMETER_FAR = SensorFault(
     "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or"
-    " load, a wrong scale of the gyro, encoders that lose counts, or a driver's odometry with another track or wheel_separation_multiplier"
-    " than in [driver]. {use} Fit the file with `skidloc calibrate`.",
+    " load, {cause}. {use} Fit the file with `skidloc calibrate`.",
+)
+_TURNING_CAUSE = (
+    "a wrong scale of the gyro, encoders that lose counts, or a driver's odometry with another track or wheel_separation_multiplier than in"
+    " [driver]"
 )
 _NAMED_WITHIN_S = 10.0
 """A named fault is found at most so long after a pair begins to differ."""
@@ -45,6 +48,8 @@ _MIN_TURNING_SIGMAS, _MIN_TURNING_SHARE = 1.4, 0.18
 """Factors on turns stand for the gyro's scale as well, whose prior is far narrower: they count from so many sigmas of the prior
 on, and from this share of the file's value. ACES, fr079, CSAIL and the Husky outdoors have 0.2 sigmas and 3 %, simulated robots 11 %
 (two wheels, and a caster that drags)."""
+_CENTER_X = "x_cr"
+"""Centre of rotation ahead of base_link, which in turns moves a LiDAR to the side as its own place ahead does."""
 _TURNING = ("k_0", "wheel_separation_multiplier", "rotation_scale")
 _MATCHED_S = 2.0
 """Scans that were matched so recently hold the pose, whatever wheels and gyro do [s]."""
@@ -167,7 +172,10 @@ class SensorConsistency:
         bins = next(window.bins for window in self._windows.values() if window.bins)
         episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
         numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
-        self._report(PARAMETER_FAR, episode, abs(off.value - off.file_value) / off.sigma, {**numbers, "file": off.file_value})
+        ahead_m = off.value - off.file_value
+        far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
+        numbers |= {"file": off.file_value, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
+        self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.calibration.wheel_units import check_length_unit, without_outliers
+from localization.calibration.wheel_signals import WheelSignals
+from localization.calibration.wheel_units import check_length_unit, check_units, name_speed, without_outliers
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
 from localization.events import WheelSample
 from localization.logs import open_log
@@ -85,6 +86,23 @@ def test_units_of_positions_that_are_reset_once_are_no_counter(tmp_path: Path) -
         return (position - 30.0 if next(numbers) > 500 else position), velocity
 
     assert report_of(drive(tmp_path / "log.mcap", reset)).findings == ()
+
+
+def test_units_of_velocities_without_a_sign_are_named(tmp_path: Path) -> None:
+    report = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (position, np.abs(velocity))))
+    assert any("velocities of the wheels have no sign" in text for text in report.findings)
+    assert not any("no sign" in text for text in report_of(drive(tmp_path / "healthy.mcap", scaled(1.0, 1.0))).findings)
+
+
+@pytest.mark.parametrize(("unit", "is_named"), [(1.0, False), (math.tau / 60.0, True), (DEG, True)])
+def test_units_of_wheels_that_never_turn_are_named_by_speeds_that_no_robot_has(unit: float, is_named: bool) -> None:
+    """Straight on at 1 m/s: nothing else shows the unit."""
+    n = 60
+    rates = np.outer(np.minimum(np.arange(n) / 10.0, 1.0), np.ones(4)) / RADIUS / unit
+    signals = WheelSignals(tuple("abcd"), 2, rates, np.full((n, 4), np.nan), {"gyro": np.zeros(n)}, {})
+    found = name_speed(check_units(signals, ROBOT), signals)
+    assert bool(found.findings) == is_named
+    assert (found.robot.wheel_noise.longitudinal_m2_per_m > 1.0) == is_named
 
 
 def test_units_of_gyro_in_degrees_are_corrected(tmp_path: Path) -> None:

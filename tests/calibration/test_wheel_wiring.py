@@ -70,6 +70,14 @@ def test_wiring_of_wheels_on_rollers_is_named(tmp_path: Path) -> None:
     assert report.robot == ROBOT
 
 
+def test_wiring_of_wheels_that_count_half_is_named(tmp_path: Path) -> None:
+    """Of both sides, which would be on rollers by the signs alone."""
+    rear = np.array([1.0, 0.5, 1.0, 0.5])
+    (text,) = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (rear * position, rear * velocity))).findings
+    assert text.count("turns 0.50 times as fast as") == 2
+    assert "mecanum" not in text
+
+
 def test_wiring_of_one_side_whose_wheels_differ_is_none_on_rollers(tmp_path: Path) -> None:
     def spinning(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         turned = math.sin(0.2 * float(np.abs(position).sum()))

@@ -104,3 +104,26 @@ def test_reference_check_counts_the_run_that_agrees_best():
 def test_reference_of_hardly_any_motion_is_not_judged():
     still = replace(DRIVE, poses=0.01 * DRIVE.poses)
     assert reference_contradictions([still], _reference()) == ()
+
+
+@pytest.mark.parametrize(("rate", "words"), [(0.01, "faster"), (-0.01, "slower")])
+def test_reference_whose_clock_runs_at_another_rate_is_named(rate, words):
+    reference = _reference()
+    begin = reference.stamps_ns[0]
+    later = begin + np.round((1.0 + rate) * (reference.stamps_ns - begin)).astype(np.int64)
+    found = " ".join(reference_contradictions([DRIVE], replace(reference, stamps_ns=later)))
+    assert f"% {words}" in found
+
+
+@pytest.mark.parametrize("degrees", [90.0, -90.0, 170.0, 30.0])
+def test_reference_whose_body_points_elsewhere_is_named(degrees):
+    reference = _reference()
+    side = "left" if degrees > 0.0 else "right"
+    found = _sentence(replace(reference, yaws=se2.wrap_angle(reference.yaws + np.radians(degrees))))
+    assert f"{abs(degrees):.0f} deg {side}" in found
+
+
+def test_reference_of_inverse_poses_is_named():
+    inverse = se2.inverse(np.column_stack([_reference().positions, _reference().yaws]))
+    found = _sentence(replace(_reference(), positions=inverse[:, :2], yaws=inverse[:, 2]))
+    assert "inverse" in found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,18 @@ def test_cloud_times_of_each_driver_are_seconds_from_the_header(tmp_path: Path, 
     rows = [(*row, value) for row, value in zip(ROWS, values, strict=True)]
     (scan,), _ = scans_of(tmp_path, [bags.cloud(START, table(rows, [(field, kind)]))], "/points")
     np.testing.assert_allclose(scan.offsets, SWEEP, atol=1e-3 if kind == "<u2" else 2e-6)
+
+
+@pytest.mark.parametrize(("kind", "unit_deg"), [("<u2", 0.01), ("<u2", 0.1), ("<f4", 1.0), ("<f8", math.degrees(1.0))])
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_cloud_times_that_are_azimuths_are_parts_of_a_turn(tmp_path: Path, kind: str, unit_deg: float, way: float) -> None:
+    """As drivers that pass on the angle of the encoder, from an origin of their own, of either sense."""
+    part = np.linspace(0.0, 0.99, 100)
+    azimuth = 0.7 + way * math.tau * part
+    rows = [(3.0 * math.cos(a), 3.0 * math.sin(a), 0.1, 360.0 / unit_deg * u) for a, u in zip(azimuth, part, strict=True)]
+    clouds = [bags.cloud(START + i * S // 10, table(rows, [("t", kind)])) for i in range(4)]
+    scans, _ = scans_of(tmp_path, clouds, "/points")
+    np.testing.assert_allclose(scans[0].offsets, 0.1 * part, atol=1e-4)
 
 
 @pytest.mark.parametrize("hz", [4, 10, 20, 100])

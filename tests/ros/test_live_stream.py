@@ -77,6 +77,24 @@ def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
     assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it; synchronize the clocks."]
 
 
+def test_live_node_names_a_topic_whose_stamps_are_off_the_times_of_receiving():
+    """By more than turns are searched for."""
+
+    def shift(messages):
+        found = []
+        for message in messages:
+            data = bytearray(message.data)
+            if message.topic == "/scan":  # seconds of the stamp, behind the encapsulation
+                data[4:8] = (int.from_bytes(data[4:8], "little") + 2).to_bytes(4, "little")
+            found.append(message._replace(data=bytes(data)))
+        return found
+
+    node, _ = run_node(LogTransport(drive_log(scans_hz=6.25), shift))
+    (named,) = (text for text in node.warnings() if "times of receiving" in text)
+    assert named.startswith("/scan: its stamps are 1.9")
+    assert "s ahead of" in named
+
+
 def test_live_node_gives_the_numbers_of_a_replay(calm):
     transport, node, reports = calm
     log = open_log(drive_log(scans_hz=6.25), ROBOT)

@@ -337,7 +337,7 @@ POINTS = (
         "f4",
         lambda u, period, stamp: 40_000.0 + (stamp - START) / S + u * period,
     ),
-    clouded("degrees of the sweep as floats", HOPPER, "time", "f4", lambda u, period, stamp: 360.0 * u, ["times"]),
+    clouded("degrees of the sweep as floats", HOPPER, "time", "f4", lambda u, period, stamp: 360.0 * u),
 )
 
 # descriptions
