@@ -66,18 +66,20 @@ def test_diagnose_rates_that_saturate_are_unexplained(nominal: Drive) -> None:
 
 
 @pytest.mark.slow
-def test_extend_slip_in_left_turns_is_friction_and_a_term(nominal: Drive) -> None:
-    """A part that both sides have is friction, within what robots have, and one that they have with opposite signs a term."""
+def test_extend_slip_in_left_turns_is_said_and_half_of_it_not_written(nominal: Drive) -> None:
+    """-0.15 max(wz, 0) is -0.075 wz, which tolerated friction takes, and -0.075 |wz|, a term. A file with the term alone leaves half of the
+    error in left turns, and makes as much in right ones, which had none: quarters of the drive show 2 and 0 times its size."""
     drive, model = UNKNOWN["slip in left turns only"](nominal), make_model("friction", nominal.robot)
     found = examine(drive, model)
     assert_unexplained(found.diagnosis)
     extended = extend(found, drive, model)
-    assert extended.robot is not None
-    assert [term.name for term in extended.robot.terms["friction"]] == ["wz[abs(wz)]"]
-    assert extended.robot.geometry == nominal.robot.geometry
+    assert extended.robot is None
     assert extended.extension is not None
-    assert extended.extension.check is not None
-    assert extended.extension.check.after["yaw"] < 0.15 * extended.extension.check.before["yaw"]
+    (term,) = extended.extension.terms
+    assert term.term.name == "wz[abs(wz)]"
+    assert term.term.value == pytest.approx(-0.075, abs=3.0 * term.term.sigma)
+    assert "its size differs from part to part of the drive" in extended.extension.refusal
+    assert_unexplained(extended.found.diagnosis)
 
 
 def assert_unexplained(found: Diagnosis) -> None:
