@@ -268,12 +268,11 @@ def _names(what: str, radius: float) -> dict[str, float]:
         return {
             "revolutions per minute": math.tau / 60.0,
             "degrees per second": _DEG,
-            "tenths of a degree per second": 0.1 * _DEG,
             "turns per second": math.tau,
             "metres per second": 1.0 / radius,
             "millimetres per second": 1e-3 / radius,
         }
-    return {"degrees": _DEG, "tenths of a degree": 0.1 * _DEG, "turns": math.tau, "metres": 1.0 / radius, "millimetres": 1e-3 / radius}
+    return {"degrees": _DEG, "turns": math.tau, "metres": 1.0 / radius, "millimetres": 1e-3 / radius}
 
 
 def _name_unit(report: UnitReport, signals: WheelSignals, what: str, unit: _Unit) -> UnitReport:
