@@ -38,9 +38,10 @@ _THINNING = 0.4
 """Edge of the cubes with one point each, in voxels: 3,300 of the 5,200 points of 16 rings on hills."""
 _INLIER_WEIGHT = 0.25
 """Weight by Geman-McClure's loss at `_KERNEL` sigmas, over that at none."""
-_REACH = math.sqrt(0.5)
-"""Distance along a surface from its mean, up to which it holds, in voxels: half the diagonal of a voxel's face. Farther points are beyond
-the end of the map, where a plane misses ground that bends by h = .08 1/m by h d^2 / 2 = 10 mm at d = .5 m."""
+_REACH = 0.5
+"""Distance along a surface from its mean, up to which it holds, in voxels; points of a plane are spread at least as far. Farther ones are
+beyond the end of the map, where a plane misses ground that bends by h = .08 1/m by h d^2 / 2 = 10 mm at d = .5 m, and a ring or two of the
+scanner, drawn from poses that drift, lean in the direction of the drift."""
 _BLOCK = 2
 """Voxels along each side of a block, whose residuals err together."""
 _BLOCKS = 1 << 13
@@ -265,7 +266,8 @@ def _fill_surface(grid: CloudGrid, v: int) -> None:
     low, mid = max(C[least, least], 0.0) + grid.noise, max(C[middle, middle], 0.0) + grid.noise
     for a in range(3):
         out[3 + a], out[6 + a] = V[a, least], V[a, middle]
-    is_plane = mid > _PLANE_RATIO * low
+    is_wide = C[middle, middle] > (_REACH * grid.cell) ** 2 / 3.0  # of points spread evenly over the reach to both sides
+    is_plane = is_wide and mid > _PLANE_RATIO * low
     is_upright = abs(V[2, most]) > _UPRIGHT and C[most, most] > _PLANE_RATIO * mid
     out[9] = low if is_known and (is_plane or is_upright) else math.inf
     out[10] = mid if is_known and is_upright else math.inf

@@ -102,6 +102,23 @@ def test_thin_keeps_one_point_per_cube():
     np.testing.assert_array_equal(thin(points, CELL_M), points[[0, 2, 3]])
 
 
+def test_cloud_match_to_rings_that_drift_says_nothing():
+    """A scanner that drives off draws rings on a wall ahead, each 5 cm higher, from poses that drift by 1 cm. A plane through them leans,
+    and the next ring on it would move the pose by 1 cm more."""
+
+    def ring(k, drift):
+        y = np.random.default_rng(k).uniform(-6.0, 6.0, 400)
+        points = np.column_stack([np.full(400, 20.0 + drift), y, np.full(400, 1.0 + 0.05 * k)])
+        return seen(points, np.eye(4), np.random.default_rng(100 + k))
+
+    made = CloudMap(CELL_M, NOISE_M)
+    for k in range(4):
+        made.insert(np.eye(4), ring(k, 0.01 * k))
+    match = made.match(ring(4, 0.0), np.eye(4), np.diag([0.01**2] * 3 + [0.001**2] * 3))
+    np.testing.assert_allclose(se3.log(match.pose), 0.0, atol=1e-9)
+    assert np.sqrt(match.cov[0, 0]) > 3.0
+
+
 def test_cloud_match_counts_no_point_beyond_the_end_of_a_surface():
     """Where ground bends, the plane at the map's edge does not go on: points that are beyond it by half a voxel and more pull nowhere."""
 
@@ -115,5 +132,5 @@ def test_cloud_match_counts_no_point_beyond_the_end_of_a_surface():
     rng, surfaces = np.random.default_rng(7), mapped(within)
     inside, beyond = seen(within(rng), np.eye(4), rng), seen(valley(rng, 3.4, 3.6, 300), np.eye(4), rng)
     alone, both = (surfaces.match(points, np.eye(4), WIDE) for points in (inside, np.concatenate([inside, beyond])))
-    assert both.mapped > alone.mapped + 250
+    assert both.mapped > alone.mapped + 200  # surfaces narrower than a voxel at the very edge are none
     np.testing.assert_allclose(both.measured, alone.measured, atol=1e-12)
