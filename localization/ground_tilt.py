@@ -44,6 +44,16 @@ class GroundTilt:
         """(2, 2) of the mount's error."""
         return self._cov[:2, :2]
 
+    @property
+    def ground(self) -> FloatArray:
+        """(2,) downhill slope of the ground."""
+        return self._mean[2:]
+
+    @property
+    def ground_cov(self) -> FloatArray:
+        """(2, 2) of the ground's slope."""
+        return self._cov[2:, 2:]
+
     def restart(self) -> None:
         """The ground is another one: nothing is known of its tilt."""
         self._cov[2:] = self._cov[:, 2:] = 0.0
@@ -53,9 +63,8 @@ class GroundTilt:
         """Update by the measured ``downhill`` slope (2,) of mount and ground together and its ``cov`` (2, 2), after ``turn`` [rad] and
         ``way`` [m]."""
         _separate(self._mean, self._cov, downhill, cov, turn, way)
-        ground, cov = self._mean[2:], self._cov[2:, 2:]
-        if not self.is_certain and np.hypot(ground[0], ground[1]) > _LEVEL:
-            self.is_certain = bool(ground @ np.linalg.solve(cov, ground) > _CERTAIN**2)
+        if not self.is_certain and np.hypot(*self.ground) > _LEVEL:
+            self.is_certain = bool(self.ground @ np.linalg.solve(self.ground_cov, self.ground) > _CERTAIN**2)
 
 
 @kernel

@@ -37,6 +37,24 @@ def test_level_ground_under_a_mount_that_is_off_is_never_tilted(degrees):
     assert not any(turn_on_a_plane(degrees, (1.5, 1.5), seed).is_certain for seed in range(20))
 
 
+@pytest.mark.parametrize("degrees", [2.0, 4.0])
+def test_ground_that_is_found_to_tilt_is_within_its_covariance(degrees):
+    """A mount that is off by 2.1 deg, at 1.8 sigma of its prior. On 2 deg of slope half of the drives are found to tilt, by 3.7 deg in the
+    mean: that moment is the one at which the tilt looks largest, and the truth is within 3 sigma (99 % of chi-square) even then."""
+    steep, squares = math.tan(math.radians(degrees)), []
+    for seed in range(60):
+        rng, made = np.random.default_rng(seed), GroundTilt()
+        for k in range(1, 41):
+            ground = steep * np.array([-math.cos(0.5 * k), math.sin(0.5 * k)])
+            made.update(ground + np.radians([1.5, 1.5]) + np.radians(0.5) * rng.normal(size=2), COV, 0.5, 0.3)
+            if made.is_certain:
+                off = made.ground - ground
+                squares.append(off @ np.linalg.solve(made.ground_cov, off))
+                break
+    assert len(squares) > 15
+    assert max(squares) < 9.2
+
+
 def test_restart_forgets_the_ground_and_keeps_the_mount():
     made = turn_on_a_plane(8.0, (2.0, 0.0), noise=False)
     mount, cov = made.mount_error.copy(), made.mount_cov.copy()
