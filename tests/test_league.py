@@ -10,6 +10,7 @@ import pytest
 from motion_models import se2
 from tests.league import page
 from tests.league.__main__ import main
+from tests.league.evalio_pipelines import PIPELINES
 from tests.league.logs import find_logs, peer_arrays
 from tests.league.peers.exchange import Drive, matrix, peak_memory_mb, planar
 from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE
@@ -74,8 +75,8 @@ def test_memory_of_a_process_is_its_own():
 
 
 @pytest.mark.parametrize("system", SYSTEMS_IN_SPACE)
-def test_systems_in_space_are_skidloc_or_front_ends_of_the_study(system):
-    assert system.in_space == "" or system.in_space in FRONT_ENDS
+def test_systems_in_space_are_skidloc_front_ends_of_the_study_or_evalios(system):
+    assert system.in_space == "" or system.in_space in {**FRONT_ENDS, **PIPELINES}
 
 
 def test_unknown_log_ends_with_those_there_are():

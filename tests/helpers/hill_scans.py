@@ -21,8 +21,8 @@ _MAX_RANGE_M = 50.0
 _STEEPEST = 0.45
 """More than the hills' steepest slope: how far a ray may go on per height above ground."""
 _SWEEP_S, SWEEP_NS = 0.1, 100_000_000
-_COLUMNS = 450
-_HALF_FIELD_RAD = math.radians(15.0)
+COLUMNS, RINGS = 450, 16
+HALF_FIELD_RAD = math.radians(15.0)
 _CLEAR_M = 1.2
 """Trees keep this far from where the robot drives."""
 
@@ -54,22 +54,22 @@ def make_scene(drive: HillDrive, seed: int, n_trees: int = 60, n_walls: int = 4,
     return Scene(np.array(trees).reshape(-1, 4), np.array([[*side, 5.0] for side in sides]).reshape(-1, 5), heights)
 
 
-def scans(drive: HillDrive, scene: Scene, rings: int = 16, seed: int = 1, noise_m: float = 0.015) -> Iterator[Scan]:
+def scans(drive: HillDrive, scene: Scene, rings: int = RINGS, seed: int = 1, noise_m: float = 0.015) -> Iterator[Scan]:
     """Sweeps at 10 Hz, stamped at their begin, each column with its own time."""
     rng = np.random.default_rng(seed)
     seconds = (drive.stamps_ns - drive.stamps_ns[0]) * 1e-9
     turn = Slerp(seconds, Rotation.from_matrix(drive.rotations))
-    elevations = np.linspace(-_HALF_FIELD_RAD, _HALF_FIELD_RAD, rings)
-    azimuths = -math.pi + 2.0 * math.pi * np.arange(_COLUMNS) / _COLUMNS
+    elevations = np.linspace(-HALF_FIELD_RAD, HALF_FIELD_RAD, rings)
+    azimuths = -math.pi + 2.0 * math.pi * np.arange(COLUMNS) / COLUMNS
     directions = np.stack(
         [
             np.outer(np.cos(azimuths), np.cos(elevations)),
             np.outer(np.sin(azimuths), np.cos(elevations)),
-            np.broadcast_to(np.sin(elevations), (_COLUMNS, rings)),
+            np.broadcast_to(np.sin(elevations), (COLUMNS, rings)),
         ],
         axis=-1,
     )
-    offsets, place = np.arange(_COLUMNS) * _SWEEP_S / _COLUMNS, np.array([MOUNT.x, MOUNT.y, MOUNT.z])
+    offsets, place = np.arange(COLUMNS) * _SWEEP_S / COLUMNS, np.array([MOUNT.x, MOUNT.y, MOUNT.z])
     for start in np.arange(0.0, seconds[-1] - _SWEEP_S, _SWEEP_S):
         times = start + offsets
         R = turn(times).as_matrix()

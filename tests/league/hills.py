@@ -17,6 +17,7 @@ from motion_models.se2 import FloatArray
 from tests.helpers.hill_scans import make_scene, scans
 from tests.helpers.hills import HillDrive, with_accelerometer_bias
 from tests.helpers.in_space import run_in_space, true_poses
+from tests.league.evalio_pipelines import PIPELINES
 from tests.league.peers.exchange import write
 from tests.studies.hills import FRONT_ENDS, SCENES
 
@@ -39,7 +40,7 @@ def main(log: str, system: str, peers: str, out: str) -> None:
     seed, scene = HILLS[log]
     made = with_accelerometer_bias(drive(Wander(seed), SECONDS, seed=seed), seed)
     clouds = list(scans(made, make_scene(made, seed, *SCENES[scene]), seed=seed))
-    register = FRONT_ENDS[system] if system else _ours
+    register = {**FRONT_ENDS, **PIPELINES}[system] if system else _ours
     register(made, clouds[: round(_WARM_UP_S * 10)])  # compiles
     begin = time.process_time()
     poses, stamps_ns = register(made, clouds)

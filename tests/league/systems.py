@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,16 @@ class System:
     """With a 3D LiDAR on hills: its name in `tests.studies.hills`, empty for skidloc."""
 
 
+EVALIO: Mapping[str, str] = {
+    "CT-ICP (evalio)": "3D LiDAR alone",
+    "MAD-ICP (evalio)": "3D LiDAR alone",
+    "FORM (evalio)": "3D LiDAR alone",
+    "LOAM (evalio)": "3D LiDAR alone",
+    "DLIO (evalio)": "3D LiDAR and IMU",
+    "LIO-SAM (evalio)": "3D LiDAR and IMU",
+}
+"""Sensors of the pipelines that evalio has compiled, by name."""
+
 SYSTEMS: Sequence[System] = (
     System("wheels", "wheel odometry, diff_drive", estimator="odometry"),
     System(
@@ -36,6 +46,7 @@ SYSTEMS: Sequence[System] = (
     System("skidloc graph", "wheels and LiDAR, live and smoothed", estimator="graph"),
     System("skidloc ekf with KISS-ICP", "wheels and LiDAR, live, KISS-ICP as matcher", estimator="ekf", matcher="kiss"),
     System("KISS-ICP", "LiDAR alone; its own defaults, 3D pipeline on planar scans", peer="kiss"),
+    System("KISS-SLAM", "LiDAR alone; its own defaults, final poses", peer="kiss_graph"),
     System("KISS-ICP + wheels", "LiDAR, each registration started from wheel odometry", peer="kiss_wheels"),
     System("GenZ-ICP", "LiDAR alone; its interface takes no initial guess", peer="genz"),
     System("small_gicp + wheels", "LiDAR, scan to model as in its examples, started from wheel odometry", peer="gicp"),
@@ -50,4 +61,5 @@ SYSTEMS_IN_SPACE: Sequence[System] = (
     System("GenZ-ICP in space", "3D LiDAR alone, its defaults", in_space="GenZ-ICP"),
     System("small_gicp + our prediction", "as KISS-ICP + our prediction; scan to model", in_space="small_gicp, our prediction"),
     System("RKO-LIO", "3D LiDAR and IMU, its defaults", in_space="RKO-LIO"),
+    *(System(name, f"{sensors}, evalio's defaults, one thread", in_space=name) for name, sensors in EVALIO.items()),
 )
