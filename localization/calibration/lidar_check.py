@@ -89,7 +89,7 @@ class _Travel:
     odometry: ScanOdometry = field(default_factory=ScanOdometry)
     begin_ns: int = 0
     delta: Pose2 | None = None
-    """(3,) by the scans since ``begin_ns``; None before the first."""
+    """(3,) by the scans since ``begin_ns``, NaN for a way that the scene does not show; None before the first."""
     rows: list[tuple[int, int, Pose2]] = field(default_factory=list)
 
 
@@ -227,7 +227,7 @@ class LidarCheck:
             left, right = (np.diff(np.interp(edges, t, side))[0] for side in ways.T)
             turn, forward = float(delta[2]), 0.5 * (left + right)
             turns.append((right - left, turn))
-            if abs(forward) >= _MIN_WAY_M and abs(turn) <= max_curvature * abs(forward):
+            if abs(forward) >= _MIN_WAY_M and abs(turn) <= max_curvature * abs(forward) and math.isfinite(delta[0]):
                 lever = (np.exp(1j * turn) - 1.0) * complex(mount.x, mount.y)
                 by_wheels.append(forward * np.exp(0.5j * turn) + lever)
                 by_scans.append(complex(delta[0], delta[1]) + lever)
@@ -365,13 +365,15 @@ def _has_moved(first: WheelSample, now: WheelSample) -> bool:
 
 
 def _register(travel: _Travel, scan: Scan, mount: Mount, config: LidarConfig) -> None:
-    """Add the motion since the scan before; an interval ends at the first scan after `_INTERVAL_S`."""
+    """Add the motion since the scan before; an interval ends at the first scan after `_INTERVAL_S`. Where the scene does not show the way,
+    the interval has the turn alone."""
     motion = travel.odometry.register(profile_of(scan, mount, config))
     now = scan.middle_ns
-    if motion is None or not motion.has_translation or travel.delta is None:
+    if motion is None or travel.delta is None:
         travel.begin_ns, travel.delta = now, np.zeros(3)
         return
-    travel.delta = se2.compose(travel.delta, motion.delta)
+    x, y, turn = motion.delta.tolist()
+    travel.delta = se2.compose(travel.delta, np.array([x, y, turn] if motion.has_translation else [math.nan, math.nan, turn]))
     if now - travel.begin_ns >= _INTERVAL_S * 1e9:
         travel.rows.append((travel.begin_ns, now, travel.delta))
         travel.begin_ns, travel.delta = now, np.zeros(3)
