@@ -107,11 +107,12 @@ class PlanarSearch(BackgroundSearch[Place]):
         places: PlaceMap,
         points: Points2,
         near: tuple[Pose2, FloatArray] | None,
+        is_by_fix: bool = False,
         way_m: float = 0.0,
     ) -> None:
         """``points`` (N, 2) of the body frame [m]; ``near``: pose (3,) and half the window (3,) about it; None for the whole map.
-        ``way_m``: way from the first to the last of the scans [m]."""
-        self.n_points, self.way_m, self.is_whole = len(points), way_m, near is None
+        ``is_by_fix``: it is about a measured position. ``way_m``: way from the first to the last of the scans [m]."""
+        self.n_points, self.is_by_fix, self.way_m, self.is_whole = len(points), is_by_fix, way_m, near is None
         self.since = UncertainPose(np.zeros(3), np.zeros((3, 3)))
         """Motion since the scans."""
         super().__init__(places, points, *(near or ()), due_s=places.search_s)

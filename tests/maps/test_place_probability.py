@@ -30,7 +30,7 @@ def test_place_alone_is_weighed_against_what_the_search_left_out() -> None:
 
 def test_wrong_place_by_one_view_of_a_hundred_points_is_not_taken() -> None:
     """In a corridor of ACES, 7 m off, with a margin of 0.36."""
-    assert weigh([place(0.77, 0.01), place(0.39, 0.0, 5.0)], 112)[0].probability < 0.98
+    assert weigh([place(0.77, 0.01), place(0.39, 0.0, 5.0)], 112)[0].probability < LIKELY
 
 
 def test_place_alone_that_fits_well_is_certain() -> None:
@@ -46,7 +46,7 @@ def test_places_that_fit_alike_share_the_probability() -> None:
 
 
 def test_place_of_a_narrowed_search_has_no_rivals_beyond_its_window() -> None:
-    assert weigh([place(0.8, 0.02)], 300, is_narrowed=True)[0].probability > LIKELY
+    assert weigh([place(0.8, 0.02)], 300, is_whole=False)[0].probability > LIKELY
 
 
 def test_left_out_score_is_above_what_any_place_of_a_lower_search_score_has() -> None:
