@@ -23,6 +23,7 @@ from motion_models.robot_file import load_robot
 from tests.helpers.bags import S, write_mcap
 from tests.helpers.entrance_drives import Publishing, Vehicle, drive, records_of, write
 from tests.helpers.extended import cases
+from tests.helpers.hostile_logs import Case, write_case
 from tests.helpers.online import ROBOT, drive_log
 
 CASE = Path(__file__).parents[1] / "data" / "cases" / "H11-lidar-yaw-180"
@@ -94,6 +95,12 @@ def test_lidar_yaw_of_a_few_degrees_is_kept(tmp_path: Path, degrees: float) -> N
     vehicle = Vehicle(scan_hz=10.0, beams=180, seed=10)
     how = Publishing(lidar_yaw=math.radians(degrees))
     assert check_lidar(open_log(write(tmp_path / "log.mcap", vehicle, drive(vehicle), how), vehicle.robot())) is None
+
+
+def test_lidar_with_beams_on_the_robot_keeps_its_yaw(tmp_path: Path) -> None:
+    """They stand still about it, which shortens and turns the way by the scans."""
+    log = write_case(Case(0, "laps", "mcap", "30 % of beams on the robot", ""), tmp_path, 1)
+    assert check_lidar(open_log(log, load_robot("vaultbot"))) is None
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, -10.0])
