@@ -2,7 +2,7 @@
 
 python -m tests.studies.hill_headings
 
-Each robot turns twice by its wheels; the law is told their rates and the true heading. It has the robot file's contacts once, and once
+Each robot turns twice by its wheels; the law is given their rates and the true heading. It has the robot file's contacts once, and once
 those of MuJoCo, whose wheels do not resist rolling and whose friction is full from 3 cm/s of slip on (slip_stiffness 50).
 Needs the extra `mujoco`.
 """
