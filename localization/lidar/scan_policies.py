@@ -7,11 +7,9 @@ import math
 import numpy as np
 
 from localization.events import Scan, Step
+from localization.lidar.scan_matcher import LidarConfig
 from motion_models.se2 import FloatArray
 
-_MAPPED, _UNMAPPED, _MAX_MOTION = 0.8, 0.3, 0.3
-"""The scene changed at once where the mapped share of scans fell from above the first to below the second while the wheels moved by less
-than the third [m, rad]. It falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, and below 0.25 where a robot is carried."""
 MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
 """Covariance of the pose of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2,
 rad^2]."""
@@ -37,9 +35,14 @@ class StaleScans:
 
 
 class MovedRobot:
-    """Recognizes a robot that was moved by other than its wheels: its scans lose the map at once."""
+    """Recognizes a robot that was moved by other than its wheels: its scans lose the map at once.
 
-    def __init__(self) -> None:
+    The mapped share of scans falls from where no search is needed to where a scan is lost, within a way after which no key scan is due. It
+    falls from 0.97 to 0.52 at most on fr079, MIT-CSAIL and ACES, and below 0.25 where a robot is carried.
+    """
+
+    def __init__(self, config: LidarConfig) -> None:
+        self._config = config
         self._mapped_shares: dict[str, float] = {}  # of the last scan in each frame
         self._at_ns: int | None = None
 
@@ -49,12 +52,12 @@ class MovedRobot:
 
     def is_moved(self, step: Step, scan: Scan, mapped_share: float, *, is_matched: bool) -> bool:
         """Whether the robot was moved in ``step``, by the ``mapped_share`` of the points of its ``scan`` now and before."""
-        before = self._mapped_shares.get(scan.frame_id, 0.0)
+        before, c = self._mapped_shares.get(scan.frame_id, 0.0), self._config
         self._mapped_shares[scan.frame_id] = mapped_share
-        if is_matched or step.is_scan_partial or before <= _MAPPED or mapped_share >= _UNMAPPED:
+        if is_matched or step.is_scan_partial or before <= c.search_below or mapped_share >= c.lost_below:
             return False
         x, y, yaw = step.predicted.delta
-        if math.hypot(x, y) >= _MAX_MOTION or abs(yaw) >= _MAX_MOTION:
+        if math.hypot(x, y) >= c.key_distance_m or abs(yaw) >= c.key_angle_rad:
             return False
         self._at_ns = step.end_ns
         return True

@@ -53,7 +53,7 @@ class ScanMatchingSensor:
         self._kiss: KissIcp | None = None
         self._scan: _Scan | None = None
         self._frame = ""  # of the last scan
-        self._stale, self.moved, self.lost = StaleScans(), MovedRobot(), LostScans()
+        self._stale, self.moved, self.lost = StaleScans(), MovedRobot(config), LostScans()
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.

@@ -15,7 +15,7 @@ from localization.core.motion import FilterConfig
 from localization.estimators.estimator import Estimator
 from localization.estimators.fusion import EkfFusion
 from localization.events import Scan, Step, Turn
-from localization.lidar import LostScans, ScanMatch
+from localization.lidar import LidarConfig, LostScans, ScanMatch
 from localization.lidar.scan_policies import MovedRobot
 from motion_models import se2
 from motion_models.motion import Motion
@@ -53,7 +53,7 @@ class PoseSensor:
 
     def __init__(self) -> None:
         self.next: ScanMatch | None = None
-        self.lost, self.moved = LostScans(), MovedRobot()
+        self.lost, self.moved = LostScans(), MovedRobot(LidarConfig())
 
     def measure(self, step, prior, cov, offset):
         return self.next

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from localization.events import Scan, Step
+from localization.lidar import LidarConfig
 from localization.lidar.scan_policies import MOVED_COV, MovedRobot, StaleScans
 from motion_models.motion import Motion
 
@@ -51,7 +52,7 @@ def step(stamp_ns: int, way: float = 0.0) -> Step:
 
 
 def test_is_moved_where_the_map_is_lost_at_once_while_the_wheels_stand() -> None:
-    moved = MovedRobot()
+    moved = MovedRobot(LidarConfig())
     moved.begin(scan(0))
     assert not moved.is_moved(step(1), scan(1), 0.9, is_matched=True)
     assert moved.is_moved(step(2), scan(2), 0.1, is_matched=False)
@@ -62,7 +63,7 @@ def test_is_moved_where_the_map_is_lost_at_once_while_the_wheels_stand() -> None
 
 @pytest.mark.parametrize(("way", "share", "is_matched"), [(0.5, 0.1, False), (0.0, 0.5, False), (0.0, 0.1, True)])
 def test_is_moved_of_a_robot_that_drives_or_keeps_the_map_is_false(way: float, share: float, is_matched: bool) -> None:
-    moved = MovedRobot()
+    moved = MovedRobot(LidarConfig())
     moved.begin(scan(0))
     assert not moved.is_moved(step(1, way), scan(1), share, is_matched=is_matched)
     assert moved.cov(step(1)) is None
@@ -70,7 +71,7 @@ def test_is_moved_of_a_robot_that_drives_or_keeps_the_map_is_false(way: float, s
 
 def test_is_moved_tells_frames_apart() -> None:
     """A second LiDAR sees another part of the map than the first."""
-    moved = MovedRobot()
+    moved = MovedRobot(LidarConfig())
     moved.begin(scan(0))
     other = Scan(0, scan(1).points, frame_id="rear")
     assert not moved.is_moved(step(1), other, 0.1, is_matched=False)
