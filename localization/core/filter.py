@@ -82,6 +82,15 @@ class Innovation:
         return float(self.residual[i]), float(self.S[i, i])
 
 
+def begin(variables: Mapping[str, tuple[Group, FloatArray, FloatArray]]) -> State:
+    """The state of these ``variables``, each a group, a mean and a covariance (k, k), whose errors are independent."""
+    layout = Layout({name: group for name, (group, _, _) in variables.items()})
+    P = np.zeros((sum(group.dim for group in layout.groups.values()),) * 2)
+    for name, (_, _, cov) in variables.items():
+        P[layout.rows[name], layout.rows[name]] = cov
+    return State(layout, {name: mean for name, (_, mean, _) in variables.items()}, P)
+
+
 def propagate(state: State, transition: Transition) -> State:
     """The state after ``transition``: P' = F P F^T + Q. Raises `EstimatorError` for numbers that would spoil the state for good."""
     n, rows = len(state.P), state.layout.rows

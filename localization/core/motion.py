@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.bounded_settings import Settings
-from localization.core.filter import Transition
-from localization.core.state import SE2, Group, Layout, Perturbation, State, Vector
+from localization.core.filter import Transition, begin
+from localization.core.state import SE2, Group, Perturbation, State, Vector
 from localization.events import Step
 from motion_models import se2
 from motion_models.motion import Motion
@@ -53,23 +53,19 @@ def initial_state(noise: NoiseModel, has_lidar: bool = True) -> State:
     Without a LiDAR there is no second clock until the gyro's first reading.
     """
     gyro, corrections, config = noise.gyro, noise.corrections, noise.config
-    one, unknown = Vector(1), np.zeros((1, 1))
+    one, known, unknown = Vector(1), np.zeros((3, 3)), np.ones((1, 1))
     priors: dict[str, tuple[Group, FloatArray]] = {
-        "pose": (SE2, np.zeros((3, 3))),
-        "start": (SE2, np.zeros((3, 3))),
-        "map": (Perturbation(3, "pose"), np.zeros((3, 3))),
-        "key": (SE2, np.zeros((3, 3))),
-        "gyro_bias": (one, unknown + gyro.bias_sigma_rad_per_s**2),
-        "gyro_scale": (one, unknown + gyro.scale_sigma**2),
-        "clock": (one, unknown + has_lidar * config.clock_sigma_s**2),
-        "radius": (one, unknown + config.wheel_radius_sigma**2),
+        "pose": (SE2, known),
+        "start": (SE2, known),
+        "map": (Perturbation(3, "pose"), known),
+        "key": (SE2, known),
+        "gyro_bias": (one, unknown * gyro.bias_sigma_rad_per_s**2),
+        "gyro_scale": (one, unknown * gyro.scale_sigma**2),
+        "clock": (one, unknown * has_lidar * config.clock_sigma_s**2),
+        "radius": (one, unknown * config.wheel_radius_sigma**2),
         "corrections": (Vector(len(corrections.names)), corrections.cov),
     }
-    layout = Layout({name: group for name, (group, _) in priors.items()})
-    P = np.zeros((layout.dim, layout.dim))
-    for name, (_, cov) in priors.items():
-        P[layout.rows[name], layout.rows[name]] = cov
-    return State(layout, {name: np.zeros(group.dim) for name, group in layout.groups.items()}, P)
+    return begin({name: (group, np.zeros(group.dim), cov) for name, (group, cov) in priors.items()})
 
 
 def wheel_transition(state: State, step: Step, motion: Motion, noise: NoiseModel) -> Transition:

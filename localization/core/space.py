@@ -14,8 +14,8 @@ from typing import Annotated
 import numpy as np
 
 from localization.bounded_settings import Settings, at_least
-from localization.core.filter import Measurement, Transition
-from localization.core.state import Group, Layout, Perturbation, State, Vector
+from localization.core.filter import Measurement, Transition, begin, set_marginal
+from localization.core.state import Perturbation, State, Vector
 from localization.events import BodyTurn, Gravity, Step
 from motion_models import se3
 from motion_models.robot import GyroNoise
@@ -60,16 +60,17 @@ class SpaceConfig(Settings):
 
 def initial_space_state(gyro: GyroNoise, bias_sigma: float, config: SpaceConfig) -> State:
     """State at the odometry origin, level within 10 deg (1 sigma); ``bias_sigma``: gyro axes across the vertical [rad/s]."""
-    groups: dict[str, Group] = {"pose": SE3, "start": SE3, "map": Perturbation(6, "pose"), "gyro_bias": Vector(3)}
-    layout = Layout({**groups, "gyro_scale": Vector(1), "accelerometer": Vector(3)})
-    n = sum(group.dim for group in layout.groups.values())
-    P = np.zeros((n, n))
-    P[3, 3] = P[4, 4] = _FIRST_TILT_SIGMA**2
-    P[layout.rows["gyro_bias"], layout.rows["gyro_bias"]] = np.diag([bias_sigma**2, bias_sigma**2, gyro.bias_sigma_rad_per_s**2])
-    P[layout.rows["gyro_scale"], layout.rows["gyro_scale"]] = gyro.scale_sigma**2
-    P[layout.rows["accelerometer"], layout.rows["accelerometer"]] = config.accelerometer_m_s2**2 * np.eye(3)
-    means = {name: np.eye(4) if group is SE3 else np.zeros(group.dim) for name, group in layout.groups.items()}
-    return State(layout, means, P)
+    known, tilt = np.zeros((6, 6)), _FIRST_TILT_SIGMA**2
+    return begin(
+        {
+            "pose": (SE3, np.eye(4), np.diag([0.0, 0.0, 0.0, tilt, tilt, 0.0])),
+            "start": (SE3, np.eye(4), known),
+            "map": (Perturbation(6, "pose"), np.zeros(6), known),
+            "gyro_bias": (Vector(3), np.zeros(3), np.diag([bias_sigma**2, bias_sigma**2, gyro.bias_sigma_rad_per_s**2])),
+            "gyro_scale": (Vector(1), np.zeros(1), np.array([[gyro.scale_sigma**2]])),
+            "accelerometer": (Vector(3), np.zeros(3), config.accelerometer_m_s2**2 * np.eye(3)),
+        }
+    )
 
 
 def start_at(state: State, position: FloatArray, rotation: FloatArray, cov: FloatArray) -> State:
@@ -77,13 +78,12 @@ def start_at(state: State, position: FloatArray, rotation: FloatArray, cov: Floa
 
     Roll and pitch keep their first variance: gravity measures them anew.
     """
-    pose, P, world = np.eye(4), state.P.copy(), np.kron(np.eye(2), rotation)
+    pose, world = np.eye(4), np.kron(np.eye(2), rotation)
     pose[:3, :3], pose[:3, 3] = rotation, position
-    rows, tilt = state.layout.rows["pose"], np.diag(state.cov("pose"))[3:5]
-    P[rows, rows] = world.T @ cov @ world
-    P[rows, rows][3:5], P[rows, rows][:, 3:5] = 0.0, 0.0
-    P[rows, rows][3:5, 3:5] = np.diag(tilt)
-    return State(state.layout, {**state.means, "pose": pose}, P)
+    body, tilt = world.T @ cov @ world, np.diag(state.cov("pose"))[3:5]
+    body[3:5], body[:, 3:5] = 0.0, 0.0
+    body[3:5, 3:5] = np.diag(tilt)
+    return set_marginal(state, "pose", pose, body)
 
 
 def lifted_transition(state: State, step: Step, gyro: GyroNoise, config: SpaceConfig) -> Transition:

@@ -109,11 +109,6 @@ class Layout:
         ends = np.cumsum([group.dim for group in self.groups.values()]).tolist()
         return {name: slice(end - group.dim, end) for (name, group), end in zip(self.groups.items(), ends, strict=True)}
 
-    @property
-    def dim(self) -> int:
-        """Rows in all."""
-        return sum(group.dim for group in self.groups.values())
-
     def indices(self, names: Sequence[str]) -> IntArray:
         """(k,) rows of the variables ``names``, one after another."""
         return np.concatenate([np.arange(self.rows[name].start, self.rows[name].stop) for name in names])
@@ -151,10 +146,6 @@ class State:
             return self.P[rows, rows].copy()
         indices = self.layout.indices(names)
         return self.P[np.ix_(indices, indices)]
-
-    def cross_cov(self, one: str, other: str) -> FloatArray:
-        """Covariance (k, m) of the errors of ``one`` variable with those of the ``other``."""
-        return self.P[self.layout.rows[one], self.layout.rows[other]]
 
     def difference_cov(self, one: str, other: str) -> FloatArray:
         """Covariance (k, k) of e_one - e_other, for errors in one tangent space."""

@@ -105,7 +105,9 @@ class ScanMatcher:
         fits = converges and fit.overlap >= self._config.search_below
         if not (fits and agrees):
             added = prior_outlier_cov(cov) + np.outer(offset, offset)
-            start = fit.pose if fits else self._search(points, prior, cov + added, cov)
+            start: Pose2 | None = fit.pose
+            if not fits:
+                start = find_place(self.submap.image, voxel_means(points, self.submap.cell), prior, cov + added, cov)
             if start is not None and not converges and mahalanobis(prior, start, cov) < 2.0 * OUTLIER_COST:
                 added = np.zeros((3, 3))  # within a prior that is wide itself
             found = None if start is None else align_points(self.submap.grid, points, prior, cov + added, start, self.submap.cell)
@@ -160,10 +162,6 @@ class ScanMatcher:
     def _block_variance(self) -> float:
         """Mean square of the sums of residuals over blocks of neighbouring beams, which contains how these err together (batch means)."""
         return float(self._residuals[1] / self._residuals[2])
-
-    def _search(self, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> Pose2 | None:
-        """The best pose (3,) of ``points`` in the submap, as `find_place` returns it; None where it is ambiguous."""
-        return find_place(self.submap.image, voxel_means(points, self.submap.cell), prior, wide, cov)
 
     def _result(self, fit: Alignment, outlier_cov: Cov3) -> ScanMatch:
         """The match of the scan alone: one more Gauss-Newton step from the minimum, without the prior's pull."""
