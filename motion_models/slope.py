@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,12 +26,6 @@ class Slope:
     def from_up(cls, up: FloatArray, cg_height: float) -> Slope:
         """From the vertical ``up`` (..., 3) in body axes, of any length; its z is positive."""
         return cls(np.asarray(-up[..., :2] / up[..., 2:]), cg_height)
-
-    @classmethod
-    def from_angles(cls, roll: float, pitch: float, cg_height: float) -> Slope:
-        """From roll and pitch [rad], REP-103: a positive pitch points the nose down, a positive roll lifts the left side."""
-        up = np.array([-math.sin(pitch), math.cos(pitch) * math.sin(roll), math.cos(pitch) * math.cos(roll)])
-        return cls.from_up(up, cg_height)
 
     def samples(self, lead: tuple[int, ...]) -> FloatArray:
         """(n, 3) `downhill` and `cg_height` for the n samples of the leading axes ``lead``."""

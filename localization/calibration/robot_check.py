@@ -55,7 +55,6 @@ _MAX_YAW_DEG = 5.0
 """Largest yaw of a LiDAR against the direction of travel [deg]; robots slide by a few degrees."""
 _MAX_TILT_RAD = math.radians(10.0)
 """Largest tilt of gravity against the IMU's mount [rad]: floors and ramps."""
-_MAX_BIAS_RAD_S = 0.02
 _MAX_CLOCK_S, _MAX_CLOCK_SIGMA_S = 0.1, 0.1
 """Offset that is named, and sigma at which none can be seen [s]; drivers and radios have latencies of up to 0.1 s."""
 _SIGMAS = 3.0

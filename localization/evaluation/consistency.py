@@ -1,4 +1,4 @@
-"""Consistency of covariances: NEES and NIS against chi-square bands, and the whiteness of innovations (Bar-Shalom et al. 2001, 5.4).
+"""Consistency of covariances: NEES and NIS against chi-square bands (Bar-Shalom et al. 2001, 5.4).
 
 A consistent estimator's normalised squared errors ``e^T P^-1 e`` follow chi-square with as many degrees of freedom as ``e`` has dimensions
 (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, sec. 5.4). NEES takes errors against the
@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from localization.errors import EvaluationError
 from localization.evaluation.metrics import match
@@ -36,22 +36,6 @@ _MAX_INSTANTS = 120
 """Whose correlations are computed: the mean over a drive does not change with more."""
 _MIN_STEP_M, _MIN_STEP_RAD = 0.01, 0.01
 """Steps from where on a robot has moved: below, its error is the one that it had."""
-
-
-@dataclass(frozen=True)
-class Whiteness:
-    """Correlation of normalised innovations with their successors; beyond the bound the filter's model is wrong."""
-
-    lag1: float
-    """-1 to 1."""
-    bound: float
-    """Absolute correlation that white innovations exceed with probability 1 - ``probability`` only."""
-    probability: float
-
-    @property
-    def is_white(self) -> bool:
-        """Whether the correlation is within the bound."""
-        return abs(self.lag1) <= self.bound
 
 
 @dataclass(frozen=True)
@@ -69,7 +53,6 @@ class Consistency:
     fraction_inside: float
     """Part of the samples below the 95 % quantile of their own chi-square distribution; 0.95 if consistent."""
     probability: float
-    whiteness: Whiteness | None = None
 
     @property
     def p_value(self) -> float:
@@ -118,12 +101,10 @@ def consistency(
     covariances: ArrayLike,
     probability: float = 0.95,
     n_independent: float | None = None,
-    whiteness: bool = False,
 ) -> Consistency:
     """Test errors (N, d), or (R, N, d) of R runs, against their covariances of shape (..., d, d).
 
     ``n_independent``: by default all samples; give the number of runs for errors that are correlated within a run.
-    ``whiteness``: also test that successive samples are uncorrelated, for innovations of one run (N, d) in order of time.
     Raises `EvaluationError` if nothing is left to test.
     """
     e, p = np.asarray(errors, dtype=float), np.asarray(covariances, dtype=float)
@@ -143,7 +124,6 @@ def consistency(
         band=mean_band(independent, mean_dof, probability),
         fraction_inside=float(np.mean(values <= chi2.ppf(0.95, dof))),
         probability=probability,
-        whiteness=lag1_whiteness(e, p, probability) if whiteness else None,
     )
 
 
@@ -186,32 +166,6 @@ def _autocovariance(values: FloatArray) -> FloatArray:
     """(N, d) sums over i of ``values[i] * values[i + k]`` by lag k, of values (N, d)."""
     n = len(values)
     return np.asarray(np.fft.irfft(np.abs(np.fft.rfft(values, 2 * n, axis=0)) ** 2, 2 * n, axis=0)[:n])
-
-
-def mean_over_runs(values: ArrayLike, dof: float, probability: float = 0.95) -> tuple[FloatArray, tuple[float, float]]:
-    """Mean (N,) of NEES or NIS (R, N) over R independent runs at each instant, and the band that each of the N means keeps to."""
-    v = np.asarray(values, dtype=float)
-    if v.ndim != 2 or not v.size:
-        raise EvaluationError(f"values over runs must have shape (R, N), found {v.shape}.")
-    return v.mean(axis=0), mean_band(v.shape[0], dof, probability)
-
-
-def lag1_whiteness(innovations: ArrayLike, covariances: ArrayLike, probability: float = 0.95) -> Whiteness:
-    """Correlation of innovations (N, d) in order of time with their successors, N > 1.
-
-    Each is brought to unit covariance by the symmetric root of its own; the time-average autocorrelation
-    ``sum z_k . z_k+1 / sqrt(sum z_k . z_k  sum z_k+1 . z_k+1)`` of white ones is about normal with variance 1 / (d (N - 1))
-    (Bar-Shalom et al. 2001, sec. 5.4.2). Scaling all covariances alike does not change it: it
-    tests the model, not the size of the noise.
-    """
-    _, dof, z = normalize(innovations, covariances)
-    if len(z) < 2 or not np.any(z):
-        raise EvaluationError(f"whiteness needs at least two innovations that are not all zero, found {len(z)}.")
-    now, then = z[:-1], z[1:]
-    scale = math.sqrt(float(np.sum(now * now)) * float(np.sum(then * then)))
-    terms = float(np.minimum(dof[:-1], dof[1:]).sum())
-    bound = float(norm.ppf(0.5 * (1.0 + probability))) / math.sqrt(max(terms, 1.0))
-    return Whiteness(float(np.sum(now * then)) / scale if scale > 0.0 else 0.0, bound, probability)
 
 
 @dataclass(frozen=True, eq=False)

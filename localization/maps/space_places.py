@@ -11,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from localization.errors import MapError
-from localization.lidar.cloud_loops import compare_columns
 from localization.lidar.cloud_map import SYSTEMATIC_COV, CloudMap, CloudMatch, thin
 from localization.lidar.kiss_icp import choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
@@ -142,10 +141,6 @@ class SpacePlaces:
         apart = _distinct(coarse)
         likely = [place for place in apart[:_REFINED] if place.on_surfaces >= _SHARE_OF_BEST * apart[0].on_surfaces]
         return _distinct([self.align(cloud, place.pose, np.diag(_FINE_SIGMAS**2)) for place in likely])
-
-    def upright_columns(self, cloud: FloatArray, pose: Transform3) -> tuple[int, int]:
-        """Columns in which something stands upright both in the map and in ``cloud`` (N, 3) at ``pose`` (4, 4), and in one alone."""
-        return compare_columns(self.points, se3.transform(pose, cloud), 2.0 * self.cell)
 
 
 Places = PlaceMap | SpacePlaces

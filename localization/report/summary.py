@@ -390,7 +390,3 @@ def _separation(a: PlottedRun, b: PlottedRun) -> float | None:
 def _error(line: PlottedRun) -> float:
     assert line.error is not None
     return line.error
-
-
-def _lower(text: str) -> str:
-    return text[0].lower() + text[1:]

@@ -16,9 +16,7 @@ from localization.evaluation.consistency import (
     consistency,
     degrees_of_freedom,
     independent_samples,
-    lag1_whiteness,
     mean_band,
-    mean_over_runs,
     nees,
     nis,
     pose_consistency,
@@ -112,16 +110,6 @@ def test_band_is_that_of_the_mean():
     assert np.round(mean_band(50, 2), 1).tolist() == [1.5, 2.6]
 
 
-def test_mean_nees_over_runs_is_in_its_band_at_each_instant():
-    rng = np.random.default_rng(4)
-    p = np.broadcast_to(np.diag([0.1, 0.2, 0.3]), (25, 2_000, 3, 3)).reshape(-1, 3, 3)
-    values = nees(draw(rng, p), p).reshape(25, 2_000)
-    means, (low, high) = mean_over_runs(values, 3)
-    assert means.shape == (2_000,)
-    assert as_often_as(np.count_nonzero((means > low) & (means < high)), 2_000, 0.95)
-    assert mean_band(25, 3) == (low, high)
-
-
 def test_nees_accepts_stacked_runs():
     rng = np.random.default_rng(5)
     p = random_covariances(rng, 60)
@@ -190,34 +178,6 @@ def test_band_of_no_samples_is_refused(n, dof, probability):
         mean_band(n, dof, probability)
 
 
-# --- whiteness
-
-
-def test_whiteness_of_white_innovations_passes_at_the_stated_rate():
-    white = 0
-    for seed in range(400):
-        rng = np.random.default_rng(1000 + seed)
-        p = random_covariances(rng, 200)
-        white += lag1_whiteness(draw(rng, p), p).is_white
-    assert as_often_as(white, 400, 0.95)
-
-
-def test_whiteness_of_correlated_innovations_fails_with_its_measure():
-    rng = np.random.default_rng(8)
-    z = np.zeros((5_000, 3))
-    for k in range(1, 5_000):
-        z[k] = 0.3 * z[k - 1] + math.sqrt(1 - 0.09) * rng.normal(size=3)
-    p = random_covariances(rng, 1).repeat(5_000, axis=0)
-    e = z @ np.linalg.cholesky(p[0]).T
-    found = consistency(e, p, whiteness=True)
-    assert found.whiteness.lag1 == pytest.approx(0.3, abs=4 / math.sqrt(15_000))
-    assert not found.whiteness.is_white
-    assert found.verdict == "consistent"  # of the right size all the same: whiteness is another question
-    assert lag1_whiteness(e, 9.0 * p).lag1 == pytest.approx(found.whiteness.lag1)  # nor does it ask for the size
-    with pytest.raises(EvaluationError, match="at least two"):
-        lag1_whiteness(e[:1], p[:1])
-
-
 # --- pose errors
 
 STEP_COVARIANCE = np.array([[4e-4, 1e-5, 0.0], [1e-5, 1e-4, 2e-5], [0.0, 2e-5, 4e-5]])
@@ -268,16 +228,15 @@ def test_pose_nees_of_right_odometry_passes_whatever_its_first_sigma(first):
     found = [pose_errors(as_trajectory(estimate, p), as_track(truth)) for truth in truths]
     values = np.array([nees(f.errors, f.covariances) for f in found])
     # at each of the instants the mean of 200 independent runs; instants are correlated, hence three of them only, at 99.9 %
-    means, (low, high) = mean_over_runs(values, 3, probability=0.999)
+    means, (low, high) = values.mean(axis=0), mean_band(200, 3, probability=0.999)
     assert np.all((means[[0, 30, 59]] > low) & (means[[0, 30, 59]] < high))
 
 
 def test_pose_nees_of_half_the_variance_fails_over_runs():
     truths, estimate, p = odometry_runs(15, runs=100)
     found = [pose_errors(as_trajectory(estimate, 0.5 * p), as_track(truth)) for truth in truths]
-    values = [nees(f.errors, f.covariances) for f in found]
-    means, (_, high) = mean_over_runs(values, 3)
-    assert np.all(means > high)
+    means = np.mean([nees(f.errors, f.covariances) for f in found], axis=0)
+    assert np.all(means > mean_band(100, 3)[1])
 
 
 def test_nees_of_one_dead_reckoning_counts_as_two_samples_and_by_stretches():

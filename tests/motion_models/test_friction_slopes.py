@@ -142,10 +142,11 @@ def test_slope_that_is_not_finite_is_refused():
         MODEL.twist_on_slope(np.ones(2), np.zeros(2), with_params(), Slope(np.array([math.nan, 0.0]), HEIGHT))
 
 
-def test_slope_from_angles_follows_the_ros_signs():
+def test_slope_follows_the_ros_signs():
     """Nose down (pitch > 0) is downhill ahead; left side up (roll > 0) is downhill to the right."""
-    np.testing.assert_allclose(Slope.from_angles(0.0, math.radians(5), 0.4).downhill, [tangent(5), 0.0], atol=1e-12)
-    np.testing.assert_allclose(Slope.from_angles(math.radians(5), 0.0, 0.4).downhill, [0.0, -tangent(5)], atol=1e-12)
+    s, c = math.sin(math.radians(5)), math.cos(math.radians(5))
+    np.testing.assert_allclose(Slope.from_up(np.array([-s, 0.0, c]), 0.4).downhill, [tangent(5), 0.0], atol=1e-12)
+    np.testing.assert_allclose(Slope.from_up(np.array([0.0, s, c]), 0.4).downhill, [0.0, -tangent(5)], atol=1e-12)
 
 
 def test_slope_twist_takes_microseconds():
