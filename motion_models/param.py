@@ -8,8 +8,10 @@ from dataclasses import dataclass
 TURNING_SIGMA = 0.15
 """Prior sigma of the rotation scaling, relative, for robots of one type on different floors and with other loads: Clearpath's own
 multipliers for one Husky range from 1.5 to 1.9; terrains differ by a quarter."""
-CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M = 0.05, 0.03
-"""Prior sigmas of the centre of rotation [m], for the same robots."""
+CENTRE_X_SIGMA_M = 0.05
+"""Prior sigma of the centre of rotation along the robot [m], for the same robots."""
+CENTRE_Y_SIGMA_M = 0.03
+"""Prior sigma of the centre of rotation across the robot [m], for the same robots."""
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ class Joints:
     """Range after which the positions wrap, in their own unit: 65536 for counters of 16 bits. 0: a full turn of the wheel."""
 
     def renamed(self, names: Mapping[str, str]) -> Joints:
-        """The same wheels by other ``names``, each by the present one."""
+        """Rename the wheels: ``names`` has the new name of each by the present one."""
         left, right, backwards = (tuple(names[joint] for joint in side) for side in (self.left, self.right, self.reversed))
         return replace(self, left=left, right=right, reversed=backwards)
 

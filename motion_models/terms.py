@@ -111,7 +111,7 @@ class Expression:
     factors: tuple[Factor, ...]
 
     def __str__(self) -> str:
-        """As in robot files."""
+        """The product as robot files have it: ``wz*abs(vx)``."""
         return "*".join(str(f) for f in self.factors)
 
     @property

@@ -24,8 +24,10 @@ from motion_models.robot import GyroNoise, Mount, WheelNoise
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
-_MAX_SCAN_GAP_S, MAX_REFERENCE_GAP_S = 1.0, 0.5
-"""Gaps in scans and references beyond which a window is not measured [s]."""
+_MAX_SCAN_GAP_S = 1.0
+"""Gap in the scans beyond which a window is not measured [s]."""
+MAX_REFERENCE_GAP_S = 0.5
+"""Gap in a reference beyond which a window is not measured [s]."""
 MAX_GAP_OVER_PERIOD = 2.5  # for references that are sparser than that: one missing measurement does not end a window
 _MAX_GYRO_BIAS = 0.05  # rad/s; a robot that turns faster by the gyro than any bias does not stand, whatever its wheels report
 HOLD_S = 0.5
@@ -45,9 +47,10 @@ _MAX_UNMATCHED_S, _MAX_UNMATCHED_M, _MAX_UNMATCHED_RAD = 0.3, 0.15, 0.15
 _RANGE_STEP_M = 0.2
 """Added to all ranges, and taken off, for the scene's derivative [m]. In a hall the derivative is 2 to 4 mm per metre, and its own noise
 3 mm at 0.05 m, 0.7 mm at 0.2 m and 0.6 mm at 0.4 m."""
-REFERENCE_SIGMA_M, _REFERENCE_SIGMA_RAD = 0.02, 0.01
-"""Sigma of position and heading of a reference without covariances [m, rad]: about those of RTK-GPS with two antennas; motion capture is
-better."""
+REFERENCE_SIGMA_M = 0.02
+"""Sigma of the position of a reference without covariances [m]: about that of RTK-GPS; motion capture is better."""
+_REFERENCE_SIGMA_RAD = 0.01
+"""Sigma of its heading [rad]: about that of RTK-GPS with two antennas."""
 _FINEST_SIGMA = 1e-4
 """Smallest sigma of a position [m] or heading [rad]: what the best references resolve, whatever their covariance."""
 _STANDSTILL_COV = np.diag([1e-12, 1e-12, 1e-12])

@@ -42,7 +42,7 @@ class Suspect:
     """A clock that may be the one that is off."""
 
     sensor: str
-    """As the entries of `Clock` have it."""
+    """Its name, as it begins the entries of `Clock`: wheel, lidar or gyro."""
     topic: str
     key: str
     value: float

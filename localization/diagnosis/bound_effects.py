@@ -46,7 +46,7 @@ class BoundShape(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As in tables."""
+        """Component and what it follows, for tables: ``yaw[time]``."""
         return f"{self.component}[{self.along}]"
 
 

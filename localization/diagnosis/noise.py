@@ -230,7 +230,7 @@ def _correlation(z: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
 
 
 def reference_noise(predictor: DrivePredictor, linear: FloatArray, causes: tuple[Cause, ...]) -> Noise:
-    """As the motion reference states it, and with errors of the model; of discrepancies ``linear`` (M, 6)."""
+    """Noise of the discrepancies ``linear`` (M, 6) as the motion reference states it, with errors of the model."""
     return given_noise(linear, np.hypot(*_claimed_sigmas(predictor, causes)), _follows(predictor))
 
 

@@ -40,7 +40,7 @@ class LocalizationTimes:
         return sum(self._seconds.values())
 
     def as_json(self) -> Mapping[str, float | int | None]:
-        """As JSON holds it."""
+        """Times and counts by their names in JSON."""
         return {
             **{f"{state}_s": seconds for state, seconds in self._seconds.items()},
             "outside_s": self._outside_s,

@@ -29,8 +29,10 @@ m^2, rad^2]."""
 MAX_OFF_M = 0.3
 """Distance of an aligned scan from where the localizer has it, up to which it ties [m]: from there on 14 to 31 % of alignments end
 elsewhere (`localization.lidar.registration`)."""
-_LEAST_SCORE, LEAST_CLOSURES = 0.5, 3
-"""Score of a scan in the other map, from which on it ties its keyframe to that; and how many such keyframes a merge takes."""
+_LEAST_SCORE = 0.5
+"""Score of a scan in the other map, from which on it ties its keyframe to that."""
+LEAST_CLOSURES = 3
+"""Tied keyframes that a merge takes, at least."""
 
 
 Map = TypeVar("Map", KeyframeMap, SpaceMap)

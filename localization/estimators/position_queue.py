@@ -11,8 +11,10 @@ from localization.events import PositionSample, Step
 from motion_models import se2
 from motion_models.se2 import FloatArray, Points2, Pose2
 
-MIN_POSITIONS, MIN_BASELINE_M = 3, 5.0
-"""Positions, and the distance between them [m], from which they give the heading of the map."""
+MIN_POSITIONS = 3
+"""Positions that give the heading of the map, at least."""
+MIN_BASELINE_M = 5.0
+"""Distance between positions from which on they give the heading of the map [m]."""
 _ALIGNMENT_ITERATIONS = 30
 
 

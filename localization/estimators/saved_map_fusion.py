@@ -16,8 +16,10 @@ from localization.maps.space_localizer import SpaceLocalizer
 from localization.maps.space_places import Places, SpacePlaces
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
-KEYFRAME_DISTANCE_M, KEYFRAME_ANGLE_RAD = 0.5, 0.3
-"""A keyframe follows when the robot has moved this far: scans of less are nearly the same evidence."""
+KEYFRAME_DISTANCE_M = 0.5
+"""Way after which the next keyframe follows [m]: scans of less are nearly the same evidence."""
+KEYFRAME_ANGLE_RAD = 0.3
+"""Turn after which the next keyframe follows [rad], for the same reason."""
 _LISTED_PLACES = 5
 
 

@@ -172,7 +172,7 @@ class SqliteFile:
 
 
 class RecoveredSqlite:
-    """As many rows of a .db3 file as can be read, in the order in which they were recorded. Raises `LogError` if there are none.
+    """Rows of a damaged .db3 file, as many as can be read, in the order in which they were recorded. Raises `LogError` if there are none.
 
     ``reason`` is why SQLite cannot read the file: it is part of the warning or the error. ``set_backs``: of the recorder's clock, by
     which later rows are moved.

@@ -12,8 +12,10 @@ from localization.maps.grid import Grid
 from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.space_map import SpaceMap
 
-_OCCUPIED, _FREE, UNKNOWN = 0, 254, 205
+_OCCUPIED, _FREE = 0, 254
 """Grey values of map_server and nav2."""
+UNKNOWN = 205
+"""Grey value of unknown space by map_server and nav2."""
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of (255 - grey) / 255, for readers of the image. map_server's 0.196, and not nav2's 0.25: by that, 205 (0.1961) would be read
 as free."""

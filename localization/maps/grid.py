@@ -20,8 +20,10 @@ _HIT, _PASS = math.log(0.7 / 0.3), math.log(0.35 / 0.65)
 """Log-odds of a scan that hits a cell (0.7: OctoMap, Hornung 2013), and of one that passes. Two passes make a cell free by nav2's 0.25."""
 _LOW, _HIGH = -2.0, 3.5
 """Limits of the log-odds (Hornung 2013): what changes is unlearned after a few scans."""
-OCCUPIED, FREE = 0.65, 0.25
-"""Probabilities above which a cell is occupied, and below which it is free: the defaults of nav2's map saver."""
+OCCUPIED = 0.65
+"""Probability above which a cell is occupied: the default of nav2's map saver."""
+FREE = 0.25
+"""Probability below which a cell is free: the default of nav2's map saver."""
 _BESIDE = (1, 2)
 """Beams to each side whose ends show the direction of a surface: with one alone, 0.02 m of noise turn that of a near wall."""
 _MARGIN_CELLS = 4

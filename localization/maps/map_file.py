@@ -24,8 +24,10 @@ from localization.maps.space_map import SpaceMap
 from localization.output import whole_file
 from motion_models.se2 import FloatArray
 
-PLANAR, SPACE = 1, 2
-"""Versions of the format: planar scans, and clouds in space. A planar map is written as before there were maps in space."""
+PLANAR = 1
+"""Version of the format for planar scans: as before there were maps in space."""
+SPACE = 2
+"""Version of the format for clouds in space."""
 _FORMAT, _HEADER = "skidmap", "skidmap.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of all members: the earliest that a zip can hold."""

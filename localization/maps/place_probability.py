@@ -15,8 +15,10 @@ from motion_models.se2 import Cov3, FloatArray, Pose2
 
 LIKELY = 0.9
 """Probability from which on the robot is localized."""
-RIGHT_M, RIGHT_RAD = 0.5, 0.2
-"""How near a pose is the right place [m, rad]: half a door, and a scan that still overlaps."""
+RIGHT_M = 0.5
+"""Distance up to which a pose is the right place [m]: half a door."""
+RIGHT_RAD = 0.2
+"""Angle up to which a pose is the right place [rad]: the scan still overlaps."""
 MAX_SEARCH_ODDS = 5.0
 """Log-odds of a search, at most."""
 _RIVALRY = 20.0

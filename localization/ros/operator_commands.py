@@ -30,8 +30,10 @@ from localization.ros.transports.transport import Received, ServiceReply, Transp
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
 
-SET_POSE, INITIAL_POSE = "set_pose", "initialpose"
-"""Topics of a given pose: that of robot_localization, and that of RViz and nav2."""
+SET_POSE = "set_pose"
+"""Topic of a given pose, as robot_localization has it."""
+INITIAL_POSE = "initialpose"
+"""Topic of a given pose, as RViz and nav2 have it."""
 POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 RESET, PAUSE, TARE_PAYLOAD, PAYLOAD = "~/reset", "~/pause", "~/tare_payload", "~/payload"
 RELOCALIZE, SAVE_MAP, LOAD_MAP = "~/relocalize", "~/save_map", "~/load_map"

@@ -72,7 +72,7 @@ class FaultLog:
         """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
         if fault in self.declared or any(other.explains == fault for other in self.declared):
             return
-        self.declared[fault] = DetectedFault(fault, max(at_s, 0.0), fault.message.format(**numbers))
+        self.declared[fault] = DetectedFault(fault, max(0.0, at_s), fault.message.format(**numbers))
         if fault.explains is not None:
             self.declared.pop(fault.explains, None)
         self.have_scans_led_away |= fault.is_of_scans

@@ -28,9 +28,11 @@ _MIN_MOVED_WITHOUT_GYRO = 0.2
 """`_MIN_MOVED` for robots without a gyro."""
 _MIN_UNSURE = 0.06
 """Share of a scan on objects that move, from where on it is not sure that the scene is still."""
-MIN_OFF_M, _MAX_OFF_M = 0.06, 0.25
-"""Distance of the estimate from the motion by the wheels since the view that is compared, which is more than wheels slip as a rule, and
-more than labels can show that they do [m]: of points that move along, wheels explain as few as they do by chance in a still scene."""
+MIN_OFF_M = 0.06
+"""Distance of the estimate from the motion by the wheels, since the view that is compared, that is more than wheels slip as a rule [m]."""
+_MAX_OFF_M = 0.25
+"""Such a distance that is more than labels can show that wheels slip [m]: of points that move along, wheels explain as few as they do by
+chance in a still scene."""
 MAX_NIS = 16.3
 """NIS of a matched scan that contradicts the wheels: one of 1,000 by chance (chi^2 of 3 degrees of freedom)."""
 _MIN_UNIQUE, _MIN_UNIQUE_WITHOUT_GYRO, _KEPT_UNIQUE = 0.25, 0.35, 0.2

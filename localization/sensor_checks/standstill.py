@@ -50,7 +50,7 @@ class _Stop:
     rested_s: float = 0.0
     """Its end, while gyro and IMU are at rest too."""
     trusted_s: float = 0.0
-    """As far as it counted as standing and no scan has measured the pose since."""
+    """Part of it that counted as standing while no scan has measured the pose since."""
     is_confirmed: bool = False
     """Gyro or IMU have shown that the robot moved meanwhile."""
 

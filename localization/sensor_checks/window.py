@@ -17,8 +17,10 @@ from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
 BIN_S = 0.25
-WINDOW_BINS, MIN_BINS = 24, 10
-"""Bins that are compared (6 s), and the fewest (2.5 s)."""
+WINDOW_BINS = 24
+"""Bins that are compared: 6 s."""
+MIN_BINS = 10
+"""Fewest bins that are compared: 2.5 s."""
 _MAX_BIN_S = 1.0
 """How long a bin waits for a scan: LiDARs give 2 to 40 scans a second."""
 _COLUMNS = 12

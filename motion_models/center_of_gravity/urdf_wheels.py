@@ -115,7 +115,7 @@ class WheelGeometry:
     """Whether the wheels are called so; else they were found by their controller or their axes."""
 
     def renamed(self, names: Mapping[str, str]) -> WheelGeometry:
-        """The same wheels by other ``names``, each by the present one."""
+        """Rename the wheels: ``names`` has the new name of each by the present one."""
         return dataclasses.replace(
             self,
             left=tuple(names[joint] for joint in self.left),
