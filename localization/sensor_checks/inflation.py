@@ -84,9 +84,12 @@ class CovarianceInflation:
 
     def add_distance_from(self, reference: DeadReckoning) -> None:
         """Inflate by how far the estimate is from ``reference``."""
-        if self.are_wheels_outvoted:
-            return
-        self.add(self.reckoning.distance(self._agreed, WHEELS if reference == "wheels" else GYRO))
+        if not self.are_wheels_outvoted:
+            self.add(self.distance_from(reference))
+
+    def distance_from(self, reference: DeadReckoning) -> FloatArray:
+        """(3,) of ``reference`` from the estimate, since the sensors last agreed."""
+        return self.reckoning.distance(self._agreed, WHEELS if reference == "wheels" else GYRO)
 
     def add(self, difference: FloatArray) -> None:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""

@@ -6,7 +6,7 @@ import math
 
 from localization.sensor_checks.contradictions import LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.own_body import LIDAR_OWN_BODY
+from localization.sensor_checks.own_body import LIDAR_OWN_BODY, LIDAR_OWN_PARTS
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.window import BIN_S
 
@@ -14,7 +14,7 @@ MOVING_OBJECTS = SensorFault(
     "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
     " the wheels are matched meanwhile. Without people and vehicles about the robot, check the wheels' radius and what covers the LiDAR."
 )
-_EXPLAINING = (LIDAR_OWN_BODY, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_STANDING)
+_EXPLAINING = (LIDAR_OWN_BODY, LIDAR_OWN_PARTS, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_STANDING)
 """Named faults of which parts of a scan, or the wheels, move otherwise."""
 
 

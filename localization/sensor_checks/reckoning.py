@@ -6,7 +6,7 @@ import numpy as np
 
 from localization.events import Step
 from motion_models import se2
-from motion_models.se2 import FloatArray, Pose2
+from motion_models.se2 import FloatArray, Pose2, Tangent2
 
 WHEELS, GYRO, ESTIMATE, FILE, FILE_GYRO = range(5)
 """Rows of `Reckoning.poses`: by the wheels; by these with the gyro's turns, of a robot at rest without them; by the estimate; by the wheels
@@ -37,6 +37,11 @@ class Reckoning:
         if file_delta is not None:
             by_gyro = file_delta if step.turn is None else np.array([file_delta[0], file_delta[1], step.turn.angle])
             poses[FILE:] = se2.compose(poses[FILE:], np.array([file_delta, by_gyro]))
+
+    def correct_dead_reckoning(self, off: Tangent2) -> None:
+        """Wheels and gyro lead to another place by ``off`` (3,): sensors without a fault have shown it."""
+        self.poses = poses = self.poses.copy()
+        poses[GYRO] = se2.retract(poses[GYRO], off)
 
     def distance(self, since: FloatArray, row: int) -> FloatArray:
         """(3,) of the ``row`` from the estimate, for their motions since the moment of the poses ``since`` (5, 3)."""

@@ -27,7 +27,7 @@ class StepChecks:
         self._faults, self._inflation = faults, faults.inflation
         self.window = window = Window(mounts, config)
         """Motions of the last seconds."""
-        self.own_body, self.tilt, self.sweep_times = OwnBody(faults), LidarTilt(mounts), SweepTimes(faults)
+        self.own_body, self.tilt, self.sweep_times = OwnBody(faults, mounts), LidarTilt(mounts), SweepTimes(faults)
         self._contradictions, self._gyro_rate = Contradictions(faults), GyroRate(faults)
         self.standstill, self.moving = Standstill(faults, window, step_config), MovingObjects(faults, window)
 

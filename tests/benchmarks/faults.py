@@ -30,7 +30,7 @@ from unittest import mock
 
 from localization.estimators.fusion import EkfFusion
 from localization.events import ImuSample, Step
-from localization.sensor_checks import checks, contradictions
+from localization.sensor_checks import contradictions, step_checks
 from localization.sensor_checks.faults import SensorFault
 from tests.helpers import fault_drives, moving_scenes
 from tests.helpers.event_faults import EventFault, faults_of_stamps, faults_of_turns, faults_on_the_way, named_faults, without_gyro
@@ -142,7 +142,7 @@ class _NoCheck:
 
 
 def _no_check(name: str) -> Any:
-    return lambda: mock.patch.object(checks, name, return_value=_NoCheck())
+    return lambda: mock.patch.object(step_checks, name, return_value=_NoCheck())
 
 
 _WITHOUT = {

@@ -9,7 +9,8 @@ from localization.estimators import Estimate
 from localization.events import Scan, Step
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
-from localization.sensor_checks.own_body import LIDAR_OWN_BODY, OwnBody
+from localization.sensor_checks.own_body import LIDAR_OWN_BODY, LIDAR_OWN_PARTS, OwnBody
+from localization.simulation import world
 from motion_models.motion import Motion
 from tests.helpers import checked_drive, rooms
 from tests.helpers.event_faults import named_faults, without_gyro
@@ -40,7 +41,7 @@ def test_post_on_driving_and_turning_robot_is_removed() -> None:
     assert sizes[0] == len(ANGLES)
     assert sizes[-1] == len(ANGLES) - 20
     body.report()
-    assert list(faults.found) == [LIDAR_OWN_BODY]
+    assert list(faults.found) == [LIDAR_OWN_PARTS]
 
 
 def test_nothing_is_removed_from_scans_of_a_robot_at_rest() -> None:
@@ -51,6 +52,85 @@ def test_nothing_is_removed_from_scans_of_a_robot_at_rest() -> None:
     assert faults.found == {}
 
 
+def scan_of(walls: np.ndarray, pose: np.ndarray, rng: np.random.Generator, cover: np.ndarray | None = None) -> Scan:
+    """Ranges to ``walls`` (n, 5) from ``pose`` (3,) with 1 cm of noise, and where it is nearer, to what ``cover`` (360,) them."""
+    ranges = rooms.look_around(walls, pose, ANGLES) + 0.01 * rng.normal(size=len(ANGLES))
+    ranges = ranges if cover is None else np.where(np.isfinite(cover), np.minimum(ranges, cover), ranges)
+    points = np.column_stack([ranges * np.cos(ANGLES), ranges * np.sin(ANGLES), np.zeros(len(ANGLES))])
+    return Scan(1, points[np.isfinite(ranges)])
+
+
+def drive_straight_on(
+    walls: np.ndarray, *, cover: np.ndarray | None = None, is_stuck: bool = False, is_held_back: bool = False
+) -> tuple[FaultLog, np.ndarray]:
+    """4 m ahead by the wheels, of a robot that may be stuck, with an estimate that may be; faults, and the share of each scan left out."""
+    faults, rng = FaultLog(CovarianceInflation()), np.random.default_rng(0)
+    body, left_out = OwnBody(faults), []
+    for k in range(40):
+        pose = np.array([0.1 * (k + 1), 0.0, 0.0])
+        seen = scan_of(walls, np.zeros(3) if is_stuck else pose, rng, cover)
+        motion = Motion(np.array([0.1, 0.0, 0.0]), 1e-6 * np.eye(3))
+        one = Step(k * 10**8, (k + 1) * 10**8, motion, np.zeros(3), np.zeros(3), False, True, None, seen)
+        after = body.remove(one).scan
+        assert after is not None
+        left_out.append(1.0 - len(after.points) / len(seen.points))
+        faults.inflation.reckoning.predict(one)
+        faults.inflation.reckoning.correct(one, np.zeros(3) if is_held_back else pose, None)
+        body.report()
+    return faults, np.array(left_out)
+
+
+CORRIDOR = world.box(-3.0, -0.7, 9.0, 0.8)
+"""Walls that keep their ranges beside a robot that drives along it."""
+HALL = np.concatenate([world.box(-4.0, -3.0, 12.0, 4.0), world.pillar(3.0, 1.5, 0.2), world.pillar(5.0, -1.5, 0.3)])
+COVERS = {
+    "mast ahead": np.where(np.abs(ANGLES) < 0.1, 0.3, np.inf),
+    "post behind and to the left": np.where(np.abs(ANGLES - 2.0) < 0.1, 0.4, np.inf),
+    "arc on the right": np.where((ANGLES < -0.7) & (ANGLES > -1.6), 0.3, np.inf),
+    "arm at growing range": np.where((ANGLES > 0.3) & (ANGLES < 1.0), 0.4 + 0.5 * ANGLES, np.inf),
+    "plate along the left side": np.where((ANGLES > 0.8) & (ANGLES < 2.3), 0.25 / np.maximum(np.sin(ANGLES), 0.1), np.inf),
+}
+
+
+@pytest.mark.parametrize("place", ["hall", "corridor"])
+@pytest.mark.parametrize("part", COVERS)
+def test_parts_of_the_robot_are_found_on_a_straight_drive(part: str, place: str) -> None:
+    """Other beams go through where the world would have these surfaces."""
+    cover, walls = COVERS[part], {"hall": HALL, "corridor": CORRIDOR}[place]
+    faults, left_out = drive_straight_on(walls, cover=cover)
+    assert left_out[0] == 0.0
+    share = np.isfinite(cover).mean()
+    assert left_out[-1] == pytest.approx(share, rel=0.3)
+    assert list(faults.found) == ([LIDAR_OWN_PARTS] if share > 0.05 else [])  # a few points are left out without a word
+
+
+@pytest.mark.parametrize("walls", [CORRIDOR, HALL, world.box(-3.0, -0.35, 9.0, 0.35)], ids=["corridor", "hall", "narrow"])
+def test_walls_beside_a_robot_that_drives_straight_on_are_kept(walls: np.ndarray) -> None:
+    faults, left_out = drive_straight_on(walls)
+    assert left_out.max() == 0.0
+    assert faults.found == {}
+
+
+@pytest.mark.parametrize("walls", [CORRIDOR, HALL, world.box(-0.5, -0.6, 0.7, 0.5)], ids=["corridor", "hall", "corner"])
+def test_robot_that_is_stuck_while_its_wheels_turn_sees_the_world(walls: np.ndarray) -> None:
+    faults, left_out = drive_straight_on(walls, is_stuck=True)
+    assert left_out.max() == 0.0
+    assert faults.found == {}
+
+
+def test_report_has_bearings_range_and_the_setting() -> None:
+    (found,) = drive_straight_on(HALL, cover=COVERS["arc on the right"])[0].found.values()
+    assert "at bearings of -91 to -40 deg of the LiDAR" in found.message
+    assert "up to 0.30 m" in found.message
+    assert "config.estimator.lidar.min_range_m: 0.40" in found.message
+
+
+def test_estimate_that_the_robot_itself_has_held_back_goes_to_where_the_other_points_lead() -> None:
+    faults, _ = drive_straight_on(HALL, cover=COVERS["arc on the right"], is_held_back=True)
+    assert list(faults.found) == [LIDAR_OWN_BODY]
+    assert faults.have_scans_led_away
+
+
 def test_beams_on_the_robot_are_left_out_and_reported() -> None:
     def cover(points: np.ndarray) -> np.ndarray:
         points = points.copy()
@@ -59,7 +139,7 @@ def test_beams_on_the_robot_are_left_out_and_reported() -> None:
 
     robot = checked_drive.CheckedDrive(scan=cover)
     checks = robot.drive()
-    assert list(checks.found) == [LIDAR_OWN_BODY]
+    assert list(checks.found) == [LIDAR_OWN_PARTS]
     assert "28 % of the LiDAR's points are the robot itself" in checks.warnings()[0]
     last = robot.applied[-1].scan
     assert last is not None
