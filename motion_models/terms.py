@@ -3,9 +3,9 @@
     [models.skid_steer.terms]
     vy = {"wz*abs(wz)" = [-0.12, 0.01, "m s"]}      # vy = the model's + c wz |wz| with c = -0.12 +- 0.01 m s
 
-A term is a coefficient times a product of `VARIABLES`, each as it is, to a power (v^2), or in abs() or sign(); rise(t,T) is what warms up
-with the time constant T [s], 1 - exp(-t/T). Its sigma is that of the coefficient, and the unit may be left out. Terms are zero at rest: at
-least one factor is a motion.
+A term is a coefficient times a product of `VARIABLES`, each as it is, to a power (v^2), or in abs() or sign(); max(wz,0) is what acts in
+left turns alone, min(wz,0) in right ones; rise(t,T) is what warms up with the time constant T [s], 1 - exp(-t/T). Its sigma is that of the
+coefficient, and the unit may be left out. Terms are zero at rest: at least one factor is a motion.
 """
 
 from __future__ import annotations
@@ -73,7 +73,9 @@ _SYNONYMS = {
     "time": "t",
 }
 """Other names of the variables, for errors that name the nearest one."""
-_FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
+_FORMS = ("", "abs", "sign", "max", "min")
+"""Forms of a variable, in the order in which expressions have them; max and min are of the variable and 0."""
+_FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|(max|min)\(([a-z_]+),0\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
 _RISE = re.compile(r"rise\(t,(\d+(?:\.\d+)?(?:e\+?\d+)?)\)")
 
 
@@ -82,25 +84,43 @@ class Factor(NamedTuple):
 
     variable: str
     form: str
-    """Empty, abs, sign or rise."""
+    """Empty, abs, sign, max, min or rise."""
     power: int
     time_constant_s: float = 0.0
     """Time constant of a rise [s]."""
 
+    @property
+    def is_one_sided(self) -> bool:
+        """Whether it acts on one side of 0 alone."""
+        return self.form in ("max", "min")
+
+    @property
+    def mirror(self) -> int:
+        """Its sign for a robot seen in a mirror; 0 where it becomes another factor."""
+        sign = VARIABLES[self.variable].mirror
+        if self.form == "abs" and sign:
+            return 1
+        return 0 if self.is_one_sided and sign != 1 else sign**self.power
+
     def __str__(self) -> str:
         if self.form == "rise":
             return f"rise({self.variable},{self.time_constant_s:.4g})"
-        name = f"{self.form}({self.variable})" if self.form else self.variable
+        other = ",0" if self.is_one_sided else ""
+        name = f"{self.form}({self.variable}{other})" if self.form else self.variable
         return name if self.power == 1 else f"{name}^{self.power}"
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and derivative by the variable ``x`` (n,); at the kinks of abs and sign the derivative is the mean of both sides', 0."""
+        """Value and derivative by the variable ``x`` (n,); at kinks the derivative is the mean of both sides'."""
         if self.form == "rise":
             left = np.exp(-x / self.time_constant_s)
             return np.asarray(1.0 - left), np.asarray(left / self.time_constant_s)
         if self.form == "sign":
             return np.asarray(np.sign(x) ** self.power), np.zeros_like(x)
-        base, slope = (np.abs(x), np.sign(x)) if self.form else (x, np.ones_like(x))
+        if self.is_one_sided:
+            side = 1.0 if self.form == "max" else -1.0
+            base, slope = side * np.maximum(side * x, 0.0), np.heaviside(side * x, 0.5)
+        else:
+            base, slope = (np.abs(x), np.sign(x)) if self.form else (x, np.ones_like(x))
         return np.asarray(base**self.power), np.asarray(self.power * base ** (self.power - 1) * slope)
 
 
@@ -122,9 +142,7 @@ class Expression:
     @property
     def mirror(self) -> int:
         """Its sign for a mirrored robot: 1, -1, or 0 where a mirrored robot has another expression (one side's wheels)."""
-        return math.prod(
-            1 if f.form == "abs" and VARIABLES[f.variable].mirror else VARIABLES[f.variable].mirror ** f.power for f in self.factors
-        )
+        return math.prod(f.mirror for f in self.factors)
 
     def dimension(self) -> tuple[int, int]:
         """Powers of metre and second in its unit; signs and rises have none."""
@@ -159,7 +177,7 @@ def parse_expression(text: str, where: str = "term") -> Expression:
             raise RobotError(
                 f"{where}: cannot read {part[:40]!r} in {text[:60]!r}; terms are products such as v*abs(wz), wz^2 or sign(v)*cg_y."
             )
-        form, name, power = found[1] or "", found[2] or found[3], int(found[4] or 1)
+        form, name, power = found[1] or found[3] or "", found[2] or found[4] or found[5], int(found[6] or 1)
         if name not in VARIABLES:
             near = [_SYNONYMS[name]] if name in _SYNONYMS else difflib.get_close_matches(name, _NAMES, n=1, cutoff=0.4)
             meant = f" (did you mean {near[0]}?)" if near else ""
@@ -167,7 +185,7 @@ def parse_expression(text: str, where: str = "term") -> Expression:
         powers[name, form] = powers.get((name, form), 0) + power
         if not 1 <= powers[name, form] <= _MAX_POWER:
             raise RobotError(f"{where}: power {powers[name, form]} of {name} in {text[:60]!r}; powers are 1 to {_MAX_POWER}.")
-    order = sorted(powers, key=lambda key: (_NAMES.index(key[0]), ("", "abs", "sign").index(key[1])))
+    order = sorted(powers, key=lambda key: (_NAMES.index(key[0]), _FORMS.index(key[1])))
     expression = Expression((*(Factor(name, form, powers[name, form]) for name, form in order), *rises))
     if not any(VARIABLES[f.variable].is_motion for f in expression.factors):
         motions = ", ".join(name for name, v in VARIABLES.items() if v.is_motion)

@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Hypothesis, with_sizes
-from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
 from localization.diagnosis.noise import FLAT, Noise, reference_noise
+from localization.diagnosis.result import DiagnosisResult
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
 from motion_models.se2 import FloatArray
@@ -36,6 +36,10 @@ from motion_models.terms import COMPONENTS, VARIABLES, Expression, Term, parse_e
 
 _POWERS = ("", "{0}", "abs({0})", "{0}^2", "{0}*abs({0})", "sign({0})", "{0}^3")
 """Shapes of one variable: even and odd, to the third power, as slip grows."""
+_ONE_SIDED = ("max({0},0)", "min({0},0)")
+"""Shapes that act to one side alone, as a slip in left turns. By abs() such a law is half in a term, and half in what is tolerated of the
+causes, which no file holds."""
+_BESIDE_ONE_SIDED = ("", "{0}", "abs({0})")
 _OF_CAUSES = frozenset({("vx", "v"), ("vx", "wz"), ("vy", "v"), ("vy", "wz"), ("wz", "v"), ("wz", "wz")})
 """Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference. A term has them only where such a
 cause would be larger than robots have it."""
@@ -142,6 +146,7 @@ class Search(NamedTuple):
 def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[CandidateTerm, ...]:
     """Candidates for a drive in which ``count`` numbers were measured, beside so many ``others``; CG products only where the CG moves."""
     powers = list(itertools.product(_POWERS, _POWERS))[1:]
+    powers += [pair for x, y in itertools.product(_ONE_SIDED, _BESIDE_ONE_SIDED) for pair in ((x, y), (y, x))]
     texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
     has_cg = bool(np.std(predictor.batch.cg, axis=0).max() > _CG_MOVES_M)
     whole = float(predictor.batch.t.max(initial=0.0))
@@ -355,9 +360,14 @@ def _has_mirrored_rival(
     """Whether for a component whose ``chosen`` terms have one mirror symmetry, as many terms with the other one explain the drive as well.
 
     Where the robot turned left whenever it drove ahead, and right whenever it drove back, v^2 sign(wz) is v |v|, and what the robot does in
-    other turns is a guess. ``candidates`` are those of the columns that are terms.
+    other turns is a guess. ``candidates`` are those of the columns that are terms; what acts to one side alone is no rival, as two of them
+    are a symmetric one.
     """
-    symmetry = {i: (c.component, Term(c.component, c.expression, 0.0).is_symmetric) for i, c in candidates.items()}
+    symmetry = {
+        i: (c.component, Term(c.component, c.expression, 0.0).is_symmetric)
+        for i, c in candidates.items()
+        if i in chosen or c.expression.mirror
+    }
     found = {symmetry[i] for i in chosen if i in symmetry}
     least = min(c.price for c in candidates.values())
     for component, is_symmetric in found:

@@ -84,6 +84,23 @@ def test_extend_finds_what_fades(seed: int) -> None:
     assert result.robot is not None
 
 
+@pytest.mark.parametrize(("component", "text"), [("wz", "max(wz,0)"), ("vx", "min(v,0)"), ("vy", "abs(v)*min(wz,0)")])
+def test_extend_finds_what_acts_to_one_side(component: str, text: str) -> None:
+    """By abs() half of it would be a term, and half within the tolerance of radii, track and mounts, which no file holds."""
+    hidden = term(component, text, 0.1)
+    result = extended(drive_with(40, 2, hidden))
+    assert names(result) == [hidden.name]
+    assert result.robot is not None
+
+
+def test_extend_writes_nothing_of_a_side_that_the_drive_did_not_take() -> None:
+    """Without right turns wz is max(wz,0)."""
+    drawn = drive_with(400, 0, term("wz", "max(wz,0)", 0.4)).maneuvers
+    left = [m for m in drawn if (m.wheels[:, 1] - m.wheels[:, 0]).min() > -0.5][:40]
+    result = extended(drive_of_windows(ROBOT, [dataclasses.replace(m, start_s=2.0 * i) for i, m in enumerate(left)]))
+    assert result.robot is None or all("max(" not in name for name in names(result))
+
+
 def test_extend_writes_no_term_that_holds_in_a_part_of_the_drive() -> None:
     """A law that begins at three quarters of the drive: terms describe it by the motions of that part."""
     effect: Effect = lambda m: (np.where(m.t > 60.0, 0.3 * m.v * np.abs(m.v), 0.0), 0.0, 0.0)  # noqa: E731
@@ -105,13 +122,13 @@ def test_extend_writes_no_term_that_is_a_guess_for_the_other_side() -> None:
 
 
 def test_extend_corrects_by_the_half_that_has_the_motions() -> None:
-    """Every other block of four windows has hardly any way ahead: there |v| wz and v wz are nearly one term."""
-    hidden = (term("vy", "abs(v)*wz", 0.2), term("vy", "v*wz", -0.2))
+    """Every other block of four windows has hardly any way ahead: there v wz and min(v, 0) wz are nearly one term."""
+    hidden = (term("vy", "min(v,0)*wz", -0.2), term("vy", "v*wz", -0.2))
     both, back = (list(drive_with(count, 3, *hidden).maneuvers) for count in (20, 200))
     back = [m for m in back if m.wheels.mean() < -0.3 and m.wheels.mean(axis=1).max() < 0.4][:20]
     mixed = [m for i in range(5) for m in (*back[4 * i : 4 * i + 4], *both[4 * i : 4 * i + 4])]
     result = extended(drive_of_windows(ROBOT, [dataclasses.replace(m, start_s=2.0 * i) for i, m in enumerate(mixed)]))
-    assert names(result) == ["vy[abs(v)*wz]", "vy[v*wz]"]
+    assert names(result) == ["vy[min(v,0)*wz]", "vy[v*wz]"]
     assert result.extension is not None
     assert result.extension.check is not None
     assert result.extension.check.shown[0] == pytest.approx(1.0, abs=0.05)

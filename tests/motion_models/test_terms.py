@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -41,12 +43,22 @@ def husky(entry: str, model: str = "diff_drive") -> Robot:
         ("wz", "t*wz", "wz*t", "1/s", True),
         ("vx", "rise(t, 20.0)*v", "v*rise(t,20)", "1", True),
         ("vx", "v*rise(t,1.2e+02)", "v*rise(t,120)", "1", True),
+        ("wz", "max( wz, 0 )", "max(wz,0)", "1", False),
+        ("vx", "abs(wz)*min(v,0)", "min(v,0)*abs(wz)", "s", True),
     ],
 )
 def test_expression_is_written_in_one_way_with_its_unit(component: str, text: str, written: str, unit: str, is_symmetric: bool) -> None:
     term = Term(component, parse_expression(text), 1.0)
     assert (str(term.expression), term.unit, term.is_symmetric) == (written, unit, is_symmetric)
     assert parse_expression(written) == term.expression
+
+
+@pytest.mark.parametrize(("text", "python", "slope"), [("max(wz,0)", max, 1.0), ("min(wz,0)", min, 0.0)])
+def test_one_sided_term_acts_on_its_side_alone(text: str, python: Callable[[float, float], float], slope: float) -> None:
+    rates = np.array([0.4, -0.3])
+    value, slopes = parse_expression(text).evaluate({"wz": rates})
+    assert value.tolist() == [python(rate, 0.0) for rate in rates]
+    assert slopes["wz"].tolist() == [slope, 1.0 - slope]
 
 
 def test_term_value_is_that_of_python() -> None:
