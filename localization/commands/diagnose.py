@@ -18,7 +18,7 @@ from localization.calibration.windows import WindowConfig
 from localization.commands.common import in_radians, new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
-from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
+from localization.diagnosis.diagnose import DiagnosisConfig, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
 from localization.diagnosis.extension import ExtendedResult, extend, suggests_extension
 from localization.diagnosis.findings import (
@@ -37,6 +37,7 @@ from localization.diagnosis.findings import (
 )
 from localization.diagnosis.handover import Reader, check_findings
 from localization.diagnosis.linearization import default_model
+from localization.diagnosis.result import DiagnosisResult
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report

@@ -29,8 +29,10 @@ _SLIPS: Mapping[str, float] = {
     "rotation_slip_speed": 0.1,
     "longitudinal_slip_turning": 0.1,
     "rotation_scale": 0.5,
+    "cg_height": 0.1,
 }
-"""Sigma of slips that grow with speed: their typical sizes, in their units; and of rotations that no friction model predicts."""
+"""Sigma of slips that grow with speed, and of the height of the CG: their typical sizes, in their units; and of rotations that no friction
+model predicts. Another grip than the file's slides sideways in curves, as the first slip does."""
 _CG_SIGMA_M = 0.01
 """Sigma of the centre of gravity by robot files [m], with batteries and cables that these do not have."""
 _PASSING = frozenset({"gyro_bias", "slope"})

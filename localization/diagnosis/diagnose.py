@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from localization.bounded_settings import Count, Probability, Seed, Settings
 from localization.calibration.calibrate import describe_clocks
 from localization.diagnosis.causes import FROZEN_ENCODER, MISSING_MESSAGES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
+from localization.diagnosis.causes.slopes import SHOWN_BY_FORCES
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor, Unmodelled
 from localization.diagnosis.findings import (
@@ -40,6 +41,7 @@ from localization.diagnosis.linearization import (
     linearize,
     make_predictor,
 )
+from localization.diagnosis.missing_terms import find_terms
 from localization.diagnosis.model_error import (
     COULOMB_LOG_STIFFNESS,
     MissingSlips,
@@ -49,6 +51,7 @@ from localization.diagnosis.model_error import (
     unmodelled_by,
 )
 from localization.diagnosis.noise import Noise, reference_sigmas
+from localization.diagnosis.result import DiagnosisResult, DriveDiscrepancies
 from localization.diagnosis.selection import (
     aliases_of,
     bent_causes,
@@ -110,30 +113,6 @@ class DiagnosisConfig(Settings):
     """Seed of the random numbers in tests and intervals."""
 
 
-@dataclass(frozen=True)
-class DriveDiscrepancies:
-    """Discrepancies, for pictures."""
-
-    rows: FloatArray
-    """(M, 6) measured minus predicted, as `CHANNELS`."""
-    left: FloatArray
-    """(M, 6) once all findings are corrected."""
-    sigmas: FloatArray
-    """(M, 6) their noise."""
-
-
-@dataclass(frozen=True)
-class DiagnosisResult:
-    """A diagnosis and what it was made of."""
-
-    diagnosis: Diagnosis
-    predictor: DrivePredictor | None
-    """None where too little was measured."""
-    residuals: DriveDiscrepancies | None
-    linearization: Linearization | None = None
-    """The last linearization of the drive: its signatures, and its noise."""
-
-
 def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Baseline | None = None) -> Diagnosis:
     """What is wrong with ``model`` on ``drive``, why, and the gain of correcting it; causes count from ``baseline``, by default the robot
     file (see `localization.diagnosis.baseline`)."""
@@ -151,7 +130,8 @@ def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = N
     chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
     if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
         searched, chosen = searched._replace(linearization=searched.first), ()
-    return _with_confirmed_names(searched, _conclude(searched, chosen, rng, config), config)
+    found = _with_confirmed_names(searched, _conclude(searched, chosen, rng, config), config)
+    return _without_names_of_terms(searched, found, config)
 
 
 def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
@@ -162,6 +142,23 @@ def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: D
     kept = {f.definition.key for f in d.findings if f in confirmed or f.is_counted or not f.is_plausible}
     if d.verdict != "unexplained" or all(f.definition.key in kept for f in d.findings):
         return found
+    return _with_names(searched, found, kept, config)
+
+
+def _without_names_of_terms(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
+    """``found`` without the names in whose place terms explain the drive better, where a part of it stays unexplained: what such a name
+    improves on windows that it was not fitted to is then the term's."""
+    d = found.diagnosis
+    named = {f.definition.key for f in d.findings if not f.is_counted}
+    search = find_terms(found, np.random.default_rng(config.seed)) if named and d.verdict == "unexplained" else None
+    if search is None or not (search.terms or search.effects):
+        return found
+    kept = named & {search.state.causes[i].key for i in search.kept}
+    return found if kept == named else _with_names(searched, found, kept, config)
+
+
+def _with_names(searched: _Searched, found: DiagnosisResult, kept: Set[str], config: DiagnosisConfig) -> DiagnosisResult:
+    """The diagnosis with the causes alone whose keys are ``kept``, where it stays unexplained; else ``found``."""
     linearization = searched.linearization if kept else searched.first
     chosen = tuple(i for i, cause in enumerate(linearization.causes) if cause.key in kept)
     again = _conclude(searched._replace(linearization=linearization), chosen, np.random.default_rng(config.seed), config)
@@ -380,7 +377,7 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
     elif findings:
         next_drive = separating_drive(predictor, findings)
     else:
-        next_drive = general_advice(verdict, [e.id for e in undetectable])
+        next_drive = general_advice(verdict, [e.id for e in undetectable if e.id not in SHOWN_BY_FORCES])
     if has_other_contacts:
         next_drive = f"{next_drive} {model_error_advice(findings)}".strip()
     within = {**dropped, **_within_tolerance(linearization, chosen, sizes, rows)}

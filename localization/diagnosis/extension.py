@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot
-from localization.diagnosis.diagnose import DiagnosisConfig, DiagnosisResult, examine
+from localization.diagnosis.diagnose import DiagnosisConfig, examine
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import CLEAR_SIGMAS, MAX_NOISE_OVER_REFERENCE, Attribution, HandoverCheck
@@ -35,6 +35,7 @@ from localization.diagnosis.missing_terms import (
     sizes_on,
 )
 from localization.diagnosis.noise import reference_sigmas
+from localization.diagnosis.result import DiagnosisResult
 from localization.diagnosis.verdict import noise_excess
 from localization.events import Turn
 from localization.gyro import GyroRecord

@@ -28,7 +28,7 @@ from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import DrivePredictor
-from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor
+from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, setting_of
 from localization.diagnosis.model_error import CG_OFFSETS, cg_error_sigmas, cg_prior_sigmas, find_model_error
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
@@ -63,7 +63,7 @@ PRIOR_SIGMAS: Mapping[str, float] = {
 
 Scrub cannot be negative: its prior is cut there (see `_truncated`)."""
 _ON_SLOPE = ("cg_height", "grip")
-"""Causes that show on slopes alone."""
+"""Causes that are weighed on slopes, where they show well."""
 _SLOPE_SIGMA = math.radians(6.0)
 """Sigma of the floor's slope where it is none of a level floor [rad]: hills have 5.8 degrees in the median."""
 _HEIGHT_SIGMA = 0.4
@@ -314,7 +314,7 @@ def _causes(predictor: DrivePredictor, robot: Robot) -> tuple[Cause, ...]:
     """Offsets of the CG, and what else may turn the robot in the same way, with their priors; on a slope what shows there as well."""
     cg = cg_prior_sigmas(robot)
     shown, sigmas = candidate_causes(predictor, moments=0), dict(PRIOR_SIGMAS)
-    if any(cause.id in _ON_SLOPE for cause in shown):
+    if setting_of(predictor).is_on_slope:
         sigmas |= {"slope": _SLOPE_SIGMA, "cg_height": _HEIGHT_SIGMA * robot.geometry.cg_height_m, "grip": CAUSES["grip"].plausible}
     stiffness = dataclasses.replace(slip_stiffness_cause(robot), prior_sigma=_SLIP_STIFFNESS_SIGMA)
     others = [dataclasses.replace(c, prior_sigma=sigmas[c.id]) for c in shown if c.id in sigmas]

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS, DrivePredictor
+from localization.diagnosis.result import DiagnosisResult
 from localization.report.charts import Axis, Chart, ChartSeries
 from motion_models import se2
 from motion_models.se2 import FloatArray

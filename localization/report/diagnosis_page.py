@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.diagnosis.diagnose import DiagnosisResult
 from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS
 from localization.diagnosis.findings import (
     Diagnosis,
@@ -18,6 +17,7 @@ from localization.diagnosis.findings import (
     is_contesting,
     unit_of,
 )
+from localization.diagnosis.result import DiagnosisResult
 from localization.report import page as html
 from localization.report.diagnosis_charts import COMPONENTS, diagnosis_charts, motion_in_windows
 from localization.report.figures import Axes, svg

@@ -33,7 +33,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 if TYPE_CHECKING:
-    from localization.diagnosis.diagnose import DiagnosisResult
+    from localization.diagnosis.result import DiagnosisResult
 
 OK, WARN, ERROR = 0, 1, 2
 

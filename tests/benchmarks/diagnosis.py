@@ -29,10 +29,11 @@ import numpy as np
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, with_sizes
-from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
+from localization.diagnosis.diagnose import TOLERANCE, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import Linearization, linearize, make_regression
+from localization.diagnosis.result import DiagnosisResult
 from localization.logs import open_log
 from localization.simulation.injected_faults import FAULTS
 from motion_models.registry import make_model

@@ -35,6 +35,15 @@ def test_diagnose_mujoco_hidden_cause_is_named() -> None:
 
 
 @pytest.mark.extended
+def test_diagnose_mujoco_height_of_the_cg_is_named_on_a_level_floor() -> None:
+    """The centripetal force of curves shifts loads; without the height as a candidate a track 155 mm wider was named."""
+    found = diagnose_mujoco("husky_a200", "tour", {"cg_height": 0.2}, 7312, healthy("husky_a200")).diagnosis
+    (only,) = found.findings
+    assert only.cause == "cg_height"
+    assert abs(only.size - 0.2) < 3.0 * only.sigma
+
+
+@pytest.mark.extended
 @pytest.mark.parametrize("shift_m", [0.0, 0.02])
 def test_diagnose_stiff_contacts_nothing_wrong_or_the_right_shift(tmp_path: Path, shift_m: float) -> None:
     """MuJoCo's contacts are eight times as stiff as the file's: a healthy Jackal is consistent, and a CG that lies farther ahead is found

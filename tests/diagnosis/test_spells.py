@@ -11,10 +11,11 @@ import pytest
 
 from localization.diagnosis.causes.cause import Spell, in_spell
 from localization.diagnosis.corrected_robot import correct_robot
-from localization.diagnosis.diagnose import DiagnosisResult, examine
+from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import TOLERANCE, candidate_causes, linearize, make_predictor
+from localization.diagnosis.result import DiagnosisResult
 from localization.diagnosis.spells import with_intervals
 from localization.logs import open_log
 from localization.simulation.experiments import Experiment, ExperimentConfig, Phase, PickUp

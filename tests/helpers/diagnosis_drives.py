@@ -9,8 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from localization.diagnosis.diagnose import DiagnosisResult, examine
+from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
+from localization.diagnosis.result import DiagnosisResult
 from localization.logs import open_log
 from localization.simulation.experiments import EXPERIMENTS, Experiment, ExperimentConfig, MoveArms, OpenLoop, Phase, Rest, constant, sine
 from localization.simulation.scanners import ScannerConfig

@@ -29,13 +29,14 @@ import numpy as np
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.causes.cause import Cause, Hypothesis
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot, predictor_after
-from localization.diagnosis.diagnose import TOLERANCE, DiagnosisResult, examine
+from localization.diagnosis.diagnose import TOLERANCE, examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor
 from localization.diagnosis.extension import ExtendedResult, extend
 from localization.diagnosis.findings import confirmed_findings
 from localization.diagnosis.linearization import candidate_causes, default_model, linearize, make_predictor
 from localization.diagnosis.missing_terms import candidate_terms, merge_terms, term_columns
+from localization.diagnosis.result import DiagnosisResult
 from localization.logs import open_log
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig

@@ -19,9 +19,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from localization.diagnosis.baseline import estimate_baseline
-from localization.diagnosis.diagnose import DiagnosisResult, examine
+from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.drive_predictor import Baseline
+from localization.diagnosis.result import DiagnosisResult
 from localization.logs import open_log
 from localization.simulation.experiments import Experiment, ExperimentConfig, Phase
 from localization.simulation.injected_faults import FAULTS

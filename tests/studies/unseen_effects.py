@@ -27,11 +27,12 @@ import numpy as np
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Hypothesis
-from localization.diagnosis.diagnose import DiagnosisResult, examine
+from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.extension import extend
 from localization.diagnosis.findings import confirmed_findings
 from localization.diagnosis.linearization import TOLERANCE, candidate_causes, default_model, linearize, make_predictor
+from localization.diagnosis.result import DiagnosisResult
 from localization.logs import open_log
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.injected_faults import FAULTS

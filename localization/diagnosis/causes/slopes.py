@@ -1,7 +1,7 @@
-"""Causes that show where gravity pulls along the floor: the height of the centre of gravity, and the floor's grip.
+"""Causes that show where a force acts at the centre of gravity: its height, and the floor's grip.
 
 On a slope the vertical through the centre of gravity (CG) intersects the floor h tan(tilt) farther downhill, and the pull along the floor
-counts over mu. On a level floor h shifts loads only while speeds change, and mu only scales the rolling resistance.
+counts over mu. On a level floor the centripetal force m v wz does both in curves, and a change of speed shifts loads as well.
 """
 
 from __future__ import annotations
@@ -17,6 +17,11 @@ _LEAST_HEIGHT = 0.2
 _LOG_GRIP_SIGMA = 0.4
 """Sigma of the logarithm of mu: from wet grass to dry concrete, .4 to .9 (Wong 2008, Theory of Ground Vehicles, table 1.3)."""
 _MU = FrictionModel.param_names.index("mu")
+
+
+def _is_seen(s: Setting) -> bool:
+    """On slopes, and in curves of a drive whose positions were measured, by the friction model, which has inertia on logs."""
+    return s.is_on_slope or (s.kind == "log" and s.has_positions and s.is_friction_model)
 
 
 def _height_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
@@ -49,22 +54,30 @@ def _correct_grip(draft: CorrectionDraft, size: float) -> CorrectionDraft:
 
 CG_HEIGHT = Cause(
     "cg_height",
-    *("m", "the centre of gravity lies higher than in the robot file; it shows on slopes", 0.1, 0.02, add("cg_height")),
+    *("m", "the centre of gravity lies higher than in the robot file; it shows on slopes and in fast curves", 0.1, 0.02, add("cg_height")),
     ("the centre of gravity lies {} higher than the robot file has it", "the centre of gravity lies {} lower than the robot file has it"),
     correct=_correct_height,
     remedy="weigh the robot on a slope (`skidloc weigh`), or set cg_height_m = {g.cg_height_m:.3f}",
-    applies=lambda s: s.is_on_slope,
+    applies=_is_seen,
     by_skidding=True,
     variants=_height_of_robot,
 )
 GRIP = Cause(
     "grip",
-    *("1", "the floor grips more in all directions, by this logarithm of mu; it shows on slopes", 0.3, 0.05, lambda b, s: b),
+    *(
+        "1",
+        "the floor grips more in all directions, by this logarithm of mu; it shows on slopes and in fast curves",
+        0.3,
+        0.05,
+        lambda b, s: b,
+    ),
     ("the floor grips {} more in all directions", "the floor grips {} less in all directions"),
     correct=_correct_grip,
     remedy="on this floor, set [models.friction] mu",
-    applies=lambda s: s.is_on_slope,
+    applies=_is_seen,
     by_skidding=True,
     variants=_grip_of_robot,
     prior_sigma=_LOG_GRIP_SIGMA,
 )
+SHOWN_BY_FORCES = (CG_HEIGHT.id, GRIP.id)
+"""Causes that level drives at usual speeds hardly show, and are not asked to."""
