@@ -16,14 +16,16 @@ from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
 
 _WARP = FrictionModel.param_names.index("warp")
+_TYRES = [FrictionModel.param_names.index(name) for name in ("slip_stiffness", "mu")]
 _POINTS = (-1.271, -0.325, 0.325, 1.271)
 """Means of the quarters of a normal distribution [sigmas]. Where a wheel is in the air more load changes nothing: there the mean motion by
 three points of Gauss-Hermite is off by 4.4 % (RMS), by these 1.4 %."""
 
 
-def _warped(params: FloatArray, warp: float) -> FloatArray:
-    """``params`` (13,) of the friction model with ``warp`` added to theirs."""
+def _changed(params: FloatArray, tyres: tuple[float, float], warp: float = 0.0) -> FloatArray:
+    """``params`` (13,) of the friction model with other ``tyres``, see `SlopeEffect.twist`, and ``warp`` added to theirs."""
     out = params.copy()
+    out[_TYRES] *= np.exp(tyres)
     out[_WARP] += warp
     return out
 
@@ -35,6 +37,8 @@ class SlopeMotion(NamedTuple):
     """(n, 3)"""
     d_downhill: FloatArray
     """(n, 3, 2) by `Slope.downhill`."""
+    by_tyres: FloatArray
+    """(n, 3, 2) by the logarithms of slip stiffness and mu."""
     by_warp: FloatArray
     """(n, 3, 4) root B of the mean square B B^T by which motions at other loads on the diagonals are off `twist`."""
     limited: BoolArray
@@ -70,22 +74,26 @@ class SlopeEffect:
         params: FloatArray,
         downhill: FloatArray,
         warp: tuple[float, float] = (0.0, 0.0),
+        tyres: tuple[float, float] = (0.0, 0.0),
     ) -> SlopeMotion:
         """Motion of ``model`` at ``wheels`` (n, 2), ``cg`` (n, 2) and ``params`` where the ground falls to ``downhill`` (n, 2).
 
         ``warp``: mean and sigma of the load that the ground moves onto the front left and rear right wheels, over m g / 4. The
         motion is that at the mean. A robot on either diagonal slides farther than on four wheels, so that its error is to one side.
+        ``tyres``: logarithms of slip stiffness and mu over the robot file's.
         """
         level = model.twist(wheels, cg, params)
         is_friction = isinstance(model, FrictionModel)
         friction, own = (model, params) if isinstance(model, FrictionModel) else (self.friction, self.friction.nominal)
-        flat = level if is_friction else friction.twist(wheels, cg, own)
+        flat = level if is_friction else friction.twist(wheels, cg, _changed(own, tyres))
         slope = Slope(downhill, self.cg_height)
-        found = friction.find_on_slope(wheels, cg, _warped(own, warp[0]), slope)
-        points = [friction.find_on_slope(wheels, cg, _warped(own, warp[0] + z * warp[1]), slope).twist.value for z in _POINTS]
+        found = friction.find_on_slope(wheels, cg, _changed(own, tyres, warp[0]), slope)
+        points = [friction.find_on_slope(wheels, cg, _changed(own, tyres, warp[0] + z * warp[1]), slope).twist.value for z in _POINTS]
         by_warp = np.stack([point - found.twist.value for point in points], axis=-1) / math.sqrt(len(points))
-        twist = found.twist
+        twist, sizes = found.twist, _changed(own, tyres)[_TYRES]
+        by_tyres = sizes * twist.d_params[..., _TYRES]
         if not is_friction:
+            by_tyres = by_tyres - sizes * flat.d_params[..., _TYRES]
             twist = Twist(
                 level.value + (twist.value - flat.value),
                 level.d_wheels + (twist.d_wheels - flat.d_wheels),
@@ -94,7 +102,7 @@ class SlopeEffect:
             )
         limited = np.asarray(np.isnan(by_warp).any(axis=(-2, -1)))
         if not limited.any():
-            return SlopeMotion(twist, found.d_downhill, by_warp, limited)
+            return SlopeMotion(twist, found.d_downhill, by_tyres, by_warp, limited)
         at = limited[:, None, None]
         twist = Twist(
             np.where(limited[:, None], level.value, twist.value),
@@ -102,4 +110,5 @@ class SlopeEffect:
             np.where(at, level.d_cg, twist.d_cg),
             np.where(at, level.d_params, twist.d_params),
         )
-        return SlopeMotion(twist, np.where(at, 0.0, found.d_downhill), np.where(at, 0.0, by_warp), limited)
+        d_downhill, by_tyres, by_warp = (np.where(at, 0.0, by) for by in (found.d_downhill, by_tyres, by_warp))
+        return SlopeMotion(twist, d_downhill, by_tyres, by_warp, limited)
