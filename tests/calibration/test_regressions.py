@@ -79,6 +79,13 @@ def test_regression_intervals_cover():
     assert np.all(np.abs(inside / 3000 - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 3000))
 
 
+def test_regression_p_values_of_no_slope_are_uniform():
+    rng, x = np.random.default_rng(2), np.linspace(-1, 1, 12)
+    p = np.array([polynomial(0.3 + rng.normal(size=12), x, 2).p_values for _ in range(1000)])
+    for column in p.T[1:]:
+        assert stats.kstest(column, "uniform").pvalue > 1e-3
+
+
 def test_skid_steer_fit_of_a_simulated_table_returns_its_model():
     table = grid()
     truth = thesis_coefficients("full")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Hypothesis, Setting, with_sizes
@@ -32,14 +33,17 @@ from localization.diagnosis.verdict import (
     attribute_rows,
     candidate_maneuvers,
     decide,
+    find_trends,
     mark_trends,
     separating_drive,
+    trend_motions,
 )
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from tests.helpers.law_drives import law_drive
 
 pytestmark = pytest.mark.xdist_group("verdict")
 
@@ -147,6 +151,34 @@ def test_attribute_rows_unequal_noise_is_weighed_alike_in_all_columns(rotations:
     white = (drive.rows / sigmas)[:, CHANNELS.index("yaw")]
     assert yaw.rms / yaw.expected_rms == pytest.approx(np.sqrt(np.mean(white**2)))
     assert yaw.rms > 3.0 * yaw.expected_rms
+
+
+def test_attribute_rows_p_values_of_noise_are_uniform(rotations: Linearization) -> None:
+    rng, sigmas, p = np.random.default_rng(1), np.full(rotations.rows.shape, 0.01), []
+    for _ in range(300):
+        drive = measured(rotations, np.where(np.isfinite(rotations.rows), rng.normal(0.0, sigmas), np.nan), sigmas)
+        table = attribute_rows(drive, drive, (), np.zeros(0), 0.01, None, np.zeros_like(drive.rows))
+        p.append([table[name].p_value for name in ("x", "y", "yaw")])
+    for column in np.array(p).T:
+        assert kstest(column, "uniform").pvalue > 1e-3
+
+
+def test_find_trends_in_noise_are_as_rare_as_their_p_value() -> None:
+    """At most 11 of 300 drives have one at a significance of 1 % (binomial, 99.99 %), and each drive has one that is there."""
+    drive = law_drive("turtlebot3_burger")
+    predictor = make_predictor(drive, make_model("diff_drive", drive.robot))
+    known = np.isfinite(predictor.discrepancies(Hypothesis()))
+    rng, sigmas, nothing = np.random.default_rng(2), np.full(known.shape, 0.01), np.zeros((*known.shape, 0))
+    turned = trend_motions(predictor)["wz |wz|"][..., 2]
+
+    def found(strength: float) -> int:
+        left = np.where(known, rng.normal(0.0, sigmas), np.nan)
+        left[:, :3] += strength * turned
+        noise = given_noise(left, sigmas, np.zeros(len(left), dtype=bool))
+        return len(find_trends(predictor, noise, left, nothing, nothing, np.zeros(0), rng)[0])
+
+    assert sum(found(0.0) > 0 for _ in range(300)) <= 11
+    assert all(found(0.2) > 0 for _ in range(5))
 
 
 def test_attribute_rows_lists_no_tolerated_cause_that_is_not_significant(rotations: Linearization) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
 from localization.cli import main
 from localization.commands.weigh import describe
@@ -72,6 +73,11 @@ def test_weighing_of_known_offset_gives_the_payload(mass: float, place: tuple[fl
     assert found.payload(*place)[0] == pytest.approx(mass)
     assert found.moment == pytest.approx(mass * (np.array(place) - found.position))
     assert found.p_value < 1e-6
+
+
+def test_weighing_p_values_of_a_right_file_are_uniform() -> None:
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), _weighing((0.0, 0.0)).covariance, 400)
+    assert kstest([_weighing((x, y)).p_value for x, y in draws.tolist()], "uniform").pvalue > 1e-3
 
 
 def test_weigh_left_out_rotations_of_the_thesis_have_their_cg() -> None:
