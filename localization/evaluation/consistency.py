@@ -7,6 +7,9 @@ truth, NIS innovations against their predicted covariance. Both are needed: inno
 The bands are for independent samples. Innovations of a consistent filter are independent; pose errors along one run are not: this second's
 error is the last one's plus a little. How many independent samples they are worth follows from their own autocorrelation
 (`independent_samples`): one for an offset that stays, two for a random walk, hundreds for a robot that localizes itself in a map.
+Errors of dead reckoning are sums of independent increments: two samples cannot show half the sigma, however long the drive. Motions over
+stretches one after the other are independent, and their covariances follow from those of the poses: P_j - A P_i A^T, A = Ad(d_ij^-1). That
+holds of no estimator that corrects its pose by a map (`stretch_consistency`).
 
 Singular covariances: a direction of zero variance has no information. Where the error is zero too, it is not counted (one degree of
 freedom less); where it is not, the square is infinite (a plain pseudo-inverse would take it as zero). Zero is to rounding: each component
@@ -36,6 +39,12 @@ _MAX_INSTANTS = 120
 """Whose correlations are computed: the mean over a drive does not change with more."""
 _MIN_STEP_M, _MIN_STEP_RAD = 0.01, 0.01
 """Steps from where on a robot has moved: below, its error is the one that it had."""
+_STRETCHES = (16, 8)
+"""The most that the reference's noise allows. With sixteen, half the sigma of distances alone shows in 95 % of drives: 4 chi2(16) / 16 is
+above 1.8, the 97.5th percentile of one that is right."""
+_MIN_STRETCHES = 6
+_MAX_NOISE_SHARE = 1.0 / 3.0
+"""Largest share of the reference in a stretch's variance: neighbours share it, and what is left must show an error of the claim."""
 
 
 @dataclass(frozen=True)
@@ -379,3 +388,62 @@ def _spectrum(p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     correlations = p / (sigma[:, :, None] * sigma[:, None, :])
     values, vectors = np.linalg.eigh(0.5 * (correlations + np.swapaxes(correlations, 1, 2)))
     return sigma, values, vectors
+
+
+def stretch_consistency(
+    trajectory: Trajectory, reference: ReferenceTrack, lever_sigma_m: float = 0.0, probability: float = 0.95, max_gap_s: float = 1.0
+) -> Consistency | None:
+    """NEES of dead reckoning's motions over up to sixteen stretches of equal way, 3 expected.
+
+    Where the reference has no headings, of their distances, 1 expected; ``lever_sigma_m`` is then where on the robot it measures. None
+    without covariances of both, and where the reference's noise hides the claimed errors of all but five stretches.
+    """
+    if trajectory.covariances is None or reference.covariances is None:
+        return None
+    estimate, part = match(trajectory, reference, max_gap_s)
+    known = trajectory.covariances_at(part.stamps_ns)
+    assert known is not None
+    way = np.append(0.0, np.cumsum(np.abs(se2.between(estimate[:-1], estimate[1:])).sum(axis=1)))
+    for most in _STRETCHES:
+        at = np.unique(np.searchsorted(way, np.linspace(0.0, way[-1], most + 1)).clip(0, len(way) - 1))
+        ends = at[:-1], at[1:]
+        d = se2.between(*(estimate[i] for i in ends))
+        grown = known[at[1:]] - moved_covariances(known[at[:-1]], d)
+        compared = _distances(part, ends, d, grown, lever_sigma_m) if reference.yaws is None else _poses(part, ends, d, grown)
+        if len(compared[0]) >= _MIN_STRETCHES:
+            return consistency(*compared, probability)
+    return None
+
+
+def _poses(part: ReferenceTrack, ends: tuple[IntArray, IntArray], d: FloatArray, grown: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Errors (n, 3) and covariances of motions ``d`` (n, 3) between the ``ends`` whose claimed covariances (n, 3, 3) exceed the noise."""
+    first, last = ends
+    truth = part.poses
+    r = se2.between(truth[first], truth[last])
+    assert part.covariances is not None
+    in_body = covariances_in_body(part.covariances, truth[:, 2])
+    noise = in_body[last] + moved_covariances(in_body[first], r)
+    claimed, of_noise = (np.trace(m[:, :2, :2], axis1=1, axis2=2) for m in (grown, noise))
+    use = is_covariance(grown) & (of_noise <= _MAX_NOISE_SHARE * (claimed + of_noise)) & (claimed > 0.0)
+    return se2.local(d, r)[use], (grown + noise)[use]
+
+
+def _distances(
+    part: ReferenceTrack, ends: tuple[IntArray, IntArray], d: FloatArray, grown: FloatArray, lever_sigma_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (n, 1) and variances (n, 1, 1) of the lengths of motions ``d``, as `_poses` has those of the motions."""
+    first, last = ends
+    assert part.covariances is not None
+    noise = np.trace(part.covariances[:, :2, :2], axis1=1, axis2=2) / 2.0
+    length = np.hypot(d[:, 0], d[:, 1])
+    c, s = np.cos(d[:, 2]), np.sin(d[:, 2])
+    along = d[:, :2] / np.maximum(length, 1e-12)[:, None]
+    in_body = np.stack([c * along[:, 0] + s * along[:, 1], -s * along[:, 0] + c * along[:, 1]], axis=1)  # the error is the end's
+    claimed = np.einsum("ni,nij,nj->n", in_body, grown[:, :2, :2], in_body)
+    of_noise = noise[last] + noise[first] + 2.0 * (1.0 - c) * lever_sigma_m**2
+    use = is_covariance(grown) & (of_noise <= _MAX_NOISE_SHARE * (claimed + of_noise)) & (claimed > 0.0)
+    use &= length**2 > 25.0 * (claimed + of_noise)
+    measured = np.hypot(*(part.positions[last] - part.positions[first]).T)
+    # noise across a displacement makes it longer by sigma^2 / (2 l) in the mean
+    errors = measured - length - of_noise / (2.0 * np.maximum(length, 1e-12))
+    return errors[use, None], (claimed + of_noise)[use, None, None]

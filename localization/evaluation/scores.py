@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from localization.evaluation.consistency import Consistency, pose_consistency, position_consistency
+from localization.evaluation.consistency import Consistency, pose_consistency, position_consistency, stretch_consistency
 from localization.evaluation.metrics import Accuracy, evaluate
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
-from localization.evaluation.stretches import stretch_consistency
 from localization.log_replay import Run
 
 _LEVER_SIGMA_M = 0.3

@@ -17,14 +17,24 @@ from localization.lidar.correlative_search import prior_outlier_cov
 from localization.lidar.registration import OUTLIER_SIGMAS, is_narrow
 from localization.lidar.scan_matcher import MIN_POINTS, OPEN_INFORMATION
 from localization.maps.background_search import BackgroundSearcher, PlanarSearch
-from localization.maps.found_places import FoundPlaces, agree
 from localization.maps.grid import Grid
-from localization.maps.place_probability import LIKELY, NEAR_WEIGHTS, PlaceHypothesis, log_odds, weigh, with_fix
+from localization.maps.place_probability import (
+    FITTING,
+    INDEPENDENT_M,
+    LIKELY,
+    NEAR_WEIGHTS,
+    FoundPlaces,
+    PlaceHypothesis,
+    TrackedPlace,
+    agree,
+    log_odds,
+    weigh,
+    with_fix,
+)
 from localization.maps.place_search import CELL_M, Place, PlaceMap
 from localization.maps.position_plane import PositionFix
 from localization.maps.recent_scans import RecentMotion, RecentScans
 from localization.maps.search_area import SearchArea, around
-from localization.maps.tracked_place import FITTING, INDEPENDENT_M, TrackedPlace
 from localization.maps.uncertain_pose import UncertainPose
 from motion_models import se2
 from motion_models.se2 import Cov3, Points2, Pose2

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from localization.lidar.registration import OUTLIER_SIGMAS
-from localization.maps.found_places import SAME_COV
+from localization.maps.place_probability import SAME_COV
 from localization.maps.position_plane import PositionFix
 from localization.maps.uncertain_pose import UncertainPose
 from motion_models.se2 import Cov3, FloatArray, Pose2

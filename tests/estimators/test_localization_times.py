@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from localization.estimators.localization_times import LocalizationTimes
+from localization.estimators.saved_map_fusion import LocalizationTimes
 
 
 def test_localization_times_add_up_by_state():

@@ -22,9 +22,9 @@ from localization.evaluation.consistency import (
     pose_consistency,
     pose_errors,
     position_consistency,
+    stretch_consistency,
 )
 from localization.evaluation.references import ReferenceTrack, with_noise
-from localization.evaluation.stretches import stretch_consistency
 from localization.trajectory import Trajectory
 from motion_models import se2
 from tests.helpers.extended import cases

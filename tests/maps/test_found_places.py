@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from localization.maps.found_places import FoundPlaces
-from localization.maps.place_probability import PlaceHypothesis
+from localization.maps.place_probability import FoundPlaces, PlaceHypothesis
 
 _PLACES = [PlaceHypothesis(np.array([x, 2.0, 0.5 * math.pi]), 0.4, np.eye(3) * 1e-4) for x in (1.0, 8.0)]
 

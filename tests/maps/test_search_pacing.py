@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from localization.maps.search_pacing import SearchPacing
+from localization.maps.background_search import SearchPacing
 
 
 def searched(pacing: SearchPacing, n: int) -> list[int]:

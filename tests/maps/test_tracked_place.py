@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.maps.place_probability import LIKELY
-from localization.maps.tracked_place import TrackedPlace
+from localization.maps.place_probability import LIKELY, TrackedPlace
 
 _NARROW = np.diag([0.01, 0.01, 0.005]) ** 2
 

@@ -7,7 +7,7 @@ import pytest
 
 from localization.estimators import Estimate
 from localization.events import Step
-from localization.sensor_checks.records import Record, Records
+from localization.sensor_checks.checks import Record, Records
 from motion_models.motion import Motion
 
 AHEAD = np.array([0.05, 0.0, 0.0])
