@@ -129,7 +129,7 @@ def parse_robot(text: str, source: str, folder: Path | None = None) -> Robot:
         if name.endswith("_m") and abs(value) > _LONGEST_M:
             raise RobotError(f"{source}: geometry.{name} is {value:g}; it must be in metres, and at most {_LONGEST_M:g}.")
     driver = _section(Driver, data, "driver", source) if "driver" in data else Driver(geometry.wheel_radius_m, geometry.track_width_m)
-    if min(driver.wheel_radius_m, driver.track_width_m, driver.wheel_separation_multiplier, driver.length_unit_m) <= 0:
+    if min(dataclasses.astuple(driver)) <= 0:
         raise RobotError(f"{source}: every number of [driver] must be positive.")
     mounts = {frame: _build(Mount, table, f"mounts.{frame}", source) for frame, table in _table_of(data, "mounts", source).items()}
     tables = _table_of(data, "models", source)

@@ -40,8 +40,8 @@ _FASTEST_M_S = 3.0
 """Speed of such robots; velocities that mean more are no rad/s."""
 _BACKWARDS = 0.1
 """Part of a wheel's fast rate from where on it goes backwards, in half a second's mean."""
-_NO_ROBOT_M_S = 6.0
-"""Speed that no skid-steer robot has: a Warthog has 5 m/s."""
+_TOO_FAST = 1.5
+"""Speed by the rates of the wheels over the robot's fastest, from where on they have another unit."""
 _SCALE_UNKNOWN_M2_PER_M = 0.2
 """Noise of the distance where its scale is known to 10 % alone: 1 m after 10 m is 0.1 x^2 / x."""
 _MAX_SQUARES = 0.25
@@ -314,18 +314,19 @@ def _is_plausible(signals: WheelSignals, robot: Robot) -> bool:
 
 
 def name_speed(report: UnitReport, signals: WheelSignals) -> UnitReport:
-    """``report`` of a whole log with speeds that no robot has, where no turn and no other sensor shows the unit: named, and in the
-    covariance."""
+    """``report`` of a whole log with speeds that this robot does not have, where no turn and no other sensor shows the unit: named, and in
+    the covariance."""
     if report.ratios:
         return report
     robot, rates = report.robot, np.abs(signals.joint_rates)
     fastest = float(np.nanmax(rates, initial=0.0)) * robot.geometry.wheel_radius_m
-    if fastest <= _NO_ROBOT_M_S:
+    if fastest <= _TOO_FAST * robot.driver.max_speed_m_s:
         return report
     text = (
-        f"by rates and radius the wheels reach {fastest:.3g} m/s, which no such robot does: another unit than rad/s and rad, as revolutions"
-        " per minute (9.55 times too large) or degrees (57.3), or another radius. No turn and no other sensor shows which, nothing is"
-        " corrected, and the covariance is wide. Turn in place, or write joints.rate_unit_rad_s and joints.angle_unit_rad."
+        f"by rates and radius the wheels reach {fastest:.3g} m/s, and the robot drives {robot.driver.max_speed_m_s:g} m/s at most"
+        " (driver.max_speed_m_s): another unit than rad/s and rad, as revolutions per minute (9.55 times too large) or degrees (57.3), or"
+        " another radius. No turn and no other sensor shows which, nothing is corrected, and the covariance is wide. Turn in place, or write"
+        " joints.rate_unit_rad_s and joints.angle_unit_rad."
     )
     noise = replace(robot.wheel_noise, longitudinal_m2_per_m=100.0 * _SCALE_UNKNOWN_M2_PER_M)  # of 100 %, not of 10 %
     return replace(report, robot=replace(robot, wheel_noise=noise), findings=(*report.findings, text))

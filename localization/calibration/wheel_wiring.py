@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.calibration.recorded_clocks import find_recorded_clock
+from localization.calibration.unsigned_speeds import describe_unsigned, may_be_unsigned
 from localization.calibration.wheel_signals import (
     MAX_BIAS_RAD_S,
     MIN_TURN_RAD_S,
@@ -119,11 +120,13 @@ class WiringReport:
     """Entries to write to the robot file, by their key: text of the value in TOML."""
     is_ambiguous: bool = False
     """Wheels and another sensor contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
-    that, and the gyro is not to be used."""
+    that, and the gyro is not to be used unless the wheels alone are in question."""
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Correlation of the wheels' turn and speed with each source, as the robot file has them."""
     ratios: Mapping[str, float] = field(default_factory=dict)
     """Measured over expected motion, by what was compared."""
+    has_lost_signs: bool = False
+    """The wheels' rates are speeds without a sign: they alone are in question."""
 
 
 def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> tuple[Log, WiringReport]:  # noqa: B008
@@ -132,7 +135,8 @@ def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicO
     log = open_log(path, robot, topics)
     found = check_wiring(log)
     if found.findings:
-        log = open_log(path, found.robot, replace(topics, imu="") if found.is_ambiguous else topics)
+        is_gyro_open = found.is_ambiguous and not found.has_lost_signs
+        log = open_log(path, found.robot, replace(topics, imu="") if is_gyro_open else topics)
         log.add_notes(found.findings)
     return log, found
 
@@ -162,6 +166,8 @@ def check_wiring(log: Log, is_clock_known: bool = False) -> WiringReport:
     dead = without_dead(log.robot, signals)
     if dead is not None:
         return _joined(dead, check_wiring(open_log(log.path, dead.robot, log.overrides), is_clock_known))
+    if (unsigned := _without_signs(log, signals)) is not None:
+        return unsigned
     signals, found = _wiring_of(log, signals, is_clock_known)
     # as the corrected robot has them
     if found.keys:
@@ -228,6 +234,8 @@ def check_live(sensors: LiveSensors, signals: WheelSignals, is_clock_known: bool
     is_clock_known = is_clock_known or len(signals.rates) < _MIN_CLOCK_INTERVALS
     if not signals.joints:
         return _odometry_of(sensors, signals, is_clock_known, _USUAL_M_S)
+    if (unsigned := _without_signs(sensors, signals)) is not None:
+        return unsigned
     signals, found = _wiring_of(sensors, signals, is_clock_known)
     if found.findings:
         return found
@@ -302,6 +310,17 @@ def _correlation_shifted(turn: FloatArray, other: FloatArray, shift: int) -> flo
 def _with_unknown_signs(robot: Robot) -> Robot:
     noise = replace(robot.wheel_noise, yaw_rad2_per_rad=_UNKNOWN_YAW_RAD2_PER_RAD, longitudinal_m2_per_m=_UNKNOWN_WAY_M2_PER_M)
     return replace(robot, wheel_noise=noise)
+
+
+def _without_signs(log: Log | LiveSensors, signals: WheelSignals) -> WiringReport | None:
+    """Wheels that publish speeds without a sign, by gyro and LiDAR; None for others."""
+    if not may_be_unsigned(signals):
+        return None
+    text = describe_unsigned(signals, log.robot) or describe_unsigned(with_lidar(log, signals), log.robot)
+    if not text:
+        return None
+    wheels = " and ".join(source.topic for source in log.sources.all_wheels)
+    return WiringReport(_with_unknown_signs(log.robot), (f"{wheels}: {text}",), is_ambiguous=True, has_lost_signs=True)
 
 
 def _wiring_of(log: Log | LiveSensors, signals: WheelSignals, is_clock_known: bool) -> tuple[WheelSignals, WiringReport]:

@@ -50,7 +50,7 @@ def cloud_decoder(period_s: float | None) -> Callable[[Any, int], Scan]:
         offsets: FloatArray = np.empty(0)
         time_fields = [name for name in table.dtype.names or () if name not in ("x", "y", "z")]
         if time_fields:
-            times = convert(table[time_fields[0]].ravel(), good, stamp, points)
+            times = convert(table[time_fields[0]], good, stamp, points)
             if np.isfinite(times[good]).any():
                 good &= np.isfinite(times)
                 offsets = times[good]
@@ -95,6 +95,30 @@ def _table(message: Any) -> Any:
     return np.ndarray((height, width), dtype=dtype, buffer=data.data, strides=(row_step, step))
 
 
+def _without_wraps(times: Any, longest_s: float) -> Any:
+    """``times`` (height, width) of a counter of 16 or 32 bits that wraps within a scan of up to ``longest_s`` [s], continued beyond its
+    range; others as they are.
+
+    32 bits of nanoseconds wrap each 4.3 s, at most once in a sweep. 16 bits of microseconds do so within one: its rows are in order of
+    time where no step but the wraps is larger than a quarter of the range.
+    """
+    kind = times.dtype
+    if not np.issubdtype(kind, np.integer) or kind.itemsize not in (2, 4) or not times.size:
+        return times
+    span, whole = 2 ** (8 * kind.itemsize), times.astype(np.int64)
+    if np.ptp(whole) <= span // 2:
+        return times
+    if kind.itemsize == 4:
+        middle = 0 if np.issubdtype(kind, np.signedinteger) else span // 2
+        moved = np.where(whole < middle, whole + span, whole)
+        return moved if float(np.ptp(moved)) * 1e-9 <= longest_s else times
+    steps = np.diff(whole, axis=1)
+    wraps = np.where(steps < -span // 2, span, 0) - np.where(steps > span // 2, span, 0)
+    if not wraps.any() or np.abs(steps + wraps).max() > span // 4:
+        return times
+    return whole + np.hstack([np.zeros((len(whole), 1), dtype=np.int64), np.cumsum(wraps, axis=1)])
+
+
 class _PointTimes:
     """Times of the points of one topic to seconds after the header's stamp."""
 
@@ -106,8 +130,10 @@ class _PointTimes:
         """Where the field is an azimuth; 0 where it is none, None before the first cloud."""
 
     def __call__(self, times: Any, good: Any, stamp: int, points: FloatArray) -> FloatArray:
-        """Seconds after ``stamp`` [ns] of each of ``times`` (N,), of which ``good`` (N,) belong to ``points`` (N, 3); NaN where it has
-        none."""
+        """Seconds (N,) after ``stamp`` [ns] of ``times`` (height, width), of which ``good`` (N,) belong to ``points`` (N, 3); NaN where
+        there is none."""
+        longest = MAX_PERIODS * self._period_s
+        times = _without_wraps(times, longest).ravel()
         is_whole = np.issubdtype(times.dtype, np.integer)
         values = times.astype(np.int64 if is_whole else float)
         known = values[good] if is_whole else values[good & np.isfinite(values)]
@@ -117,7 +143,7 @@ class _PointTimes:
             self._angle_unit_rad = _angle_unit(values[good], points[good])
         if self._angle_unit_rad:
             return np.asarray(values * (self._angle_unit_rad / math.tau * self._period_s), dtype=float)
-        first, spread, longest = known.min(), float(np.ptp(known)), MAX_PERIODS * self._period_s
+        first, spread = known.min(), float(np.ptp(known))
         start_s = max(_MAX_START_OFFSET_S, longest)
         for unit_ns in _UNITS_NS:
             begin = float(first) * unit_ns * 1e-9

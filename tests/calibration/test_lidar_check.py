@@ -57,6 +57,23 @@ def test_lidar_yaw_of_180_deg_is_named_and_corrected() -> None:
     assert all("times of their points" in warning for warning in run.warnings)
 
 
+@pytest.mark.parametrize("shift", cases([0.45, -0.45, 0.1], ("0.45", "0.1")))
+def test_lidar_that_is_elsewhere_along_the_robot_is_found_in_turns(tmp_path: Path, shift: float) -> None:
+    """Up to half the wheelbase of 0.4 m it may be the point about which the robot turns."""
+    vehicle = Vehicle(scan_hz=8.0, seed=21)
+    log = open_log(write(tmp_path / "log.mcap", vehicle, drive(vehicle), Publishing(lidar_ahead_m=0.15)), vehicle.robot())
+    right = log.mounts["laser"]
+    log.__dict__["mounts"] = {**log.mounts, "laser": dataclasses.replace(right, x=right.x + shift)}
+    found = check_lidar(log)
+    if abs(shift) < 0.2:
+        assert found is None
+        return
+    assert found is not None
+    assert found.mount is not None
+    assert found.mount.x == pytest.approx(right.x, abs=0.02)
+    assert f"{abs(shift):.2f} m {'behind' if shift > 0.0 else 'ahead of'} the mount of 'laser'" in found.text
+
+
 @pytest.mark.parametrize("degrees", cases([90.0, -90.0, 45.0, 30.0, 178.0], ("178.0",)))
 def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
     found = check_lidar(turned(opened(), degrees))

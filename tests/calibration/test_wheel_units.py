@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from localization.calibration.unsigned_speeds import describe_unsigned
 from localization.calibration.wheel_signals import WheelSignals
 from localization.calibration.wheel_units import check_length_unit, check_units, name_speed, without_outliers
 from localization.calibration.wheel_wiring import WiringReport, check_wiring, open_checked
@@ -92,6 +93,45 @@ def test_units_of_velocities_without_a_sign_are_named(tmp_path: Path) -> None:
     report = report_of(drive(tmp_path / "log.mcap", lambda position, velocity: (position, np.abs(velocity))))
     assert any("velocities of the wheels have no sign" in text for text in report.findings)
     assert not any("no sign" in text for text in report_of(drive(tmp_path / "healthy.mcap", scaled(1.0, 1.0))).findings)
+
+
+def test_speeds_without_a_sign_or_angles_are_named_and_leave_the_gyro_in_use(tmp_path: Path) -> None:
+    log, report = open_checked(drive(tmp_path / "log.mcap", lambda position, velocity: (NOTHING, np.abs(velocity))), ROBOT)
+    assert "speeds without a sign" in report.findings[0]
+    assert "turns in place by the gyro" in report.findings[0]
+    assert log.sources.imu is not None
+    assert report.robot.wheel_noise.longitudinal_m2_per_m > 1.0
+
+
+def test_speeds_without_a_sign_that_a_lidar_sees_go_back_are_named() -> None:
+    """Straight on and back, at one speed of all wheels."""
+    n = 60
+    speed = np.repeat([0.5, -0.5], n // 2)
+    rates = np.outer(np.abs(speed), np.ones(4)) / RADIUS
+    signals = WheelSignals(tuple("abcd"), 2, rates, np.full((n, 4), np.nan), {"LiDAR": np.zeros(n)}, {"LiDAR": speed})
+    assert "goes backwards by the LiDAR" in describe_unsigned(signals, ROBOT)
+    assert describe_unsigned(replace(signals, speeds={"LiDAR": np.abs(speed)}), ROBOT) == ""
+    assert describe_unsigned(replace(signals, rates=np.outer(speed, np.ones(4)) / RADIUS), ROBOT) == ""
+
+
+@pytest.mark.parametrize("left", [0.0, 0.5, 1.0])
+def test_wheels_that_only_go_ahead_are_no_speeds_without_a_sign(left: float) -> None:
+    """Arcs, and a turn about the left wheels."""
+    n = 60
+    rates = np.column_stack([np.full((n, 2), 3.0 * left), np.full((n, 2), 3.0)])
+    turn = 0.5 * RADIUS / ROBOT.geometry.track_width_m * 3.0 * (1.0 - left) * np.ones(n)
+    signals = WheelSignals(tuple("abcd"), 2, rates, np.full((n, 4), np.nan), {"gyro": turn}, {})
+    assert describe_unsigned(signals, ROBOT) == ""
+
+
+def test_wheels_faster_than_their_robot_are_named() -> None:
+    """Revolutions per minute of a slow drive are a usual speed, but not this robot's."""
+    n = 60
+    rates = np.full((n, 4), 0.24 / RADIUS * 60.0 / math.tau)
+    signals = WheelSignals(tuple("abcd"), 2, rates, np.full((n, 4), np.nan), {"gyro": np.zeros(n)}, {})
+    slow = replace(ROBOT, driver=replace(ROBOT.driver, max_speed_m_s=1.0))
+    assert "1 m/s at most (driver.max_speed_m_s)" in name_speed(check_units(signals, slow), signals).findings[0]
+    assert name_speed(check_units(signals, ROBOT), signals).findings == ()
 
 
 @pytest.mark.parametrize(("unit", "is_named"), [(1.0, False), (math.tau / 60.0, True), (DEG, True)])

@@ -202,6 +202,20 @@ def test_cloud_times_units_follow_the_scan_period(tmp_path: Path, hz: int, unit:
         np.testing.assert_allclose(scan.offsets, times, rtol=1e-9)
 
 
+@pytest.mark.parametrize(("kind", "unit_s", "first"), [("<u2", 1e-6, 50_000), ("<i2", 1e-6, 0), ("<u4", 1e-9, 2**32 - 40_000_000)])
+@pytest.mark.parametrize("shape", [(1, 200), (3, 200)])
+def test_cloud_times_of_a_counter_that_wraps_go_on(tmp_path: Path, kind: str, unit_s: float, first: int, shape: tuple[int, int]) -> None:
+    """65 ms of microseconds in 16 bits, or 4.3 s of nanoseconds in 32, within a sweep of 0.1 s."""
+    part = np.linspace(0.0, 0.099, shape[1])
+    cells = np.zeros(shape, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", kind)])
+    cells["x"], cells["y"] = 2.0, 1.0
+    counts = (first + np.round(part / unit_s).astype(np.int64)) % 2 ** (8 * cells["t"].dtype.itemsize)
+    cells["t"] = counts.astype(kind.replace("i", "u")).view(kind)
+    scans, _ = scans_of(tmp_path, [bags.cloud(START + i * S // 10, cells) for i in range(4)], "/points")
+    wanted = np.tile(part, shape[0])
+    np.testing.assert_allclose(scans[0].offsets - scans[0].offsets.min(), wanted, atol=2e-6)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.05, START * 1e-9])
 def test_cloud_times_all_equal_are_no_times(tmp_path: Path, value: float) -> None:
     rows = [(*row, value) for row in ROWS]

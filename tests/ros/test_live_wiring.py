@@ -39,6 +39,7 @@ WRONG = {
     "swapped": (lambda a, r: (a[[2, 3, 0, 1]], r[[2, 3, 0, 1]]), 1.0, "left and right wheels are swapped, or the gyro's sign"),
     "rpm": (lambda a, r: (np.zeros(0), 9.5493 * r), 1.0, "joints.rate_unit_rad_s = 0.10472"),
     "degrees": (lambda a, r: (57.2958 * a, 57.2958 * r), 1.0, "joints.angle_unit_rad = 0.0174533"),
+    "speeds without a sign": (lambda a, r: (np.zeros(0), np.abs(r)), 1.0, "speeds without a sign"),
     "gyro in deg/s": (unchanged, 57.2958, "imu.rate_unit_rad_s = 0.0174533"),
 }
 
