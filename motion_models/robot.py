@@ -85,8 +85,8 @@ class Driver:
     length_unit_m: float = 1.0
     """Metres per unit of the positions and speeds that it publishes: 0.001 for millimetres, 0.277778 for a speed in km/h."""
     max_speed_m_s: float = 4.0
-    """Fastest speed that the robot drives [m/s], as its controller's linear.x.max_velocity: rates of the wheels that are 1.5 times as fast have
-    another unit."""
+    """Fastest speed that the robot drives [m/s], as its controller's linear.x.max_velocity: rates of the wheels that are 1.5 times as fast
+    have another unit."""
 
 
 @dataclass(frozen=True)

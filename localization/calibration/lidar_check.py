@@ -45,16 +45,16 @@ _STRAIGHT_RAD_M, _STRAIGHT_WAY_M, _CERTAIN_WAY_M, _MIN_STRAIGHT = 0.2, 3.0, 10.0
 """Largest curvature of straight driving, its least way and intervals, and the way [m] after which a yaw is certain. A centre of
 rotation 0.1 m off turns the direction by 1 degree there."""
 _FAR_RAD, _MIN_NEAR = math.radians(10.0), 0.8
-"""Direction of an interval's travel against the usual one, from where on its scans were matched to the wrong place, as along a corridor, and
-the least share of the others."""
+"""Direction of an interval's travel against the usual one, from where on its scans were matched to the wrong place, as along a corridor,
+and the least share of the others."""
 _HEALTHY_RAD, _MIN_YAW_RAD, _MAX_YAW_SIGMA_RAD = math.radians(3.5), math.radians(5.0), math.radians(1.0)
 """Direction of travel that is healthy, the least in straight driving that is a wrong yaw, and its largest standard error. After 3 m, it is
 2.8 degrees at most in 17 parts of three buildings and on 25 simulated drives."""
 _YAW_SIGMA_RAD = math.radians(1.5)
-"""Standard error of a yaw that is named: of 6 to 18 degrees, 24 simulated drives on a floor that shears have 0.6 left (root mean square;
-`tests.studies.lidar_mounts`), and ten parts of fr079, MIT-CSAIL and ACES 1.2, at most 2.2."""
+"""Standard error of a yaw that is named: of 6 to 18 degrees, 24 simulated drives on a floor that shears have 0.6 left (root mean
+square; `tests.studies.lidar_mounts`), and ten parts of fr079, MIT-CSAIL and ACES 1.2, at most 2.2."""
 _MAX_WAY_CHANGE = 0.08
-"""Largest logarithm of the way by scans over that by wheels in straight driving, for its direction to be a yaw: -0.05 to 0.03 in healthy
+"""Largest logarithm of the way by scans over that by wheels, for a yaw or a shift of its mount to be one: -0.05 to 0.03 in healthy
 parts of fr079 and MIT-CSAIL and on 25 simulated drives. Beams on the robot, 30 % of all, turn the direction by 11 degrees; the logarithm
 is -0.14."""
 _MAX_LATE_M, _MAX_SLIP = 0.08, 0.15
@@ -73,8 +73,8 @@ _SHARP_TURN_RAD, _MIN_SHARP, _SHIFT_TURN_RAD, _MAX_SHIFT_SIGMA_M = 0.05, 4, 1.0,
 """Turn of an interval in which sideways motion shows where the LiDAR is, the least number of these and their turns in all, and the largest
 standard error of that place [m]."""
 _MIN_SHIFT_M, _BEYOND_AXLES_M = 0.15, 0.03
-"""Least distance of a LiDAR from its mount that is named, and how far beyond its axles a robot may seem to turn [m]: the contacts of its wheels
-lie within them, and so does the point about which it turns."""
+"""Least distance of a LiDAR from its mount that is named, and how far beyond its axles a robot may seem to turn [m]: the contacts of its
+wheels lie within them, and so does the point about which it turns."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class LidarCheck:
     def _is_healthy(self, frame: str) -> bool:
         direction = _direction(*self._compare(frame)[:2])
         is_known = self._is_clock_known or (self._wheels_late_s(frame) if self._gyro is None else self._by_turns(frame)) is not None
-        if direction is None or not is_known or abs(direction) > _MAX_SLIDE_RAD or self._shift(frame) is not None:
+        if direction is None or not is_known or abs(direction) > _MAX_SLIDE_RAD or self._shift(frame, direction) is not None:
             return False
         return abs(direction) <= _HEALTHY_RAD or abs(self._straight(frame) or math.pi) <= _HEALTHY_RAD
 
@@ -201,11 +201,11 @@ class LidarCheck:
         weight = np.abs(product) / np.abs(product).sum()
         apart = np.angle(product * np.exp(-1j * mean))
         sigma = math.sqrt(float(np.sum((weight * apart) ** 2)))
-        longer = math.log(float(np.abs(by_scans).sum() / np.abs(by_wheels).sum()))
-        return mean if sigma < _MAX_YAW_SIGMA_RAD and abs(longer) < _MAX_WAY_CHANGE else None
+        return mean if sigma < _MAX_YAW_SIGMA_RAD and _is_equally_long(by_wheels, by_scans) else None
 
-    def _shift(self, frame: str) -> tuple[float, float] | None:
-        """How far ahead of its mount the LiDAR is, by its sideways motion in turns, and the standard error [m]; None where it may be there.
+    def _shift(self, frame: str, direction: float) -> float | None:
+        """How far ahead of its mount the LiDAR is, by its sideways motion in turns against the ``direction`` of its travel [m]; None where
+        it may be there.
 
         A sensor s ahead of where it is taken to be moves sideways by 2 s tan(a / 2) as the robot turns by a, beside the chord of the arc.
         """
@@ -213,28 +213,28 @@ class LidarCheck:
         moves = moves[np.isfinite(moves).all(axis=1) & (np.abs(moves[:, 2]) > _SHARP_TURN_RAD)]
         if len(moves) < _MIN_SHARP or float(np.abs(moves[:, 2]).sum()) < _SHIFT_TURN_RAD:
             return None
-        half = np.tan(0.5 * moves[:, 2])
-        side, arm = moves[:, 1] - moves[:, 0] * half, 2.0 * half
+        half, ways = np.tan(0.5 * moves[:, 2]), (moves[:, 0] + 1j * moves[:, 1]) * np.exp(-1j * direction)
+        side, arm = ways.imag - ways.real * half, 2.0 * half
         squares = float(arm @ arm)
         shift = float(arm @ side) / squares
         sigma = math.sqrt(float(np.sum((arm * (side - shift * arm)) ** 2))) / squares
         turns_about_m = float(self._robot.models.get("skid_steer", {}).get("x_cr_0", 0.0))
         ahead, most = shift + turns_about_m, max(_MIN_SHIFT_M, 0.5 * self._robot.geometry.wheelbase_m + _BEYOND_AXLES_M)
-        return (ahead, sigma) if abs(ahead) > most and sigma < _MAX_SHIFT_SIGMA_M else None
+        is_sure = sigma < _MAX_SHIFT_SIGMA_M and _is_equally_long(*self._compare(frame)[:2])
+        return ahead if abs(ahead) > most and is_sure else None
 
-    def _shifted(self, frame: str) -> LidarFinding | None:
+    def _shifted(self, frame: str, direction: float) -> LidarFinding | None:
         """A LiDAR that is elsewhere along the robot; None where it is where its mount has it."""
-        found = self._shift(frame)
-        if found is None:
+        ahead, mount = self._shift(frame, direction), self._mounts[frame]
+        if ahead is None:
             return None
-        (ahead, _), mount = found, self._mounts[frame]
         right, error_m = round(mount.x + ahead, 3), 0.25 * self._robot.geometry.wheelbase_m
         text = (
-            f"{self._topic}: in turns it moves sideways as a sensor does that is {abs(ahead):.2f} m {'ahead of' if ahead > 0.0 else 'behind'}"
-            f" the mount of '{frame}', farther than from any point between the axles, about which robots turn: its x is wrong, or the middle"
-            f" of the wheels is not where the body's frame is. Corrected in this run; write x = {right:g} m (+- {error_m:.2f}, as the point"
-            " about which it turns is not known) in /tf_static, or in"
-            f" [mounts.{frame}] where the log has none."
+            f"{self._topic}: in turns it moves sideways as a sensor does that is {abs(ahead):.2f} m"
+            f" {'ahead of' if ahead > 0.0 else 'behind'} the mount of '{frame}', farther than from any point between the axles, about which"
+            f" robots turn: its x is wrong, or the middle of the wheels is not where the body's frame is. Corrected in this run; write x ="
+            f" {right:g} m (+- {error_m:.2f}, as the point about which it turns is not known) in /tf_static, or in [mounts.{frame}] where"
+            " the log has none."
         )
         return LidarFinding(text, frame, replace(mount, x=right), is_certain=True)
 
@@ -314,7 +314,7 @@ class LidarCheck:
         if direction is None:
             direction = straight
         if direction is not None and abs(direction) <= _MAX_SLIDE_RAD and (straight is None or abs(straight) < _MIN_YAW_RAD):
-            return self._shifted(frame)
+            return self._shifted(frame, direction)
         if direction is None:
             return None
         if (turned_rad := _largest_change(*_without_far(by_wheels, by_scans))) > _MAX_SLIDE_RAD:
@@ -454,6 +454,11 @@ def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
     if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < _MIN_COHERENCE * size:
         return None
     return float(np.angle(product.sum()))
+
+
+def _is_equally_long(by_wheels: FloatArray, by_scans: FloatArray) -> bool:
+    """Whether the ways (n,) by wheels and scans have nearly one length, so that the scans are of surfaces that stand still."""
+    return abs(math.log(float(np.abs(by_scans).sum() / np.abs(by_wheels).sum()))) < _MAX_WAY_CHANGE
 
 
 def _without_far(by_wheels: FloatArray, by_scans: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ sign is lost. It cannot be had from the same message, and without one nothing ca
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.calibration.wheel_signals import WheelSignals
 from localization.calibration.wheel_units import MAX_RATIO, expected_scaling
@@ -55,7 +56,7 @@ def describe_unsigned(signals: WheelSignals, robot: Robot) -> str:
     )
 
 
-def _turns_in_place(signals: WheelSignals, robot: Robot, source: str, both: FloatArray, is_equal: FloatArray) -> bool:
+def _turns_in_place(signals: WheelSignals, robot: Robot, source: str, both: FloatArray, is_equal: NDArray[np.bool_]) -> bool:
     """Whether the robot turns by ``source`` as sides that go opposite ways turn it, while both have one speed, and else not."""
     turn = signals.turns.get(source)
     if turn is None:
@@ -67,7 +68,7 @@ def _turns_in_place(signals: WheelSignals, robot: Robot, source: str, both: Floa
     return int(is_opposite.sum()) >= _MIN_INTERVALS
 
 
-def _goes_back(speed: FloatArray, by_wheels: FloatArray, is_moving: FloatArray) -> bool:
+def _goes_back(speed: FloatArray, by_wheels: FloatArray, is_moving: NDArray[np.bool_]) -> bool:
     """Whether the LiDAR's ``speed`` is the wheels' in some intervals, and the opposite in others."""
     with np.errstate(invalid="ignore"):
         ways = [is_moving & (np.abs(speed - sign * by_wheels) < 0.5 * by_wheels) for sign in (1.0, -1.0)]

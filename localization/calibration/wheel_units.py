@@ -324,9 +324,9 @@ def name_speed(report: UnitReport, signals: WheelSignals) -> UnitReport:
         return report
     text = (
         f"by rates and radius the wheels reach {fastest:.3g} m/s, and the robot drives {robot.driver.max_speed_m_s:g} m/s at most"
-        " (driver.max_speed_m_s): another unit than rad/s and rad, as revolutions per minute (9.55 times too large) or degrees (57.3), or"
-        " another radius. No turn and no other sensor shows which, nothing is corrected, and the covariance is wide. Turn in place, or write"
-        " joints.rate_unit_rad_s and joints.angle_unit_rad."
+        " (driver.max_speed_m_s): another unit than rad/s and rad, as revolutions per minute (9.55 times too large) or degrees (57.3),"
+        " or another radius. No turn and no other sensor shows which, nothing is corrected, and the covariance is wide. Turn in place,"
+        " or write joints.rate_unit_rad_s and joints.angle_unit_rad."
     )
     noise = replace(robot.wheel_noise, longitudinal_m2_per_m=100.0 * _SCALE_UNKNOWN_M2_PER_M)  # of 100 %, not of 10 %
     return replace(report, robot=replace(robot, wheel_noise=noise), findings=(*report.findings, text))

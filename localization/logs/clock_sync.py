@@ -448,6 +448,13 @@ def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterat
     yield from merger.flush()
 
 
+def moved_back(item: Item, by_ns: int) -> Item:
+    """``item`` recorded and stamped earlier by ``by_ns`` [ns]; one without a stamp has none after it."""
+    if not by_ns:
+        return item
+    return _restamped(item._replace(log_ns=item.log_ns - by_ns), item.stamp_ns - by_ns if item.stamp_ns else 0)
+
+
 def _restamped(item: Item, stamp_ns: int) -> Item:
     if stamp_ns == item.stamp_ns:
         return item

@@ -366,7 +366,8 @@ class Node:
         self._checks.end(self._report)
         wiring, lidar = entrance.wiring, entrance.lidar
         if wiring is not None:
-            self.inputs.rewire(self._keep_wiring(LiveRobot(wiring.robot, wiring.has_lost_signs or not wiring.is_ambiguous)), self.session.pipeline.mounts)
+            uses_gyro = wiring.has_lost_signs or not wiring.is_ambiguous
+            self.inputs.rewire(self._keep_wiring(LiveRobot(wiring.robot, uses_gyro)), self.session.pipeline.mounts)
             self._begin_anew(self.session.pipeline.mounts)
             is_clock_known = any(key.startswith("clock.") for key in wiring.keys)
             self._checks.begin(  # what comes next: units after signs, the LiDAR after both

@@ -1,8 +1,8 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [mixed | forum | closing | threads | last | other | more | hostile | KIND | part of a NAME]
-[-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone and of
-the EKF, with those of the same drive with nothing wrong in brackets.
+`python -m tests.studies.entrance_commands [symptoms | mixed | forum | closing | threads | last | other | more | hostile | KIND | part of
+a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone
+and of the EKF, with those of the same drive with nothing wrong in brackets.
 """
 
 from __future__ import annotations
@@ -253,6 +253,7 @@ def main(arguments: Sequence[str]) -> None:
     from tests.studies.entrance_mixed_cases import MIXED
     from tests.studies.entrance_more_cases import MORE
     from tests.studies.entrance_other_cases import OTHER
+    from tests.studies.entrance_symptom_cases import SYMPTOMS
     from tests.studies.entrance_thread_cases import THREADS
 
     wanted = [a for a in arguments if not a.startswith("-")]
@@ -265,11 +266,12 @@ def main(arguments: Sequence[str]) -> None:
         "closing": CLOSING,
         "forum": FORUM,
         "mixed": MIXED,
+        "symptoms": SYMPTOMS,
     }
     found = []
     for case in (
         c
-        for c in (*MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
+        for c in (*SYMPTOMS, *MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
         if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:

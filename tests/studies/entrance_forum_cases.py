@@ -309,7 +309,6 @@ CLOCKS = (
         LEO_LAPS,
         clock_set_forward(40.0, 600.0),
         ["clock was set forward"],
-        is_open=True,
     ),
 )
 

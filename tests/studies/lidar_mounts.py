@@ -1,9 +1,8 @@
 """How often a healthy LiDAR is taken for a turned or shifted one, and how well a wrong mount is measured, on simulated robots.
 
-`python -m tests.studies.lidar_mounts [--drives 24] [--seed 700]` drives each robot of `ROBOTS` in turn for 75 s, with a centre of gravity off
-the middle and a floor that shears sideways in curves, three times: with the LiDAR as its transform has it, turned by 6 to 18 degrees, and
-shifted along the robot by .25 to .5 m (to where it is still on the robot or near it). No limit of `calibration.lidar_check` was chosen on
-these drives.
+`python -m tests.studies.lidar_mounts [--drives 24] [--seed 700]` drives each robot of `ROBOTS` in turn for 75 s, with a centre of gravity
+off the middle and a floor that shears sideways in curves, three times: with the LiDAR as its transform has it, turned by 6 to 18 degrees,
+and shifted along the robot by .25 to .5 m. No limit of a yaw was chosen on these drives.
 """
 
 from __future__ import annotations
