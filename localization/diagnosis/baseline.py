@@ -12,11 +12,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import with_sizes
 from localization.diagnosis.causes.floor import slip_stiffness_cause, stiffness_exponent_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import Baseline, DrivePredictor
-from localization.diagnosis.linearization import candidate_causes, make_predictor
+from localization.diagnosis.linearization import candidate_causes, make_predictor, setting_of
 from localization.diagnosis.noise import Noise
 from localization.diagnosis.weigh import PRIOR_SIGMAS, estimate_map
 from motion_models.base import MotionModel
@@ -29,10 +30,9 @@ _SLIPS: Mapping[str, float] = {
     "rotation_slip_speed": 0.1,
     "longitudinal_slip_turning": 0.1,
     "rotation_scale": 0.5,
-    "cg_height": 0.1,
 }
-"""Sigma of slips that grow with speed, and of the height of the CG: their typical sizes, in their units; and of rotations that no friction
-model predicts. Another grip than the file's slides sideways in curves, as the first slip does."""
+"""Sigma of slips that grow with speed: their typical sizes, in their units; and of rotations that no friction model predicts. Another grip
+than the file's slides sideways in curves, as the first one does."""
 _CG_SIGMA_M = 0.01
 """Sigma of the centre of gravity by robot files [m], with batteries and cables that these do not have."""
 _PASSING = frozenset({"gyro_bias", "slope"})
@@ -51,6 +51,8 @@ def estimate_baseline(drive: Drive, model: MotionModel) -> Baseline:
     sigmas = {**PRIOR_SIGMAS, **_SLIPS, "cg_offset_x": _CG_SIGMA_M, "cg_offset_y": _CG_SIGMA_M}
     causes = [dataclasses.replace(c, prior_sigma=sigmas[c.id]) for c in candidate_causes(predictor, moments=0) if c.id in sigmas]
     if model.name == FrictionModel.name:
+        height = CAUSES["cg_height"]
+        causes += [dataclasses.replace(c, prior_sigma=c.typical) for c in height.variants(height, setting_of(predictor))]
         causes += [slip_stiffness_cause(drive.robot), stiffness_exponent_cause()]
     found = estimate_map(predictor, tuple(causes))
     lasting = with_sizes({c: float(v) for c, v in zip(found.causes, found.sizes, strict=True) if c.id not in _PASSING})

@@ -263,6 +263,7 @@ def setting_of(predictor: DrivePredictor, moments: int = 0) -> Setting:
         is_on_slope=find_floor_slope(predictor) is not None,
         is_friction_model=predictor.model.name == FrictionModel.name,
         change_times_s=tuple(float(drive.starts_s[-1]) * q for q in np.linspace(0.2, 0.8, moments)) if is_long else (),
+        has_baseline=predictor.has_baseline,
     )
 
 

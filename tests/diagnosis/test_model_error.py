@@ -37,15 +37,15 @@ def test_diagnose_contacts_that_creep_by_rate_are_no_cause() -> None:
 
 
 def test_diagnose_grip_beside_a_healthy_drive_has_the_error_of_the_response() -> None:
-    """A healthy drive does not show how contacts respond: in MuJoCo the centre of rotation moves by 4 to 18 % less than by the model."""
+    """A healthy drive does not show how contacts respond: laws and stiffnesses that were measured on robots differ by 8.5 % in that."""
     drive, split = law_drive("husky_a200"), 0.3
     model = make_model("friction", drive.robot)
     hypothesis = CAUSES["split_friction"].inject(Hypothesis(), split)
     moved = measured_under(drive, model, hypothesis, np.random.default_rng(4), has_inertia=True)
     first, beside = (diagnose(moved, model, baseline=baseline).findings[0] for baseline in (None, Baseline(windows=20.0)))
     assert first.cause == beside.cause == "split_friction"
-    assert first.sigma < 0.1 * split
-    assert 0.1 * split < beside.sigma < 0.2 * split
+    assert first.sigma < 0.05 * split
+    assert beside.sigma == pytest.approx(math.hypot(first.sigma, 0.085 * split), rel=0.2)
 
 
 def test_predictor_about_stiff_contacts_predicts_as_they_move_and_writes_none_of_them() -> None:

@@ -158,6 +158,8 @@ class Setting:
     """The diagnosed model has the floor's friction as its parameters."""
     change_times_s: tuple[float, ...] = ()
     """When a change of the floor is tried [s]."""
+    has_baseline: bool = False
+    """A healthy drive shows how the robot differs from its file."""
 
     @property
     def is_timed(self) -> bool:
