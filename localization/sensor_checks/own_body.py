@@ -72,7 +72,7 @@ class _Lidar:
     way_m: float
     """Way of the robot at the LiDAR's last scan."""
     bearings: FloatArray = field(default_factory=lambda: np.full((_BEARINGS, 5), np.nan))
-    """As `_find_own` has them."""
+    """(360, 5) nearest surface at each bearing, in the columns of `_find_own`."""
     seen_through: FloatArray = field(default_factory=lambda: np.zeros(_BEARINGS))
     """By bearing: scans that show that the surface there is not part of the world."""
     views: deque[_View] = field(default_factory=lambda: deque(maxlen=_MAX_VIEWS))
