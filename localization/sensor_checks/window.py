@@ -117,6 +117,8 @@ class Window:
         turn_alone = np.array([np.nan, np.nan, motion.delta[2]])
         if self.is_scene_moving:
             return turn_alone, _UNKNOWN
+        if not motion.has_translation and not scan.is_planar:  # a few trees on hills: what is below them is no wall
+            return turn_alone, _UNKNOWN
         across = np.array([motion.delta[:2] @ motion.normal, *motion.normal])
         return motion.delta if motion.has_translation else turn_alone, across
 

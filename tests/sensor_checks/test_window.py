@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,18 @@ def test_window_bin_without_gyro_or_wheels_has_unknown_rates() -> None:
     for k in range(6):
         window.add(step(k, has_gyro=k != 1, has_wheels=k != 4), (k + 1) * STEP_S)
     np.testing.assert_allclose((window.bins.rows[:, 3:5].T / window.bins.durations_s), [[0.2, np.nan], [np.nan, 0.3]])
+
+
+@pytest.mark.parametrize("is_planar", [True, False])
+def test_window_takes_ways_across_walls_alone_from_planar_scans_only(is_planar: bool) -> None:
+    """In a corridor. What stands about on open ground may look like one in the projection of a cloud, as the robot tilts."""
+    window, x = Window({}, LidarConfig()), np.arange(-20.0, 20.0, 0.05)
+    walls = np.vstack([np.column_stack([x, np.full(len(x), side), np.zeros(len(x))]) for side in (-4.1, 4.1)])
+    points = walls if is_planar else np.vstack([walls + np.array([0.0, 0.0, z]) for z in np.arange(-0.6, 0.7, 0.1)])
+    for k in range(35):
+        scan = Scan(k * S // 10, points, np.zeros(0 if is_planar else len(points)), is_planar=is_planar)
+        window.add(replace(step(k), scan=scan if k % 5 == 0 else None), (k + 1) * STEP_S)
+    assert np.isfinite(window.bins.lidar[1:, 2]).all()  # turns
+    assert np.isnan(window.bins.lidar[:, :2]).all()
+    assert np.isfinite(window.bins.across[1:]).all() == is_planar
+    assert np.isnan(window.bins.across).all() != is_planar
