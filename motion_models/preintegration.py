@@ -52,7 +52,7 @@ def integrate_twists(dt: FloatArray, twist: Twist, noise: FloatArray) -> Motion:
     by = np.concatenate([twist.d_params, twist.d_cg], axis=-1)
     delta, cov, d = np.zeros(3), np.zeros((3, 3)), np.zeros((3, by.shape[-1]))
     integrate(np.ascontiguousarray(dt), twist.value, by, noise, delta, cov, d)
-    return Motion(delta, cov, d[:, :k], d[:, k:])
+    return Motion(delta, cov, d[:, :k].copy(), d[:, k:].copy())
 
 
 @kernel

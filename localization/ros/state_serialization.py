@@ -1,8 +1,8 @@
 """Objects as numbers and names: what a state holds, without pickle, so that a foreign file can only be refused and never run code.
 
 Understood are plain values, numpy arrays and numbers, the usual containers, and objects of this project's own classes, which are made
-without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays keep their
-layout in memory, and a view of another array stays one: linear algebra rounds by layout, and results are to be the same to the last bit.
+without calling them (``__setstate__`` where a class has one). What is held twice is written once and held twice again. Arrays are
+contiguous, by rows or by columns as they were: linear algebra rounds by layout, and results are to be the same to the last bit.
 
 Long lists and deques of numbers, and of frozen dataclasses or named tuples of numbers and arrays, are written as columns: hours of them
 must not take longer than a scan. Objects that the entries of such a list share become one copy for each entry; as none is ever changed,
@@ -156,12 +156,6 @@ class _Writer:
     def _ndarray(self, value: NDArray[Any]) -> Json:
         if value.dtype.kind not in KINDS:
             raise CheckpointError(f"the state holds an array of {value.dtype}, which cannot be written down")
-        base = value
-        while isinstance(base.base, np.ndarray):
-            base = base.base
-        if base is not value and not (value.flags.c_contiguous or value.flags.f_contiguous) and base.flags.c_contiguous:
-            offset = value.__array_interface__["data"][0] - base.__array_interface__["data"][0]
-            return ["v", self.put(base), value.dtype.str, offset, list(value.shape), list(value.strides)]
         return ["m", self._array(value)]
 
     def _array(self, value: NDArray[Any]) -> int:
@@ -246,8 +240,6 @@ class _Reader:
             self._made[index] = deque(self._list(*rest[1:]), maxlen=rest[0])
         elif kind == "m":
             self._made[index] = self._array(rest[0])
-        elif kind == "v":
-            self._made[index] = self._view(*rest)
         elif kind == "a":
             self._made[index] = array(rest[0], self._array(rest[1]).tobytes())
         elif kind == "s":
@@ -292,9 +284,6 @@ class _Reader:
         if kind == "ndarray":
             return [row.copy() for row in values]
         return list(values) if kind == "float64" else values.tolist()
-
-    def _view(self, base: Json, dtype: str, offset: int, shape: list[int], strides: list[int]) -> NDArray[Any]:
-        return np.ndarray(tuple(shape), _dtype(dtype), self.get(base), offset, tuple(strides))
 
     def _array(self, place: int) -> NDArray[Any]:
         dtype, shape, order, offset = self._arrays[place]

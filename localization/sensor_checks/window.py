@@ -76,6 +76,7 @@ class Bins(NamedTuple):
     @classmethod
     def of(cls, rows: FloatArray) -> Bins:
         """Columns of ``rows`` (n, 12)."""
+        rows = np.asfortranarray(rows)  # so that each is contiguous
         return cls(rows, rows[:, 0], rows[:, 1:4], rows[:, 4], rows[:, 5:8], rows[:, 8], rows[:, 9:])
 
 
