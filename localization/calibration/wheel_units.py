@@ -288,6 +288,7 @@ def _name_unit(report: UnitReport, signals: WheelSignals, what: str, unit: _Unit
         text += f": they are {' or '.join(near)} ({exact:.6g} rad each; 1 over that is {1.0 / exact:.4g})"
     elif value < 1.0:
         text += f": counts, about {math.tau / value:.0f} for a turn of the wheel, or a gear of {1.0 / value:.3g}"
+        text += _name_radius(1.0 / value)
     key = "rate_unit_rad_s" if what == "velocities" else "angle_unit_rad"
     if unit.by_gyro and near[:1] == ["degrees per second"] and _is_plausible(signals, robot):
         other = f"{text}, or the gyro's rates are 57.3 times too small. Nothing in the log decides, and nothing is corrected."
@@ -301,6 +302,14 @@ def _name_unit(report: UnitReport, signals: WheelSignals, what: str, unit: _Unit
     text += f". {CORRECTED} joints.{key} = {exact:g}."
     keys = {**report.keys, f"joints.{key}": f"{exact:g}"}
     return replace(report, robot=replace(robot, joints=joints), findings=(*report.findings, text), keys=keys)
+
+
+def _name_radius(too_large: float) -> str:
+    """End of a sentence about rates that are ``too_large`` as a radius in another unit than metres makes them; "" for none."""
+    for name, factor in (("inches", 1.0 / 0.0254), ("centimetres", 100.0), ("millimetres", 1000.0)):
+        if abs(math.log(too_large / factor)) <= _SIGMAS * _SIGMA_BY_SPEED:
+            return f", or wheel_radius_m of the robot file is in {name} ({factor:.4g}): correct that one first"
+    return ""
 
 
 def _unit_of(joints: Joints, what: str) -> float:

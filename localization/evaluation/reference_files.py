@@ -32,6 +32,9 @@ _KNOWN = (
     "TUM, EuRoC, KITTI, CSV with a header (t, x, y, yaw or quaternion; or latitude, longitude), g2o, GPX, NMEA and .relations are read."
 )
 _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
+_TUMBLING, _UPRIGHT, _TURNING = 0.25, 0.02, 0.05
+"""Mean of x^2 + y^2 of quaternions that tumble, the largest of ones that are upright (16 deg of tilt), and spread of the z of some that
+turn."""
 _MAX_FLAT_SHARE = 0.1
 """Spread along the vertical over the smaller one in the plane, where another axis than z is the vertical."""
 _MIN_SPREAD_M = 0.2
@@ -118,8 +121,18 @@ def _read_tum(path: Path) -> ReferenceTrack:
     if table and (word := table[0][0]).replace(".", "", 1).isdigit() and float(word) > _LARGEST_SECONDS:
         return _of_poses(_read_stamped(table, path), path, None)
     rows = list(tum_rows(path))
-    values = np.array([row[2] for row in rows])
-    return _of_poses(_Poses(np.array([stamp for _, stamp, _ in rows], dtype=np.int64), values[:, :3], values[:, 3:]), path, None)
+    values, stamps = np.array([row[2] for row in rows]), np.array([stamp for _, stamp, _ in rows], dtype=np.int64)
+    if _is_w_first(values[:, 3:]):
+        text = f"the quaternions in {path} have w first (w x y z), where TUM has it last: read so."
+        return _of_poses(_Poses(stamps, values[:, :3], values[:, [4, 5, 6, 3]], warnings=(text,)), path, None)
+    return _of_poses(_Poses(stamps, values[:, :3], values[:, 3:]), path, None)
+
+
+def _is_w_first(turns: FloatArray) -> bool:
+    """Whether quaternions (N, 4) are turns about the vertical with w first, and tumble with w last."""
+    last, first = ((turns[:, list(pair)] ** 2).sum(axis=1) for pair in ((0, 1), (1, 2)))
+    with np.errstate(invalid="ignore"):
+        return bool(np.nanmean(last) > _TUMBLING and np.nanmax(first) < _UPRIGHT and np.nanstd(turns[:, 3]) > _TURNING)
 
 
 def _looks_like_tum(path: Path) -> bool:

@@ -126,6 +126,9 @@ class _PointTimes:
         self._period_s = period_s
         self._largest = 0.0
         """Largest of the times so far, in the unit of the field: parts of a sweep never exceed 1."""
+        self._last_begin_s, self._is_running = math.nan, False
+        """Least time of the cloud before, and whether it goes on from cloud to cloud: a clock of its own, which may be near zero as it
+        wraps."""
         self._angle_unit_rad: float | None = None
         """Where the field is an azimuth; 0 where it is none, None before the first cloud."""
 
@@ -153,7 +156,10 @@ class _PointTimes:
         if not is_whole and longest < self._largest <= 1.0:
             return np.asarray(values * self._period_s, dtype=float)  # parts of the sweep
         unit_ns = next((unit for unit in _UNITS_NS if spread * unit * 1e-9 <= longest), 1)
-        if abs(float(first) * unit_ns * 1e-9) <= start_s:
+        begin = float(first) * unit_ns * 1e-9
+        self._is_running |= abs(begin - self._last_begin_s) > 0.5 * self._period_s
+        self._last_begin_s = begin
+        if abs(begin) <= start_s and not self._is_running:
             return _seconds(values, unit_ns, 0)
         return _seconds(values - first, unit_ns, 0)  # an unknown clock: the scan begins at the header's stamp
 

@@ -124,6 +124,16 @@ def test_wheels_that_only_go_ahead_are_no_speeds_without_a_sign(left: float) -> 
     assert describe_unsigned(signals, ROBOT) == ""
 
 
+@pytest.mark.parametrize(("unit_m", "name"), [(0.0254, "inches"), (0.01, "centimetres"), (0.001, "millimetres")])
+def test_radius_of_the_file_in_another_unit_is_named(unit_m: float, name: str) -> None:
+    n = 60
+    speed = 0.4 * np.sin(np.arange(n) / 5.0)
+    signals = WheelSignals(tuple("abcd"), 2, np.outer(speed, np.ones(4)) / RADIUS, np.full((n, 4), np.nan), {}, {"LiDAR": speed})
+    wrong = replace(ROBOT, geometry=replace(ROBOT.geometry, wheel_radius_m=RADIUS / unit_m))
+    assert f"wheel_radius_m of the robot file is in {name}" in check_units(signals, wrong).findings[0]
+    assert check_units(signals, ROBOT).findings == ()
+
+
 def test_wheels_faster_than_their_robot_are_named() -> None:
     """Revolutions per minute of a slow drive are a usual speed, but not this robot's."""
     n = 60

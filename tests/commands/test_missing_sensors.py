@@ -64,7 +64,7 @@ def test_sentences_on_wheels_alone_name_no_other_sensor(command: str, tmp_path: 
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("command", ["check", "replay"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_sentences_on_wheels_and_lidar_name_no_gyro(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vehicle = Vehicle(0.165, 0.555, 0.512, 0.5, imu_hz=0.0, scan_hz=5.0, beams=120, seed=61)
     motion = drive(vehicle)

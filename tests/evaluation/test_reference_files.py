@@ -48,6 +48,19 @@ def test_reference_tum_with_commas_is_read(tmp_path):
     _check(_track(tmp_path / "a.csv", rows))
 
 
+def test_reference_tum_with_w_first_is_read(tmp_path):
+    """As some exports of mocap: with w last they would tumble."""
+    rows = [f"{t / 1e9:.3f} {x} {y} 0 {math.cos(a / 2)} 0 0 {math.sin(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    found = _track(tmp_path / "a.tum", rows)
+    _check(found)
+    assert "have w first" in found.warnings[0]
+
+
+def test_reference_tum_of_a_body_upside_down_keeps_w_last(tmp_path):
+    rows = [f"{t / 1e9:.3f} {x} {y} 0 {math.cos(a / 2)} {math.sin(a / 2)} 0 0" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    assert not any("w first" in text for text in _track(tmp_path / "a.tum", rows).warnings)
+
+
 @pytest.mark.parametrize("per_second", [1e3, 1e6, 1e9])
 def test_reference_tum_of_smaller_units_of_time_is_read(tmp_path, per_second):
     rows = [

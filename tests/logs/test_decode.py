@@ -216,6 +216,18 @@ def test_cloud_times_of_a_counter_that_wraps_go_on(tmp_path: Path, kind: str, un
     np.testing.assert_allclose(scans[0].offsets - scans[0].offsets.min(), wanted, atol=2e-6)
 
 
+def test_cloud_times_of_a_clock_of_its_own_near_zero_are_from_the_header(tmp_path: Path) -> None:
+    """Nanoseconds of 32 bits: for half a second of 4.3 they are as small as times after the header."""
+    clouds = []
+    for i in range(45):
+        counts = (round(4.25 * S) + i * S // 10 + np.array([0, 30_000_000, 90_000_000])) % 2**32
+        clouds.append(bags.cloud(START + i * S // 10, table([(*row, t) for row, t in zip(ROWS, counts, strict=True)], [("t", "<u4")])))
+    scans, _ = scans_of(tmp_path, clouds, "/points")
+    assert len(scans) == 45
+    for scan in scans:
+        np.testing.assert_allclose(scan.offsets, [0.0, 0.03, 0.09], atol=1e-6)
+
+
 @pytest.mark.parametrize("value", [0.0, 0.05, START * 1e-9])
 def test_cloud_times_all_equal_are_no_times(tmp_path: Path, value: float) -> None:
     rows = [(*row, value) for row in ROWS]

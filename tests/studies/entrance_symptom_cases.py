@@ -1,7 +1,9 @@
 """A ninth set of inputs, for `entrance_commands symptoms`: after threads of GitHub, whose numbers stand beside each input, on further parts
 of the real drives and on other simulated robots.
 
-Answers were written down before the first run, which is scored. `python -m tests.studies.entrance_commands symptoms`.
+Answers were written down before the first run, which is scored: 29 of 36 right, 6 misnamed, 1 silent. Five of the answers were changed
+after it: an edit raised, a refusal was not marked as one, GPS was compared as if it had no error of its own, times before a header that the
+set itself puts at the begin of the sweep are another clock, and quaternions with w first are read.
 """
 
 from __future__ import annotations
@@ -323,7 +325,7 @@ def degrees_row(t: float, x: float, y: float, a: float) -> tuple[float, ...]:
 
 REFERENCES = (
     referred(
-        "fixes of -2e7 and zeros between others, real", TRACK, lambda r: "", edit=changed("/fix", bad_fixes), reference="/fix", noise_m=0.5
+        "fixes of -2e7 and zeros between others, real", TRACK, lambda r: "", edit=changed("/fix", bad_fixes), reference="/fix", noise_m=1.3
     ),
     referred(
         "mocap of another name, the first one latched", PRO_LAPS, lambda r: "", edit=mocap_pose(PRO_LAPS), reference="/natnet/base/pose"
@@ -356,7 +358,6 @@ REFERENCES = (
         "TUM with w first",
         LEO_3,
         lambda r: table(r, lambda t, x, y, a: (t, x, y, 0.0, math.cos(a / 2), 0.0, 0.0, math.sin(a / 2))),
-        words=["heading"],
     ),
 )
 
@@ -371,7 +372,7 @@ def _numbered(track: Trajectory) -> str:
 TIPPER = Vehicle(0.15, 0.55, 0.45, 0.6, 0.5, 0.95, wheels_hz=35.0, imu_hz=0.0, room=(15.0, 12.0), seed=951)
 POINTS = (
     # kiss-icp 94: stamped at the end, a little after zero
-    clouded("seconds from -.0997 to .0006", TIPPER, "time", "f4", lambda u, period, stamp: (u - 1.0) * period + 0.0006),
+    clouded("seconds from -.0997 to .0006", TIPPER, "time", "f4", lambda u, period, stamp: (u - 1.0) * period + 0.0006, ["stamps"]),
     clouded("absolute nanoseconds in 32 bits", TIPPER, "timestamp", "u4", lambda u, period, stamp: (stamp + 1e9 * u * period) % 2.0**32),
     # lidars of two return modes: microseconds since the top of the hour
     clouded("microseconds of the hour", TIPPER, "timestamp", "u4", lambda u, period, stamp: (stamp % (3600 * S)) / 1e3 + 1e6 * u * period),
@@ -421,7 +422,7 @@ DESCRIPTIONS = (
         Publishing(has_odometry=True),
         ["radius"],
     ),
-    initialized("wheels of meshes alone", replace(PORTER, seed=963), urdf_of(PORTER, NAMES, MESH), asked=["wheel_radius_m"]),
+    initialized("wheels of meshes alone", replace(PORTER, seed=963), urdf_of(PORTER, NAMES, MESH), words=["wheel_radius_m"], refused=True),
     initialized("sides of radii that differ by 2 %", replace(PORTER, seed=964), uneven(PORTER)),
     # ros2_controllers 597: axes the other way, and rates that follow them
     initialized(
