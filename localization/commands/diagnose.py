@@ -20,7 +20,7 @@ from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig, examine
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
-from localization.diagnosis.extension import ExtendedResult, extend, suggests_extension
+from localization.diagnosis.extension import EXTEND_ADVICE, EXTENSION_HEADS, ExtendedResult, extend, suggests_extension
 from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
@@ -110,7 +110,7 @@ class Diagnose:
                 baseline = estimate_baseline(self._cut(self._open(self.healthy, robot)), model)
         with console.status("searching for causes"):
             found = examine(drive, model, self.config, baseline)
-            by_suited = self._notes_by_suited_model(found, drive)
+            by_suited, is_named = self._notes_by_suited_model(found, drive)
         extended = None
         if self.extend:
             with console.status("searching for terms"):
@@ -129,11 +129,12 @@ class Diagnose:
                 write_json(folder / "diagnosis.json", content)
                 corrected, manual_steps = self._write_robot(folder, found, robot, extended)
                 shares = held_shares(found.predictor, {f.definition: f.size for f in corrected}) if found.predictor and corrected else {}
-                write_diagnosis_report(folder / "diagnosis.html", found, is_interactive=not self.static)
+                terms = None if extended is None else extended.extension
+                write_diagnosis_report(folder / "diagnosis.html", found, terms, is_interactive=not self.static)
         if self.json is not None:
             write_json(self.json, content)
         print_diagnosis(console, found.diagnosis)
-        print_extension(console, found, extended, is_suggested=not by_suited)
+        print_extension(console, found, extended, is_suggested=not is_named)
         if self.out is not None:
             print_handover(console, corrected, manual_steps, shares)
             console.print(f"report: {self.out / 'diagnosis.html'}", markup=False, soft_wrap=True)
@@ -169,16 +170,18 @@ class Diagnose:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
 
-    def _notes_by_suited_model(self, found: DiagnosisResult, drive: Drive) -> tuple[str, ...]:
+    def _notes_by_suited_model(self, found: DiagnosisResult, drive: Drive) -> tuple[tuple[str, ...], bool]:
         """What the model that suits the robot would find, in a sentence, where a simpler one was chosen and differs from the drive: what it
-        does not have comes out as causes, or as unexplained."""
+        does not have comes out as causes, or as unexplained; and whether the suited model explains the drive."""
         d, name = found.diagnosis, default_model(drive.robot)
         is_off = bool(d.findings) or d.verdict == "unexplained"
         if not self.model or self.model == name or not is_off or self.healthy is not None:
-            return ()
+            return (), False
         other = examine(drive, make_model(name, drive.robot), self.config).diagnosis
         causes = ", ".join(f"{f.definition.label} {f.size:+.3g}{unit_of(f.cause)}" for f in other.findings) or "no cause"
-        return (f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}.",)
+        return (
+            f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}.",
+        ), other.verdict != "unexplained"
 
     def _with_written_robot(self, found: DiagnosisResult, reader: Reader | None) -> DiagnosisResult:
         """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""
@@ -230,28 +233,19 @@ class Diagnose:
 
 
 def print_extension(console: Console, found: DiagnosisResult, extended: ExtendedResult | None, is_suggested: bool) -> None:
-    """The terms of the model, or that a search for them is possible, where it ``is_suggested``: no other model suits the robot better."""
+    """The terms of the model, or that a search for them is possible, where it ``is_suggested``: no other model explains the drive."""
     if extended is None:
         if is_suggested and suggests_extension(found):
-            console.print("next: diagnose with --extend, which searches a term of the model for it.", markup=False, soft_wrap=True)
+            console.print(f"next: {EXTEND_ADVICE}", markup=False, soft_wrap=True)
         return
     if extended.extension is None:
         console.print("no term of the library explains what is left.", markup=False)
         return
-    content = extended.extension.to_dict()
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for head in ("component", "term", "value", "95 %", "unit", "stability", "log-likelihood"):
+    for head in EXTENSION_HEADS:
         table.add_column(head, no_wrap=True)
-    for row in (*content["terms"], *content["effects"]):
-        low, high = row["interval"]
-        sizes = (f"{row['value']:+.4g}", f"{low:+.3g} to {high:+.3g}", row["unit"])
-        table.add_row(
-            row["component"],
-            row.get("expression", row.get("along")),
-            *sizes,
-            f"{100 * row['stability']:.0f} %",
-            f"{row['log_likelihood']:+.0f}",
-        )
+    for row in extended.extension.table():
+        table.add_row(*row)
     console.print(table)
     if extended.robot is None and extended.extension.terms:
         console.print(f"not written: {extended.extension.describe()}.", markup=False, soft_wrap=True)

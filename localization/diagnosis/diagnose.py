@@ -197,17 +197,16 @@ def _search_contacts(predictor: DrivePredictor, config: DiagnosisConfig) -> _Sea
     found = _search(start)
     if found.error.is_shown and found.predictor.unmodelled.has_stiffness:
         stiff = _start(dataclasses.replace(predictor, unmodelled=Unmodelled(log_stiffness=COULOMB_LOG_STIFFNESS)), config)
-        other = _with_parts(_search(stiff)) if _is_error_less(stiff, start) else None
-        if other is None or other.chosen or not _describes_better(other, found):  # else contacts alone explain what causes seemed to
+        other = _about(stiff, start, found)
+        if other.chosen or not _describes_better(other, found):  # else contacts alone explain what causes seemed to
             found = _with_parts(found)
-        found = other if other is not None and _describes_better(other, found) else found
+        found = other if _describes_better(other, found) else found
     else:
         found = _with_parts(found)
     if found.predictor.unmodelled.has_stiffness and _costs_less_creeping(found):
         creeping = _start(dataclasses.replace(predictor, unmodelled=Unmodelled(stiffness_exponent=1.0)), config)
-        if _is_error_less(creeping, start):
-            other = _with_parts(_search(creeping))
-            found = other if _describes_better(other, found) else found
+        other = _about(creeping, start, found)
+        found = other if _describes_better(other, found) else found
     return found
 
 
@@ -215,6 +214,20 @@ def _start(predictor: DrivePredictor, config: DiagnosisConfig) -> _Searched:
     """The drive about the robot file with the contacts of ``predictor``, before causes are searched."""
     predictor, first, error = _linearize_with_model_error(predictor, config)
     return _Searched(predictor, first, first, (), error)
+
+
+def _about(new: _Searched, start: _Searched, found: _Searched) -> _Searched:
+    """The best causes about the contacts of ``new``, where these may be what those of the ``start`` are off; else the causes of ``found``,
+    which were searched from there."""
+    if _is_error_less(new, start):
+        return _with_parts(_search(new))
+    sizes = {
+        found.linearization.causes[i]: float(s) for i, s in zip(found.chosen, found.linearization.problem.fit(found.chosen)[0], strict=True)
+    }
+    lasting = {cause: size for cause, size in sizes.items() if cause.spell is None}
+    index = {cause.key: i for i, cause in enumerate(new.first.causes)}
+    linearization = linearize(new.predictor, new.first.causes, lasting, TOLERANCE)
+    return _with_error(new._replace(linearization=linearization, chosen=tuple(sorted(index[cause.key] for cause in lasting))))
 
 
 def _is_error_less(new: _Searched, old: _Searched) -> bool:

@@ -8,6 +8,7 @@ file that a user gets has the coefficients of all windows.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -107,6 +108,22 @@ class Extension:
             return f"{text}with it in robot.toml, {self.check.describe()}"
         return f"{text}with it in robot.toml {' and '.join(fallen)} a window on the other half"
 
+    def table(self) -> list[tuple[str, ...]]:
+        """Component, term or effect, value, 95 % interval, unit, stability and log-likelihood of each, as text."""
+        content = self.to_dict()
+        return [
+            (
+                row["component"],
+                row.get("expression", row.get("along", "")),
+                *_rounded((row["value"],), row["sigma"]),
+                " to ".join(_rounded(row["interval"], row["sigma"])),
+                row["unit"],
+                f"{100 * row['stability']:.0f} %",
+                f"{row['log_likelihood']:+.0f}",
+            )
+            for row in (*content["terms"], *content["effects"])
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """For `diagnose --json`: sizes in SI units with their 95 % intervals."""
         terms = [
@@ -151,6 +168,16 @@ class ExtendedResult:
     """None where no term explains the drive."""
     robot: Robot | None = None
     """The robot with terms and findings, where its file is better."""
+
+
+EXTENSION_HEADS = ("component", "term", "value", "95 %", "unit", "stability", "log-likelihood")
+"""Heads of `Extension.table`."""
+
+
+def _rounded(values: Sequence[float], sigma: float) -> list[str]:
+    """``values`` with two digits of their ``sigma``."""
+    decimals = max(0, 1 - math.floor(math.log10(max(sigma, 1e-9))))
+    return [f"{value:+.{decimals}f}" for value in values]
 
 
 def describe_term(term: Term) -> str:
@@ -341,6 +368,10 @@ def _robot_by(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]
     corrected = correct_robot(predictor, sizes)
     robot = dataclasses.replace(corrected.robot, terms={**old, name: merge_terms(old.get(name, ()), terms)})
     return dataclasses.replace(corrected, robot=robot), sizes
+
+
+EXTEND_ADVICE = "diagnose with --extend, which searches a term of the model for it."
+"""What to do where `suggests_extension`."""
 
 
 def suggests_extension(found: DiagnosisResult) -> bool:

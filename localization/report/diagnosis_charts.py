@@ -44,7 +44,9 @@ def diagnosis_charts(found: DiagnosisResult) -> list[Chart]:
     charts = [_discrepancies(found, columns, along, shown)]
     place = _places(found.predictor)
     if place is not None:
-        charts.append(_place_chart({**columns, "place x": place[:, 0], "place y": place[:, 1]}, shown))
+        over_noise = np.nanmean((found.residuals.rows / found.residuals.sigmas) ** 2, axis=0)
+        strongest = max(shown[:3], key=lambda c: float(over_noise[c]))
+        charts.append(_place_chart({**columns, "place x": place[:, 0], "place y": place[:, 1]}, shown, strongest))
     return [*charts, *_odds(found)]
 
 
@@ -89,15 +91,15 @@ def _discrepancies(found: DiagnosisResult, columns: dict[str, FloatArray], along
     return Chart("Discrepancies before and after", along, titles, series, columns, height_px=130 * len(shown) + 110, note=note)
 
 
-def _place_chart(columns: dict[str, FloatArray], shown: list[int]) -> Chart:
-    """Windows where they were driven, coloured by one component before or after."""
+def _place_chart(columns: dict[str, FloatArray], shown: list[int], strongest: int) -> Chart:
+    """Windows where they were driven, coloured by one component before or after, at first by the ``strongest`` before."""
     series = []
     for c in shown[:3]:
         name = CHANNELS[c]
         for kind, words in (("found", "as found"), ("corrected", "corrected")):
             label = f"{COMPONENTS[name]} [{CHANNEL_UNITS[c]}], {words}"
             texts = [f"{label}: {v:.4g}" for v in columns[f"{kind} {name}"]]
-            is_hidden = kind == "corrected" or c != shown[0]
+            is_hidden = kind == "corrected" or c != strongest
             series.append(
                 ChartSeries(label, "red", x="place x", y="place y", size=8.0, colour_by=f"{kind} {name}", texts=texts, is_hidden=is_hidden)
             )

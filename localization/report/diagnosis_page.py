@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS
+from localization.diagnosis.extension import EXTEND_ADVICE, EXTENSION_HEADS, Extension, suggests_extension
 from localization.diagnosis.findings import (
     Diagnosis,
     describe_outliers,
@@ -45,18 +46,21 @@ _TERMS = {
 }
 
 
-def write_diagnosis_report(path: str | Path, found: DiagnosisResult, is_interactive: bool = True) -> None:
-    """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
-    html.write_new(path, diagnosis_page(found, is_interactive).encode())
+def write_diagnosis_report(
+    path: str | Path, found: DiagnosisResult, extension: Extension | None = None, is_interactive: bool = True
+) -> None:
+    """Write the page, with the terms of an ``extension``. Raises `OutputError` if there is such a file already or it cannot be written."""
+    html.write_new(path, diagnosis_page(found, extension, is_interactive).encode())
 
 
-def diagnosis_page(found: DiagnosisResult, is_interactive: bool = True) -> str:
+def diagnosis_page(found: DiagnosisResult, extension: Extension | None = None, is_interactive: bool = True) -> str:
     """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     d = found.diagnosis
     sections = [
         html.Section("Findings", _findings(d)),
+        html.Section("Terms", _terms(extension)),
         html.Section("Components", _components(d)),
-        html.Section("Next drive", [html.Paragraph(d.next_drive)] if d.next_drive else []),
+        html.Section("Next", [html.Paragraph(text) for text in _next_steps(found, extension)]),
         html.Section("Explore", diagnosis_charts(found)),
         *_figures(found),
         html.Section("Corrected robot: before and after", _handover(d)),
@@ -105,6 +109,20 @@ def _findings(d: Diagnosis) -> list[html.Block]:
             [cause, html.Cell(f"{f.size:+.4g} ± {f.sigma:.2g}{unit}"), html.Cell(gain), html.Cell(f"{f.p_value:.1g}"), html.Cell(others)]
         )
     return [html.Table([html.Cell(title) for title in ("Cause", "Size", "Held-out gain", "p", "Or")], rows)]
+
+
+def _terms(extension: Extension | None) -> list[html.Block]:
+    if extension is None:
+        return []
+    rows = [[html.Cell(row[0]), html.Cell(row[1], is_code=True), *(html.Cell(text) for text in row[2:])] for row in extension.table()]
+    return [html.Table([html.Cell(head.capitalize()) for head in EXTENSION_HEADS], rows)]
+
+
+def _next_steps(found: DiagnosisResult, extension: Extension | None) -> list[str]:
+    """The next drive, and the search for terms where it is worth its time and was not made."""
+    is_suggested = extension is None and suggests_extension(found)
+    advice = f"{EXTEND_ADVICE[0].upper()}{EXTEND_ADVICE[1:]}"
+    return [text for text in (found.diagnosis.next_drive, advice if is_suggested else "") if text]
 
 
 def _components(d: Diagnosis) -> list[html.Block]:

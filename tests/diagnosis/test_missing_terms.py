@@ -10,10 +10,10 @@ import pytest
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.extension import ExtendedResult, extend
+from localization.diagnosis.extension import ExtendedResult, Extension, extend
 from localization.diagnosis.findings import confirmed_findings
 from localization.diagnosis.linearization import make_predictor
-from localization.diagnosis.missing_terms import candidate_terms, term_columns
+from localization.diagnosis.missing_terms import FoundTerm, candidate_terms, term_columns
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.terms import Term, parse_expression
@@ -149,3 +149,9 @@ def test_diagnosis_orders_no_cause_in_the_place_of_a_law(hidden: Term, count: in
     assert found.verdict == "unexplained"
     assert not confirmed_findings(found), found.sentence
     assert along in [t.along for t in found.trends]
+
+
+def test_table_of_an_extension_has_two_digits_of_the_sigma() -> None:
+    found = FoundTerm(Term("wz", parse_expression("max(wz,0)"), -0.149842, 0.00013), 1.0, 900.0)
+    (row,) = Extension("skid_steer", (found,), (), None).table()
+    assert row == ("wz", "max(wz,0)", "-0.14984", "-0.15010 to -0.14959", "1", "100 %", "+450")
