@@ -12,8 +12,11 @@ import numpy as np
 from localization.estimators import Estimate
 from localization.trajectory import Trajectory
 from motion_models import se2
+from motion_models.compiled import kernel
 from motion_models.robot import Mount, Robot
-from motion_models.se2 import Cov3, FloatArray, Pose2
+from motion_models.se2 import Cov3, FloatArray, Pose2, Twist2
+
+_NO_TWIST = np.zeros(3)
 
 
 def lever_of_unknown_front(robot: Robot | None, mounts: Mapping[str, Mount]) -> float | None:
@@ -41,8 +44,8 @@ class PathUncertainty:
 
     def widen(self, estimate: Estimate, pose: Pose2) -> Estimate:
         """``estimate`` with this covariance; ``pose`` (3,) since the start by sensors alone."""
-        spread, twist = self._of_pose(pose), estimate.twist
-        return estimate.widened(spread if twist is None else spread + self.late_s**2 * twist[:, None] * twist)
+        twist = estimate.twist if estimate.twist is not None else _NO_TWIST
+        return estimate.widened(_spread(pose, self.late_s, twist, self.scale, self.turned_about_m))
 
     def widen_trajectory(self, smoothed: Trajectory) -> Trajectory:
         """``smoothed`` with the covariance as it is at its end."""
@@ -53,19 +56,26 @@ class PathUncertainty:
             way = _way_in(smoothed, self.late_s)
             covariances += way[:, :, None] * way[:, None, :]
         if self.scale or self.turned_about_m is not None:
-            covariances += np.array([self._of_pose(se2.between(smoothed.poses[0], pose)) for pose in smoothed.poses])
+            poses = se2.between(smoothed.poses[0], smoothed.poses)
+            covariances += np.array([_spread(pose, 0.0, _NO_TWIST, self.scale, self.turned_about_m) for pose in poses])
         return Trajectory(smoothed.stamps_ns, smoothed.poses, covariances)
 
-    def _of_pose(self, pose: Pose2) -> Cov3:
-        """Covariance (3, 3) of a ``pose`` since the start, of which scale and front are unsure. A robot that may drive backwards may be as
-        far away on the other side, and a sensor ahead of its middle behind it."""
-        x, y, yaw = pose.tolist()
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        way = np.array([cos * x + sin * y, cos * y - sin * x, 0.0])  # from the start, along the body's axes
-        spread: Cov3 = self.scale**2 * way[:, None] * way
-        if self.turned_about_m is not None:
-            spread += 4.0 * way[:, None] * way + (2.0 * self.turned_about_m) ** 2 * np.diag([1.0, 1.0, 0.0])
-        return spread
+
+@kernel
+def _spread(pose: Pose2, late_s: float, twist: Twist2, scale: float, turned_about_m: float | None) -> Cov3:
+    """Covariance (3, 3) of a ``pose`` (3,) since the start, which is late by ``late_s`` [s] at ``twist`` (3,), and of which ``scale`` and
+    front are unsure. A robot that may drive backwards may be as far away on the other side, and a sensor ahead of its middle behind it."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    way = (c * pose[0] + s * pose[1], c * pose[1] - s * pose[0], 0.0)  # from the start, along the body's axes
+    of_way = scale**2 if turned_about_m is None else scale**2 + 4.0
+    spread = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] = of_way * way[i] * way[j] + late_s**2 * twist[i] * twist[j]
+    if turned_about_m is not None:
+        spread[0, 0] += (2.0 * turned_about_m) ** 2
+        spread[1, 1] += (2.0 * turned_about_m) ** 2
+    return spread
 
 
 def _way_in(trajectory: Trajectory, seconds: float) -> FloatArray:

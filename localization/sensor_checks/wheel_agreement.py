@@ -24,9 +24,10 @@ _STILL_M, _SLIP_SHARE, _SLIP_M_PER_RAD = 0.03, 0.25, 0.1
 turns, in which the centre of rotation is elsewhere by 10 cm [m/rad]."""
 CALM_S = 1.0
 """Time without moving objects after which all beams are matched again [s]."""
-_CALM_M = 0.3
-"""Distance of the wheels' pose from where wheels and estimate last disagreed, from which on what they differed by is slip that has ended
-[m]: a LiDAR that travels elsewhere by its scans agrees with wheels that stand, or turn in place."""
+_CALM_M, _CALM_M_PER_RAD = 0.3, 0.4
+"""Distance of the wheels' pose from where wheels and estimate last disagreed, and what the turn since then adds to it [m/rad], from which
+on what they differed by is slip that has ended [m]: a LiDAR that travels elsewhere by its scans agrees with wheels that stand, turn in
+place, or drive tight curves, in which ways are compared over .6 rad at most."""
 
 
 def difference(since: FloatArray, now: FloatArray) -> Tangent2:
@@ -71,7 +72,8 @@ class Suspicion:
 
     def is_over(self, now_s: float, now: FloatArray) -> bool:
         """Whether the robot has driven on for some time without a sign."""
-        return now_s - self.last_s >= CALM_S and math.dist(self.place[:2], now[0, :2]) >= _CALM_M
+        x, y, yaw = se2.between(self.place, now[0]).tolist()
+        return now_s - self.last_s >= CALM_S and math.hypot(x, y) >= _CALM_M + _CALM_M_PER_RAD * abs(yaw)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,6 +54,18 @@ def test_moments_are_near_where_neither_motion_is_long(motion, is_near):
         assert compare_motions(START, moved(by_wheels, by_estimate))[0] is is_near
 
 
+def test_suspicion_is_not_over_in_a_tight_curve():
+    """A LiDAR whose yaw is 30 deg off moves as the wheels do, but for slip, over the .27 m of .6 rad at 2.25 rad/m."""
+    suspicion, arc = Suspicion(START, 10.0, START[0]), np.array([0.02, 0.0, 0.045])
+    now = START
+    for _ in range(200):
+        now = se2.compose(now, se2.exp(arc))
+        assert not suspicion.is_over(20.0, now)
+    for _ in range(100):
+        now = se2.compose(now, np.array([0.02, 0.0, 0.0]))
+    assert suspicion.is_over(20.0, now)
+
+
 def test_suspicion_is_over_after_a_second_and_a_way_without_a_sign():
     suspicion = Suspicion(START, 10.0, START[0])
     far = moved((0.4, 0.0, 0.0), (0.4, 0.0, 0.0))
