@@ -45,6 +45,11 @@ class TyreFriction:
         """Covariance (2, 2) of `logs`."""
         return self._cov[:2, :2]
 
+    @property
+    def turning_error(self) -> float:
+        """Share by which turns on level ground are larger than by the model's nominal parameters: kappa."""
+        return float(self._mean[2])
+
     def update(self, error: float, row: FloatArray, variance: float) -> None:
         """Update by the turn ``error`` [rad] of the gyro over that of the wheels at the present `logs`, whose derivatives by the states are
         ``row`` (4,), with its ``variance``."""

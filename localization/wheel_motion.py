@@ -25,7 +25,7 @@ class WheelMotion:
         self.model, self.params, self._needs_series = model, model.nominal, needs_series(model)
         self.buffer = WheelBuffer(robot.center_of_gravity)
         self._noise, self._max_hold_s = noise_vector(robot.wheel_noise), max_hold_s
-        self._on_slopes = MotionOnSlopes(robot, self._noise, unknown_sigma) if has_slopes else None
+        self.on_slopes = MotionOnSlopes(robot, self._noise, unknown_sigma) if has_slopes else None
 
     def twist_at(self, stamp_ns: int) -> tuple[FloatArray, Twist2]:
         """Rates (n, 2) at ``stamp_ns`` and the twist (3,) that they make; n = 0 and no twist where none is near."""
@@ -49,11 +49,11 @@ class WheelMotion:
         if self._needs_series:
             since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self.buffer.first_ns or start_ns)) * 1e-9
             model = in_series(model, SampleSeries(np.r_[np.zeros(n), dt], since))
-        if tilt is None or self._on_slopes is None:
+        if tilt is None or self.on_slopes is None:
             twist = model.twist(rates, cg, self.params)
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
             motion = integrate_twists(dt, inside, self._noise)
         else:
-            twist, motion = self._on_slopes.integrate(model, self.params, dt, rates, cg, tilt)
+            twist, motion = self.on_slopes.integrate(model, self.params, dt, rates, cg, tilt)
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last

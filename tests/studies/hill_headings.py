@@ -3,7 +3,8 @@
 python -m tests.studies.hill_headings
 
 Each robot turns twice by its wheels; the law is given their rates and the true heading. It has the robot file's contacts once, and once
-those of MuJoCo, whose wheels do not resist rolling and whose friction is full from 3 cm/s of slip on (slip_stiffness 50).
+those of MuJoCo, whose wheels do not resist rolling and whose friction is full from 3 cm/s of slip on (slip_stiffness 50). A third time it
+has the slip stiffness, mu and k that the filter (ekf, wheels and IMU) estimates during the same turns, from the robot file's.
 Needs the extra `mujoco`.
 """
 
@@ -15,7 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from localization.events import WheelSample
+from localization.pipeline import Pipeline, Trial
 from motion_models.friction import FrictionModel
+from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
@@ -72,6 +75,19 @@ def by_law(found: Turned, robot: Robot, slope_deg: float, step_s: float) -> tupl
     return wz / _turn_without_slip(robot, found.rates), -float(np.sum(np.cos(psi) * vx - np.sin(psi) * vy)) * step_s
 
 
+def estimated(made: HillDrive, robot: Robot) -> tuple[Robot, float]:
+    """``robot`` with the tyres that ekf has estimated at the end of ``made``, and the factor of its turns on level ground."""
+    pipeline = Pipeline(Trial(make_model("skid_steer", robot), "ekf"), robot, made.mounts, False)
+    for event in made.events:
+        pipeline.process(event)
+    on_slopes = pipeline.synchronizer.wheels.on_slopes
+    assert on_slopes is not None, "the model is of level ground"
+    nominal = dict(zip(FrictionModel.param_names, FrictionModel.from_robot(robot).nominal.tolist(), strict=True))
+    sizes = {name: nominal[name] * math.exp(log) for name, log in zip(("slip_stiffness", "mu"), on_slopes.tyres.logs, strict=True)}
+    friction = {**robot.models["friction"], **sizes}
+    return replace(robot, models={**robot.models, "friction": friction}), 1.0 + on_slopes.tyres.turning_error
+
+
 def _turn_without_slip(robot: Robot, wheels: FloatArray) -> FloatArray:
     g = robot.geometry
     return np.asarray(g.wheel_radius_m * (wheels[:, 1] - wheels[:, 0]) / g.track_width_m)
@@ -88,11 +104,14 @@ def main() -> None:
     print("| robot | slope | mu | contacts | k: MuJoCo | law | rms | ends off by | slide: MuJoCo | law |\n" + "|---" * 10 + "|")
     for name, deg, mu in ((n, d, m) for n in ("husky_a200", "jackal") for d in (0.0, 5.0, 10.0) for m in (0.5, 0.8)):
         seconds = _SETTLED_S + 2.0 * math.pi * _TURNS / _TURN_RATE
-        found = measured(drive(steady(0.0, _TURN_RATE), seconds, mu, deg, robot_of(name, mu, {})), robot_of(name, mu, {}))
+        robot = robot_of(name, mu, {})
+        made = drive(steady(0.0, _TURN_RATE), seconds, mu, deg, robot)
+        found = measured(made, robot)
         k = over_headings(found.headings, found.k)
-        for contacts, of in CONTACTS.items():
-            law, slid = by_law(found, robot_of(name, mu, of), deg, 0.02)
-            own = over_headings(found.headings, law)
+        models = {contacts: (robot_of(name, mu, of), 1.0) for contacts, of in CONTACTS.items()}
+        for contacts, (of, factor) in {**models, "as ekf estimates": estimated(made, robot)}.items():
+            law, slid = by_law(found, of, deg, 0.02)
+            own = factor * over_headings(found.headings, law)
             print(
                 f"| {name} | {deg:.0f} deg | {mu} | {contacts} | {k.min():.3f} to {k.max():.3f} | {own.min():.3f} to {own.max():.3f} "
                 f"| {np.sqrt(np.mean((own - k) ** 2)):.3f} | {own.min() - k.min():+.3f}, {own.max() - k.max():+.3f} "
