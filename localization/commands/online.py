@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from localization.errors import CheckpointError, OutputError
+from localization.estimators import check_estimator
 from localization.events import Event
 from localization.logs import open_log
 from localization.output import fingerprint
@@ -84,6 +85,7 @@ class OnlineCommand(OnlineSettings):
         robot, files = run.robot, run.files
         log = open_log(path, robot, self.topic)
         has_lidar = log.sources.lidar is not None
+        check_estimator(self.estimator, has_lidar, self.map is not None, log.no_wheels)
         trial = self.make_trial(has_lidar)
         if trial.prior is not None:
             trial.prior.check_lidar(log.sources.has_clouds, bool(self.config.step.planar))

@@ -32,6 +32,7 @@ COMMANDS = {
     "diagnose": (),
     "weigh": (),
     "check": (),
+    "online": ("--rate", "max"),
 }
 
 
