@@ -72,6 +72,8 @@ _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
 _SHARP_TURN_RAD, _MIN_SHARP, _SHIFT_TURN_RAD, _MAX_SHIFT_SIGMA_M = 0.05, 4, 1.0, 0.03
 """Turn of an interval in which sideways motion shows where the LiDAR is, the least number of these and their turns in all, and the largest
 standard error of that place [m]."""
+_MAX_RADIUS_M = 0.6
+"""Radius of a curve beyond which a robot slides outwards as if its LiDAR were farther back (.18 to .37 m in a simulated lap)."""
 _MIN_SHIFT_M, _BEYOND_AXLES_M = 0.15, 0.03
 """Least distance of a LiDAR from its mount that is named, and how far beyond its axles a robot may seem to turn [m]: the contacts of its
 wheels lie within them, and so does the point about which it turns."""
@@ -210,7 +212,8 @@ class LidarCheck:
         A sensor s ahead of where it is taken to be moves sideways by 2 s tan(a / 2) as the robot turns by a, beside the chord of the arc.
         """
         moves = np.array([delta for _, _, delta in self._travels[frame].rows]).reshape(-1, 3)
-        moves = moves[np.isfinite(moves).all(axis=1) & (np.abs(moves[:, 2]) > _SHARP_TURN_RAD)]
+        least = np.maximum(_SHARP_TURN_RAD, np.abs(moves[:, 0]) / _MAX_RADIUS_M)
+        moves = moves[np.isfinite(moves).all(axis=1) & (np.abs(moves[:, 2]) > least)]
         if len(moves) < _MIN_SHARP or float(np.abs(moves[:, 2]).sum()) < _SHIFT_TURN_RAD:
             return None
         half, ways = np.tan(0.5 * moves[:, 2]), (moves[:, 0] + 1j * moves[:, 1]) * np.exp(-1j * direction)

@@ -74,6 +74,13 @@ def test_lidar_that_is_elsewhere_along_the_robot_is_found_in_turns(tmp_path: Pat
     assert f"{abs(shift):.2f} m {'behind' if shift > 0.0 else 'ahead of'} the mount of 'laser'" in found.text
 
 
+@pytest.mark.extended
+def test_robot_that_slides_outwards_in_one_curve_has_its_lidar_where_it_is(tmp_path: Path) -> None:
+    """12 s of a simulated lap, taken for a LiDAR .29 m farther back."""
+    log = write_case(Case(0, "laps", "mcap-file", "none", ""), tmp_path, 1)
+    assert check_lidar(open_log(log, load_robot("vaultbot"))) is None
+
+
 @pytest.mark.parametrize("degrees", cases([90.0, -90.0, 45.0, 30.0, 178.0], ("178.0",)))
 def test_lidar_yaw_of_any_size_is_corrected(degrees: float) -> None:
     found = check_lidar(turned(opened(), degrees))
