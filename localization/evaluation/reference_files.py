@@ -35,6 +35,8 @@ _KITTI_COLUMNS, _TUM_COLUMNS = 12, 8
 _TUMBLING, _UPRIGHT, _TURNING = 0.25, 0.02, 0.05
 """Mean of x^2 + y^2 of quaternions that tumble, the largest of ones that are upright (16 deg of tilt), and spread of the z of some that
 turn."""
+_MIN_ALONG = 0.7
+"""Share of the way that is along one direction of the body, from where on that is ahead."""
 _MAX_FLAT_SHARE = 0.1
 """Spread along the vertical over the smaller one in the plane, where another axis than z is the vertical."""
 _MIN_SPREAD_M = 0.2
@@ -161,10 +163,22 @@ def _of_poses(found: _Poses, path: Path, log_stamps: LogStamps | None) -> Refere
     if _is_height(found.positions, 1):
         xy = found.positions[:, [2, 0]]
         if turns is not None:
-            yaws = se2.wrap_angle(2.0 * np.arctan2(turns[:, 1], turns[:, 3]))
+            yaws = 2.0 * np.arctan2(turns[:, 1], turns[:, 3])
+            yaws = se2.wrap_angle(yaws + _quarter_turn(xy, yaws))
         warnings.append(f"the height in {path} is y (as of mocap and cameras): z and x are taken as the plane.")
     track = make_track(stamps, xy, yaws, None, str(path))
     return replace(track, warnings=(*warnings, *track.warnings), has_times=has_times)
+
+
+def _quarter_turn(xy: FloatArray, yaws: FloatArray) -> float:
+    """Quarter turn by which ``yaws`` (N,) of the axis z of bodies lie beside their way over ``xy`` (N, 2) [rad], where the bodies have x
+    ahead; 0 for cameras, whose z is ahead, and where the way shows neither."""
+    steps = np.diff(xy, axis=0) @ np.array([1.0, 1.0j])
+    known = np.isfinite(steps) & np.isfinite(yaws[:-1])
+    apart = steps[known] * np.exp(-1j * yaws[:-1][known])
+    quarter = round(float(np.angle(apart.sum())) / (0.5 * math.pi))
+    is_clear = abs(apart.sum()) > _MIN_ALONG * np.abs(apart).sum()
+    return quarter * 0.5 * math.pi if is_clear and abs(quarter) == 1 else 0.0
 
 
 def _is_height(positions: FloatArray, axis: int) -> bool:

@@ -48,6 +48,20 @@ def test_reference_tum_with_commas_is_read(tmp_path):
     _check(_track(tmp_path / "a.csv", rows))
 
 
+@pytest.mark.parametrize("is_camera", [False, True])
+def test_reference_with_y_up_has_the_heading_of_the_axis_that_is_ahead(tmp_path, is_camera):
+    """x ahead, y up and z to the right, as of mocap; cameras have z ahead."""
+    truth = np.array([[math.cos(a), math.sin(a), a + math.pi / 2] for a in np.linspace(0.0, 4.0, 60)])
+    rows = []
+    for i, (x, y, a) in enumerate(truth):
+        place = (y, x) if is_camera else (x, -y)  # x and z of the file, whose plane is (z, x)
+        rows.append(f"{i * 0.1:.1f} {place[0]} 0.3 {place[1]} 0 {math.sin(a / 2)} 0 {math.cos(a / 2)}")
+    found = _track(tmp_path / "a.tum", rows)
+    way = np.diff(found.poses[:, :2], axis=0)
+    along = np.arctan2(way[:, 1], way[:, 0]) - found.poses[:-1, 2]
+    np.testing.assert_allclose(np.angle(np.exp(1j * along)), 0.0, atol=0.1)
+
+
 def test_reference_tum_with_w_first_is_read(tmp_path):
     """As some exports of mocap: with w last they would tumble."""
     rows = [f"{t / 1e9:.3f} {x} {y} 0 {math.cos(a / 2)} 0 0 {math.sin(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
