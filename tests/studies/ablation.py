@@ -134,7 +134,7 @@ def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *r
 
 
 _NO_SEARCH = (
-    _attribute(ScanMatcher, "_search", lambda *a: None),
+    _attribute(scan_matcher, "find_place", lambda *a: None),
     _attribute(registration, "_BASIN", math.inf),
 )
 _ASSUMED_NOISE = (_attribute(ScanMatcher, "_residual_variance", 1.0), _attribute(ScanMatcher, "_block_variance", 1.0))
