@@ -166,6 +166,11 @@ class AttitudeFilter:
         return np.array([-down_x * whole, -down_y * whole, whole])
 
     @property
+    def curvature(self) -> float:
+        """Root mean square of the ground's curvature along the way [1/m]."""
+        return self._curvature.root_mean_square
+
+    @property
     def tilt_variances(self) -> tuple[float, float]:
         """Variances of roll and pitch [rad^2]: by the attitude, and by the mount, which stays."""
         own, mount = self._sums.cov, self._ground.mount_cov

@@ -26,6 +26,8 @@ _SIGMA = math.radians(6.0) / _LENGTH_M
 """Sigma of h_xx and h_yy where nothing is known [1/m]."""
 _PRIOR = _SIGMA * _SIGMA / 3.0 * np.array([[3.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 3.0]])
 """Covariance of h_xx, h_xy, h_yy of a surface that has no direction of its own: the same in all axes [1/m^2]."""
+_LASTING_M = 10.0 * _LENGTH_M
+"""Way over which `GroundCurvature.root_mean_square` is taken: ten independent curvatures."""
 _BUMPS = 2e-3
 """Random walk of the tilt by ground that is not smooth [rad/sqrt(m)]."""
 
@@ -35,11 +37,17 @@ class GroundCurvature:
 
     def __init__(self) -> None:
         self._state, self._cov = np.zeros(3), _PRIOR.copy()
+        self._weight, self._squares = 0.0, 0.0
 
     @property
     def twist(self) -> tuple[float, float]:
         """h_xy in the body's axes, and its sigma [1/m]."""
         return float(self._state[1]), math.sqrt(self._cov[1, 1])
+
+    @property
+    def root_mean_square(self) -> float:
+        """Root mean square of h_xx over the last way [1/m]; 0 before there is one."""
+        return math.sqrt(self._squares / self._weight) if self._weight > 0.0 else 0.0
 
     def advance(self, before: FloatArray, after: FloatArray, motion: tuple[float, float], variance: float) -> None:
         """Advance by a ``motion``: way ahead [m] and turn [rad] about the body's z axis.
@@ -48,6 +56,9 @@ class GroundCurvature:
         change a gyro has an error of ``variance`` [rad^2].
         """
         _advance(self._state, self._cov, before, after, motion, variance)
+        kept = math.exp(-abs(motion[0]) / _LASTING_M)
+        self._weight = kept * self._weight + 1.0 - kept
+        self._squares = kept * self._squares + (1.0 - kept) * float(self._state[0]) ** 2
 
 
 @kernel

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from localization.events import Scan
+from localization.lidar.ground_hits import GroundHits
 from motion_models.robot import Mount
 
 _UNKNOWN = "no transform or robot file gives the mount of the LiDAR's frame '{}'"
@@ -96,6 +97,8 @@ class ScanQueue:
         self.frames = LidarFrames(mounts)
         """Frames of the scans, with their mounts."""
         self.faulty = FaultyScans()
+        self.ground = GroundHits(mounts)
+        """Points on hills that may be hits of the ground."""
         self.waiting: deque[tuple[int, Scan]] = deque()
         """Scans of known frames, each with the middle of its sweep [ns], in the order of these."""
 

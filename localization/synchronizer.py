@@ -107,7 +107,8 @@ class Synchronizer:
     def warnings(self) -> list[str]:
         """Problems of the sensors so far."""
         scans = self.scans
-        return [*self.inertial.warnings(), *scans.faulty.warnings(), *self._velocity.warnings(), *scans.frames.warnings()]
+        of_scans = [*scans.faulty.warnings(), *scans.ground.warnings()]
+        return [*self.inertial.warnings(), *of_scans, *self._velocity.warnings(), *scans.frames.warnings()]
 
     def next_interval(self, is_last: bool) -> StepInterval | None:
         """The next step's time, or None while it must wait for more events; with ``is_last`` no more will come."""
@@ -158,6 +159,8 @@ class Synchronizer:
         shift, attitude = self._clock_offset_ns, self.inertial.attitude
         dt, rates, cg, missing = self.wheels.buffer.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
         tilt = None if attitude is None else attitude.advance(end_ns, dt, rates)
+        if scan is not None and attitude is not None and tilt is not None:
+            scan = self.scans.ground.leave_out(scan, attitude.curvature)
         motion, d_clock, last = self.wheels.integrate(start_ns + shift, dt, rates, cg, tilt)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
             rates, last = self.wheels.twist_at(end_ns + shift)

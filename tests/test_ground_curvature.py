@@ -42,6 +42,16 @@ def test_ground_curvature_on_an_arc_finds_the_twist(way):
     assert twist == pytest.approx((_axes(yaw).T @ HESSIAN @ _axes(yaw))[0, 1], abs=3.0 * sigma)
 
 
+@pytest.mark.parametrize(("amplitude", "low", "high"), [(0.0, 0.0, 0.007), (0.03, 0.024, 0.036)], ids=["plane", "hills"])
+def test_root_mean_square_is_that_of_the_ground_along_the_way(amplitude, low, high):
+    """Waves of 12 m of a root mean square curvature ``amplitude``, on a straight way. Bumps alone are below what counts as hills."""
+    found, rng = GroundCurvature(), np.random.default_rng(4)
+    assert found.root_mean_square == 0.0
+    waves = math.sqrt(2.0) * amplitude * np.sin(2.0 * math.pi / 12.0 * STEP_M * np.arange(2000))
+    _advance(found, waves[:, None, None] * np.diag([1.0, 0.0]), STEP_M, 0.0, rng)
+    assert low <= found.root_mean_square < high
+
+
 def test_ground_curvature_variance_is_that_of_its_errors():
     """Monte Carlo: curvature by its prior and its process along the way; the mean of 400 squared errors is 1 within .07 (1 sigma)."""
     rng, squares = np.random.default_rng(2), []

@@ -102,7 +102,7 @@ class PlanarScanner:
         view = math.radians(c.field_of_view_deg)
         self._first, self._step = -0.5 * view, view / max(c.beams - 1, 1)
         self.beam_s = math.radians(c.field_of_view_deg) / math.radians(c.sweep_deg) / c.rate_hz / max(c.beams - 1, 1)
-        self._mount = np.array([mount.x, mount.y, mount.yaw])
+        self._real, self._mount = mount, np.array([mount.x, mount.y, mount.yaw])
         self._late_ns = round(late_s * 1e9)
         angles, times, ranges = (self._first, self._step), (self.beam_s, 1.0 / c.rate_hz), (c.min_range_m, c.max_range_m)
         self.layout = message_templates.laser_scan(topic, frame, c.beams, angles, times, ranges)
@@ -114,10 +114,8 @@ class PlanarScanner:
         if not len(starts):
             return []
         c = self._config
-        ranges = np.empty((len(starts), c.beams))
-        beams = BeamPattern(self.beam_s, self._first, self._step, self._mount, c.max_range_m)
-        _cast_sweeps(seconds(starts), beams, Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s), ranges)
-        ranges = c.measure(ranges, self._rng)
+        of = self._ranges_on_hills if len(self._world.waves) else self._level_ranges
+        ranges = c.measure(of(seconds(starts), track), self._rng)
         if c.resolution_m > 0.0:
             ranges = np.round(ranges / c.resolution_m) * c.resolution_m
         lost = (ranges < c.min_range_m) | (ranges > c.max_range_m)
@@ -130,6 +128,22 @@ class PlanarScanner:
             Message(self.layout, self._start_ns + int(s) + took, self._start_ns + int(s) + self._late_ns, (values[i],))
             for i, s in enumerate(starts)
         ]
+
+    def _level_ranges(self, starts: FloatArray, track: TrueMotion) -> FloatArray:
+        """(scans, beams) true ranges on a level floor, of the scans that begin at ``starts`` [s]."""
+        ranges = np.empty((len(starts), self._config.beams))
+        beams = BeamPattern(self.beam_s, self._first, self._step, self._mount, self._config.max_range_m)
+        _cast_sweeps(starts, beams, Scene(self._grid, self._world.people, track.rows, track.start_s, track.step_s), ranges)
+        return ranges
+
+    def _ranges_on_hills(self, starts: FloatArray, track: TrueMotion) -> FloatArray:
+        """See `_level_ranges`: beams tilt with the body, and hit the ground as well."""
+        beams, found = np.arange(self._config.beams, dtype=np.float64), []
+        angles = self._first + self._step * beams, np.zeros(1)
+        for start in starts:
+            rows = track.at(start + self.beam_s * beams)
+            found.append(ring_ranges(rows, self._real, angles, self._config.max_range_m, self._grid, self._world.waves)[0])
+        return np.array(found)
 
 
 class BeamPattern(NamedTuple):

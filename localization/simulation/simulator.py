@@ -97,8 +97,6 @@ class Simulation:
         self.world = experiment.make_world()
         if experiment.has_hills:
             self.world = replace(self.world, waves=make_waves(self.config.experiment.hills_seed, self.config.experiment.hills_slope_deg))
-            if self.config.sensors.lidar == "2d":
-                raise SimulationError("planar scanners are not simulated on hills. Pass --config.sensors.lidar 3d, or none.")
         self._marks: list[Message] = []
         self.runs: list[RunRecord] = []
         """Named phases that are over."""

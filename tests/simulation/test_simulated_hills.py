@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from localization.errors import SimulationError
+import skidloc
+from localization.lidar.ground_hits import GroundHits
 from localization.log_replay import replay
 from localization.logs import open_log
 from localization.pipeline import ReplayConfig, Trial
@@ -55,9 +56,18 @@ def test_motion_over_ground_is_the_twist_in_the_bodys_plane(heading):
     assert se3.rotation_vector(R.T @ S)[2] / h == pytest.approx(0.9, abs=1e-4)
 
 
-def test_planar_scanner_on_hills_is_refused():
-    with pytest.raises(SimulationError, match="planar scanners"):
-        _simulation("2d")
+@pytest.mark.extended
+def test_planar_scanner_on_hills_leaves_the_ground_out(tmp_path, monkeypatch):
+    """Most beams hit the ground: with them the estimate goes where the ground seems to go, and healthy sensors are accused."""
+    simulation = Simulation(EXPERIMENTS["hills"], load_robot("husky_a200"), 4, {}, SimulationConfig())
+    write_simulation(tmp_path / "hills.mcap", simulation)
+    log = skidloc.open(tmp_path / "hills.mcap", "husky_a200")
+    (run,) = log.replay(["skid_steer/ekf"])
+    assert any("the planar scanner 'laser' sees the ground from" in text for text in run.warnings)
+    monkeypatch.setattr(GroundHits, "leave_out", lambda self, scan, curvature: scan)
+    (trusting,) = log.replay(["skid_steer/ekf"])
+    assert run.ate_m < 0.5 * trusting.ate_m
+    assert not any("deg to the left" in text or "turns opposite" in text for text in run.warnings)
 
 
 @pytest.mark.extended

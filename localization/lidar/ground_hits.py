@@ -1,0 +1,55 @@
+"""Points of a planar scan that may be hits of the ground, which beams on hills meet before they meet a wall.
+
+The beams run along the plane on which the robot stands. Ground of curvature h'' rises over this plane by h'' d^2 / 2 at the distance d
+(Taylor), and meets the beams of a scanner at height z from about d = sqrt(2 z / |h''|) on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from localization.events import Scan
+from motion_models.robot import Mount
+
+_SIGMAS = 2.0
+"""Curvature, in units of its root mean square, up to which a point counts as one above the ground: 95 % of them."""
+_PLANE = 7e-3
+"""Curvature up to which the ground counts as a plane [1/m]: a ramp in the simulator shows .0015 to .0029, a plane with bumps of
+2e-3 rad/sqrt(m) .0056, hills of 2 deg .008 to .010."""
+_REPORTED_SHARE = 0.2
+"""Share of the points that is reported."""
+
+
+class GroundHits:
+    """`leave_out` of each scan. ``mounts`` of the LiDARs are by frame."""
+
+    def __init__(self, mounts: Mapping[str, Mount]) -> None:
+        self._mounts = mounts
+        self._points, self._left_out = 0, 0
+        self._nearest_m, self._frame = math.inf, ""
+
+    def leave_out(self, scan: Scan, curvature: float) -> Scan:
+        """``scan`` without the points that ground of this root mean square ``curvature`` [1/m] may reach. Clouds stay as they are: of them
+        walls are matched."""
+        if not scan.is_planar:
+            return scan
+        self._points += len(scan.points)
+        if curvature < _PLANE:
+            return scan
+        mount, rise = self._mounts.get(scan.frame_id, Mount()), 0.5 * _SIGMAS * curvature
+        x, y, z = (scan.points @ mount.rotation.T + (mount.x, mount.y, mount.z)).T
+        seen = scan.select(z > rise * (x * x + y * y))
+        self._left_out += len(scan.points) - len(seen.points)
+        self._nearest_m, self._frame = min(self._nearest_m, math.sqrt(max(mount.z, 0.0) / rise)), scan.frame_id
+        return seen
+
+    def warnings(self) -> list[str]:
+        """A sentence where many points were left out."""
+        if self._left_out <= _REPORTED_SHARE * self._points:
+            return []
+        return [
+            f"on hills the planar scanner '{self._frame}' sees the ground from {self._nearest_m:.1f} m on: "
+            f"{100.0 * self._left_out / self._points:.0f} % of its points are not used, as they may be hits of the ground. Use a 3D LiDAR "
+            "there, or mount the scanner higher."
+        ]
