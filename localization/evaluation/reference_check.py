@@ -83,7 +83,7 @@ def reference_contradictions(trajectories: Sequence[Trajectory], reference: Refe
 
 def compare_reference(trajectories: Sequence[Trajectory], reference: ReferenceTrack) -> ReferenceComparison | None:
     """The comparison with that of the ``trajectories`` that agrees best; None where the motion is too small, too even or too noisy."""
-    usable = [t for t in trajectories if len(t) > 2 and t.distance(0.05) > _MIN_WAY_M]
+    usable = [t for t in trajectories if len(t) > 3 and t.distance(0.05) > _MIN_WAY_M]
     if not usable or len(reference.stamps_ns) < 10:
         return None
     best: ReferenceComparison | None = None
@@ -220,7 +220,7 @@ def _compare(trajectory: Trajectory, reference: ReferenceTrack, chord_s: float) 
     use = np.isfinite(part.lengths) & np.isfinite(sensors.lengths)
     scale = float(np.sqrt(np.mean(part.lengths[use] ** 2) / np.mean(sensors.lengths[use] ** 2)))
     n_independent = float(np.count_nonzero(use)) * _STEP_S / max(chord_s, _INDEPENDENT_S)
-    noise = max(_noise(reference.positions) / max(scale, 1.0), _noise(trajectory.poses[:, :2]))
+    noise = max(position_noise(reference.positions) / max(scale, 1.0), position_noise(trajectory.poses[:, :2]))
     if noise * math.sqrt(2.0) * _MIN_SNR > spread:
         return None
     bends = _rms(sensors.bends[use]) > _MIN_TURN_RAD * float(np.mean(sensors.lengths[use] ** 2))
@@ -338,7 +338,12 @@ def _peak(scores: FloatArray, best: int) -> float:
     return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0.0 else 0.0
 
 
-def _noise(positions: FloatArray) -> float:
-    """Standard deviation of a position [m] by the median of its second differences, which motion hardly changes."""
-    second = np.diff(positions, n=2, axis=0)
-    return float(np.median(np.abs(second))) / (0.6745 * math.sqrt(6.0))
+def position_noise(positions: FloatArray) -> float:
+    """Standard deviation of the noise of ``positions`` (N, 2), N > 3, at even times [m]: by the median of third differences, which motion
+    hardly changes.
+
+    Where a robot at 0.8 m/s turns and stops every 1.5 to 5 s, noise of 20 mm is found 2 % too large at 5 Hz, 16 % at 2 Hz and twice at
+    1 Hz, by second differences 3 %, 35 % and 2.6 times.
+    """
+    third = np.diff(positions, n=3, axis=0)
+    return float(np.median(np.abs(third))) / (0.6745 * math.sqrt(20.0))  # 1 + 9 + 9 + 1 variances

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from localization.diagnosis.baseline import estimate_baseline
+from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.diagnose import diagnose
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.logs import open_log
@@ -14,6 +16,7 @@ from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
+from tests.helpers.law_drives import drawn_errors, expected_noise, law_drive, measured_with
 
 _USUAL = {"friction_anisotropy": -0.2, "lateral_slip_speed": 0.05, "wheel_radius_scale": -0.01}
 _FAULT = "wheel_radius_difference", 0.02
@@ -40,3 +43,18 @@ def test_estimate_baseline_of_short_drive_is_refused(tmp_path: Path) -> None:
     short = _drive(tmp_path, {}, 33, "12s")
     with pytest.raises(CalibrationError, match="windows of motion were measured"):
         estimate_baseline(short, make_model("friction", short.robot))
+
+
+@pytest.mark.parametrize(
+    ("factors", "kind"),
+    [((1.0, 1.0, 1.0), "independent"), ((3.0, 1.0, 2.0), "independent"), ((2.0, 2.0, 2.0), "correlated"), ((2.0, 2.0, 2.0), "outlier")],
+)
+def test_estimate_baseline_noise_over_reference_is_that_drawn(factors: tuple[float, float, float], kind: str) -> None:
+    healthy = law_drive("husky_a200", windows=48)
+    model, rng = make_model("friction", healthy.robot), np.random.default_rng(0)
+    found = []
+    for _ in range(10):
+        errors = drawn_errors(48, rng, kind) * factors
+        found.append(estimate_baseline(measured_with(healthy, model, Hypothesis(), errors, has_inertia=True), model).noise_over_reference)
+    off = np.mean(found, axis=0) - expected_noise(48, np.array(factors), kind)
+    assert (np.abs(off) < 3.0 * np.std(found, axis=0, ddof=1) / np.sqrt(10.0)).all()

@@ -13,13 +13,16 @@ from scipy.stats import kstest
 
 from localization.cli import main
 from localization.commands.weigh import describe
-from localization.diagnosis.weigh import DrivenWeighing
+from localization.diagnosis.causes.cause import Hypothesis
+from localization.diagnosis.weigh import DrivenWeighing, weigh
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
+from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.robot_file import load_robot, robot_toml
+from tests.helpers.law_drives import drawn_errors, expected_noise, law_drive, measured_with
 from tests.studies.weigh import left_out_cgs, weigh_simulated
 
 _PAYLOAD_KG = 8.0
@@ -78,6 +81,18 @@ def test_weighing_of_known_offset_gives_the_payload(mass: float, place: tuple[fl
 def test_weighing_p_values_of_a_right_file_are_uniform() -> None:
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(2), _weighing((0.0, 0.0)).covariance, 400)
     assert kstest([_weighing((x, y)).p_value for x, y in draws.tolist()], "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(1.0, "independent"), (3.0, "independent"), (2.0, "correlated"), (2.0, "outlier")])
+def test_weigh_noise_ratio_is_that_drawn(factor: float, kind: str) -> None:
+    drive = law_drive("husky_a200", windows=48)
+    model, rng = make_model("friction", drive.robot), np.random.default_rng(0)
+    found = []
+    for _ in range(10):
+        errors = factor * drawn_errors(48, rng, kind)
+        found.append(weigh(measured_with(drive, model, Hypothesis(), errors, has_inertia=True))[0].noise_ratio)
+    expected = float(expected_noise(48, np.array(factor), kind))
+    assert np.mean(found) == pytest.approx(expected, abs=3.0 * np.std(found, ddof=1) / np.sqrt(10.0))
 
 
 def test_weigh_left_out_rotations_of_the_thesis_have_their_cg() -> None:

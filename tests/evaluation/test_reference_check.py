@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from localization.evaluation.reference_check import reference_contradictions
+from localization.evaluation.reference_check import position_noise, reference_contradictions
 from localization.evaluation.references import ReferenceTrack
 from localization.trajectory import Trajectory
 from motion_models import se2
+from motion_models.se2 import FloatArray
 
 
 def _drive(seed: int = 3, duration_s: float = 90.0) -> Trajectory:
@@ -127,3 +129,33 @@ def test_reference_of_inverse_poses_is_named():
     inverse = se2.inverse(np.column_stack([_reference().positions, _reference().yaws]))
     found = _sentence(replace(_reference(), positions=inverse[:, :2], yaws=inverse[:, 2]))
     assert "inverse" in found
+
+
+def _found_noise(positions: FloatArray, sigma_m: float, outliers: float = 0.0) -> tuple[float, float]:
+    """Mean of `position_noise` over 200 draws, and its standard error [m]; a share of ``outliers`` is off by some 10 m."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        far = (rng.uniform(size=(len(positions), 1)) < outliers) * rng.normal(0.0, 10.0, positions.shape)
+        found.append(position_noise(positions + rng.normal(0.0, sigma_m, positions.shape) + far))
+    return float(np.mean(found)), float(np.std(found, ddof=1)) / np.sqrt(200.0)
+
+
+@pytest.mark.parametrize("sigma_m", [0.005, 0.3])
+def test_position_noise_of_a_steady_turn_is_that_drawn(sigma_m: float) -> None:
+    """1 m/s on a circle of 1.5 m, by a reference of 20 Hz."""
+    angles = np.arange(1000) / 20.0 / 1.5
+    mean, error = _found_noise(1.5 * np.column_stack([np.cos(angles), np.sin(angles)]), sigma_m)
+    assert mean == pytest.approx(sigma_m, abs=3.0 * error)
+
+
+@pytest.mark.parametrize(("period", "sigma_m", "largest"), [(1, 0.005, 1.02), (4, 0.02, 1.05), (10, 0.02, 1.25), (20, 0.3, 1.1)])
+def test_position_noise_hardly_counts_that_speeds_change(period: int, sigma_m: float, largest: float) -> None:
+    mean, error = _found_noise(_reference(period=period, noise_m=0.0).positions, sigma_m)
+    assert sigma_m - 3.0 * error < mean < largest * sigma_m
+
+
+@pytest.mark.parametrize("sigma_m", [0.005, 0.3])
+def test_position_noise_with_outliers_is_a_quantile_of_the_others(sigma_m: float) -> None:
+    """One outlier of 100 positions is in 4 of 100 third differences: the median of all is a higher quantile of the others."""
+    mean, error = _found_noise(np.zeros((1000, 2)), sigma_m, outliers=0.01)
+    assert mean == pytest.approx(sigma_m * norm.ppf(0.5 + 0.25 / 0.99**4) / norm.ppf(0.75), abs=3.0 * error)
