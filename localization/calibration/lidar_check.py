@@ -76,8 +76,7 @@ _MAX_RADIUS_M = 0.6
 """Radius of a curve beyond which a robot slides outwards as if its LiDAR were farther back (.18 to .37 m in a simulated lap)."""
 _MIN_SHIFT_M, _BEYOND_AXLES_M = 0.15, 0.07
 """Least distance of a LiDAR from its mount that is named, and how far beyond its axles a robot may seem to turn [m]: the contacts of its
-wheels lie within them, and so does the point about which it turns. Wide curves of a vaultbot's laps,
-which are left out now, had 0.04 beyond."""
+wheels lie within them, and so does the point about which it turns. Wide curves of a vaultbot's laps, left out here, had 0.04 beyond."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Points of a planar scan that may be hits of the ground, which beams on hills meet before they meet a wall.
+"""Points of a planar scan that may be hits of the ground, which beams on hills reach before they reach a wall.
 
 The beams run along the plane on which the robot stands. Ground of curvature h'' rises over this plane by h'' d^2 / 2 at the distance d
-(Taylor), and meets the beams of a scanner at height z from about d = sqrt(2 z / |h''|) on.
+(Taylor), and reaches the beams of a scanner at height z from about d = sqrt(2 z / |h''|) on.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ class GroundHits:
             return scan
         mount, rise = self._mounts.get(scan.frame_id, Mount()), 0.5 * _SIGMAS * curvature
         x, y, z = (scan.points @ mount.rotation.T + (mount.x, mount.y, mount.z)).T
-        seen = scan.select(z > rise * (x * x + y * y))
-        self._left_out += len(scan.points) - len(seen.points)
+        above = scan.select(z > rise * (x * x + y * y))
+        self._left_out += len(scan.points) - len(above.points)
         self._nearest_m, self._frame = min(self._nearest_m, math.sqrt(max(mount.z, 0.0) / rise)), scan.frame_id
-        return seen
+        return above
 
     def warnings(self) -> list[str]:
         """A sentence where many points were left out."""
         if self._left_out <= _REPORTED_SHARE * self._points:
             return []
         return [
-            f"on hills the planar scanner '{self._frame}' sees the ground from {self._nearest_m:.1f} m on: "
-            f"{100.0 * self._left_out / self._points:.0f} % of its points are not used, as they may be hits of the ground. Use a 3D LiDAR "
-            "there, or mount the scanner higher."
+            f"on hills the beams of the planar scanner '{self._frame}' may hit the ground from {self._nearest_m:.1f} m on: since "
+            f"the ground was found to tilt, {100.0 * self._left_out / self._points:.0f} % of its points are not used. Use a 3D "
+            "LiDAR there, or mount the scanner higher."
         ]

@@ -44,7 +44,7 @@ _MIN_TRAVEL_M, _MIN_TURN_RAD = 1.5, 0.4
 that is hit at a right angle; 0.4 rad change these by 8 %."""
 _VIEW_EVERY_M, _VIEW_EVERY_RAD = 0.15, 0.3
 _VIEWS, _MAX_VIEWS = 6, 100
-"""Views that a scan is compared with, and that are kept. A range that is the same on the way of the former is looked through."""
+"""Views that a scan is compared with, and that are kept. A range that is the same on the way of the former is compared."""
 _SAME_FOR_M = _VIEWS * _VIEW_EVERY_M
 _SEEN_THROUGH_M = 0.15
 """A beam that goes so much farther than a surface shows that this is not there; errors of the way by wheels over a metre are smaller."""
@@ -119,7 +119,7 @@ class OwnBody:
         lidar.way_m = self._way_m
         way_m, heading = lidar.viewed
         if candidates and len(lidar.views) >= _VIEWS:
-            self._look_through(lidar, scan)
+            self._compare_views(lidar, scan)
         if self._way_m - way_m >= _VIEW_EVERY_M or abs(self._pose[2] - heading) >= _VIEW_EVERY_RAD:
             lidar.viewed = self._way_m, self._pose[2]
             lidar.views.append(_View(self._pose, self._pose_by_gyro, scan))
@@ -132,12 +132,12 @@ class OwnBody:
         self.is_found = True
         return replace(step, scan=scan.select(~is_own))
 
-    def _look_through(self, lidar: _Lidar, scan: Scan) -> None:
-        """Look for ranges that are the same, and through whose place in the world other beams go."""
+    def _compare_views(self, lidar: _Lidar, scan: Scan) -> None:
+        """Find ranges that stay the same, and through whose place in the world other beams go."""
         mount, views = self._mounts.get(scan.frame_id, Mount()), list(lidar.views)[-_VIEWS:]
         lidars = se2.compose(np.array([self._pose, *(view.pose for view in views)]), np.array([mount.x, mount.y, mount.yaw]))
         ranges = np.array([_nearest(view.scan.points) for view in views])
-        _look_through(lidar.bearings, _nearest(scan.points), se2.between(lidars[0], lidars[1:]), ranges, lidar.seen_through)
+        _count_views(lidar.bearings, _nearest(scan.points), se2.between(lidars[0], lidars[1:]), ranges, lidar.seen_through)
 
     def report(self) -> None:
         """Declare what was left out, if it is more than a few points."""
@@ -184,6 +184,12 @@ def _sectors(is_own: BoolArray) -> str:
     return "at bearings of " + ", ".join(f"{first} to {last + 1} deg" for first, last in degrees)
 
 
+@subroutine
+def _bearing(x: float, y: float) -> int:
+    """Index of the bearing of 1 deg of a point about the LiDAR."""
+    return math.floor(math.atan2(y, x) * (_BEARINGS / (2.0 * math.pi))) % _BEARINGS
+
+
 @kernel
 def _find_own(
     points: FloatArray, travelled: float, heading: float, bearings: FloatArray, seen_through: FloatArray, is_own: BoolArray
@@ -200,7 +206,7 @@ def _find_own(
         x, y = points[i, 0], points[i, 1]
         ranges[i], bins[i] = math.sqrt(x * x + y * y), -1
         if ranges[i] < _MAX_BODY_RANGE_M:
-            bins[i] = k = math.floor(math.atan2(y, x) * (_BEARINGS / (2.0 * math.pi))) % _BEARINGS
+            bins[i] = k = _bearing(x, y)
             nearest[k] = min(nearest[k], ranges[i])
     candidates = 0
     for k in range(_BEARINGS):
@@ -235,7 +241,7 @@ def _nearest(points: FloatArray) -> FloatArray:
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         if math.isfinite(x) and math.isfinite(y):
-            k = math.floor(math.atan2(y, x) * (_BEARINGS / (2.0 * math.pi))) % _BEARINGS
+            k = _bearing(x, y)
             nearest[k] = np.fmin(nearest[k], math.sqrt(x * x + y * y))
     return nearest
 
@@ -244,7 +250,7 @@ def _nearest(points: FloatArray) -> FloatArray:
 def _goes_through(ranges: FloatArray, x: float, y: float) -> bool:
     """Whether the beams (360,) go through the place ``x``, ``y`` [m] about their LiDAR, those beside it included."""
     r = math.sqrt(x * x + y * y)
-    k = math.floor(math.atan2(y, x) * (_BEARINGS / (2.0 * math.pi))) % _BEARINGS
+    k = _bearing(x, y)
     if r < _SAME_RANGE_M or math.isnan(ranges[k]):
         return False
     least = min(np.fmin(ranges[k - 1], ranges[k]), np.fmin(ranges[(k + 1) % _BEARINGS], ranges[k]))
@@ -252,7 +258,7 @@ def _goes_through(ranges: FloatArray, x: float, y: float) -> bool:
 
 
 @kernel
-def _look_through(bearings: FloatArray, now: FloatArray, poses: FloatArray, ranges: FloatArray, seen_through: FloatArray) -> None:
+def _count_views(bearings: FloatArray, now: FloatArray, poses: FloatArray, ranges: FloatArray, seen_through: FloatArray) -> None:
     """Count a scan in ``seen_through`` (360,) of those ``bearings`` (360, 5) that have kept their range and are not part of the world:
     a beam of a view goes through the place where the surface is now, or one of now through the place where it was at that view.
 
@@ -273,10 +279,9 @@ def _look_through(bearings: FloatArray, now: FloatArray, poses: FloatArray, rang
         a = (k + 0.5) * (2.0 * math.pi / _BEARINGS)
         x, y = bearings[k, 0] * math.cos(a), bearings[k, 0] * math.sin(a)
         for v in range(poses.shape[0]):
-            px, py, yaw = poses[v]
-            c, s = math.cos(yaw), math.sin(yaw)
-            was_x, was_y = px + c * x - s * y, py + s * x + c * y  # where it was at the view, in the LiDAR's frame of now
-            dx, dy = x - px, y - py
-            if _goes_through(now, was_x, was_y) or _goes_through(ranges[v], c * dx + s * dy, c * dy - s * dx):
+            now_T_view = se2.triple(poses[v])
+            was_x, was_y = se2.scalar_transform(now_T_view, x, y)
+            is_x, is_y = se2.scalar_transform(se2.scalar_inverse(now_T_view), x, y)
+            if _goes_through(now, was_x, was_y) or _goes_through(ranges[v], is_x, is_y):
                 seen_through[k] += 1.0
                 break

@@ -23,14 +23,14 @@ def _scan(ranges, frame="laser", is_planar=True):
 def test_points_beyond_the_reach_of_curved_ground_stay():
     """Ground of 2 x .02 rises by .02 d^2 over the robot's plane: to .3 m after 3.87 m from the body, 3.47 to 4.27 m from the scanner."""
     ranges = np.linspace(1.0, 8.0, 141)
-    seen = GroundHits(MOUNTS).leave_out(_scan(ranges), 0.02)
-    left = np.hypot(seen.points[:, 0], seen.points[:, 1])
+    above = GroundHits(MOUNTS).leave_out(_scan(ranges), 0.02)
+    left = np.hypot(above.points[:, 0], above.points[:, 1])
     assert left.min() == 1.0
     assert 3.4 < left.max() <= 4.28
-    assert len(seen.offsets) == len(seen.points)
+    assert len(above.offsets) == len(above.points)
 
 
-def test_beams_that_point_down_meet_the_ground_earlier():
+def test_beams_that_point_down_reach_the_ground_earlier():
     near, far = (GroundHits(MOUNTS).leave_out(_scan(np.full(9, r), "pitched"), 0.02).points for r in (1.5, 2.9))
     assert len(near) == 9
     assert not len(far)
@@ -48,5 +48,5 @@ def test_many_points_on_the_ground_are_reported():
     for ranges in (np.full(30, 1.0), np.full(10, 20.0)):
         hits.leave_out(_scan(ranges), 0.02)
     (text,) = hits.warnings()
-    assert f"'laser' sees the ground from {math.sqrt(0.3 / 0.02):.1f} m on" in text
+    assert f"'laser' may hit the ground from {math.sqrt(0.3 / 0.02):.1f} m on" in text
     assert "25 % of its points" in text

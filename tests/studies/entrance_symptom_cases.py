@@ -284,7 +284,7 @@ def bad_fixes(message: Any) -> Any:
 
 
 def mocap_pose(base: BaseLog) -> Edit:
-    """PoseStamped of the truth whose name says nothing, with the first message latched from the session before."""
+    """PoseStamped of the truth whose name shows nothing of that, with the first message latched from an earlier run."""
 
     def edit(records: list[Record]) -> list[Record]:
         track = healthy(base).reference
