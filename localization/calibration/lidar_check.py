@@ -69,14 +69,12 @@ _SNAP_RAD = math.radians(4.0)
 _MIN_LEVEL = 0.5
 """Least vertical component of the axis of a planar LiDAR: beyond 60 degrees of tilt it measures no motion along the floor."""
 _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
-_SHARP_TURN_RAD, _MIN_SHARP, _SHIFT_TURN_RAD, _MAX_SHIFT_SIGMA_M = 0.05, 4, 1.0, 0.03
-"""Turn of an interval in which sideways motion shows where the LiDAR is, the least number of these and their turns in all, and the largest
-standard error of that place [m]."""
-_MAX_RADIUS_M = 0.6
-"""Radius of a curve beyond which a robot slides outwards as if its LiDAR were farther back (.18 to .37 m in a simulated lap)."""
-_MIN_SHIFT_M, _BEYOND_AXLES_M = 0.15, 0.07
-"""Least distance of a LiDAR from its mount that is named, and how far beyond its axles a robot may seem to turn [m]: the contacts of its
-wheels lie within them, and so does the point about which it turns. Wide curves of a vaultbot's laps, left out here, had 0.04 beyond."""
+_SHIFT_TURN_RAD, _SHIFT_SIGMAS, _MIN_SHIFT_M, _CERTAIN_SHIFT_M = 1.0, 3.0, 0.15, 0.05
+"""Turns in all that show where along the robot a LiDAR is, the standard errors by which its place is beyond every point about which the
+robot may turn, the least distance from its mount that is named, and the standard error from where on no more driving is read [m]."""
+_SLIDE_SIGMA_S, _MIN_SIDEWAYS_M = 0.1, 0.004
+"""Sideways speed in a curve over v wz: -0.12 s on the Husky of tests/data/drive-husky, 0.02 to 0.09 by `slip_at_speed`; and the least
+standard deviation of an interval's sideways motion by scans."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +107,12 @@ class _Travel:
     delta: Pose2 | None = None
     """(3,) by the scans since ``begin_ns``, NaN for a way that the scene does not show; None before the first."""
     rows: list[tuple[int, int, Pose2]] = field(default_factory=list)
+    arcs: list[FloatArray] = field(default_factory=list)
+    """For each of ``rows``, (2,): sideways motion of a point that moves straight ahead alone, by the ways and turns from scan to scan [m],
+    and the integral of v wz over time [m rad/s]."""
+    arc: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """That since ``begin_ns``."""
+    last_ns: int = 0
 
 
 class LidarCheck:
@@ -187,7 +191,7 @@ class LidarCheck:
     def _is_healthy(self, frame: str) -> bool:
         direction = _direction(*self._compare(frame)[:2])
         is_known = self._is_clock_known or (self._wheels_late_s(frame) if self._gyro is None else self._by_turns(frame)) is not None
-        if direction is None or not is_known or abs(direction) > _MAX_SLIDE_RAD or self._shift(frame, direction) is not None:
+        if direction is None or not is_known or abs(direction) > _MAX_SLIDE_RAD or self._shift(frame) is not None:
             return False
         return abs(direction) <= _HEALTHY_RAD or abs(self._straight(frame) or math.pi) <= _HEALTHY_RAD
 
@@ -205,33 +209,35 @@ class LidarCheck:
         sigma = math.sqrt(float(np.sum((weight * apart) ** 2)))
         return mean if sigma < _MAX_YAW_SIGMA_RAD and _is_equally_long(by_wheels, by_scans) else None
 
-    def _shift(self, frame: str, direction: float) -> float | None:
-        """How far ahead of its mount the LiDAR is, by its sideways motion in turns against the ``direction`` of its travel [m]; None where
-        it may be there.
+    def _shift(self, frame: str) -> tuple[float, float] | None:
+        """How far ahead of its mount the LiDAR is, by its sideways motion in turns, and its standard error [m]; None where it may be there.
 
-        A sensor s ahead of where it is taken to be moves sideways by 2 s tan(a / 2) as the robot turns by a, beside the chord of the arc.
+        A sensor s ahead of where it is taken to be, on a robot that turns by a about a point x ahead of its middle, moves sideways by
+        (s - x) sin(a) beside the arc, by its yaw times the way, and by the slide in curves: least squares with priors of yaw and slide.
+        Robots turn about a point between their axles.
         """
-        moves = np.array([delta for _, _, delta in self._travels[frame].rows]).reshape(-1, 3)
-        least = np.maximum(_SHARP_TURN_RAD, np.abs(moves[:, 0]) / _MAX_RADIUS_M)
-        moves = moves[np.isfinite(moves).all(axis=1) & (np.abs(moves[:, 2]) > least)]
-        if len(moves) < _MIN_SHARP or float(np.abs(moves[:, 2]).sum()) < _SHIFT_TURN_RAD:
+        travel = self._travels[frame]
+        moves = np.array([delta for _, _, delta in travel.rows]).reshape(-1, 3)
+        arcs = np.array(travel.arcs).reshape(-1, 2)
+        is_shown = np.isfinite(moves).all(axis=1)
+        moves, arcs = moves[is_shown], arcs[is_shown]
+        if float(np.abs(moves[:, 2]).sum()) < _SHIFT_TURN_RAD:
             return None
-        half, ways = np.tan(0.5 * moves[:, 2]), (moves[:, 0] + 1j * moves[:, 1]) * np.exp(-1j * direction)
-        side, arm = ways.imag - ways.real * half, 2.0 * half
-        squares = float(arm @ arm)
-        shift = float(arm @ side) / squares
-        sigma = math.sqrt(float(np.sum((arm * (side - shift * arm)) ** 2))) / squares
-        turns_about_m = float(self._robot.models.get("skid_steer", {}).get("x_cr_0", 0.0))
-        ahead, most = shift + turns_about_m, max(_MIN_SHIFT_M, 0.5 * self._robot.geometry.wheelbase_m + _BEYOND_AXLES_M)
-        is_sure = sigma < _MAX_SHIFT_SIGMA_M and _is_equally_long(*self._compare(frame)[:2])
-        return ahead if abs(ahead) > most and is_sure else None
+        columns, sideways = np.stack([np.sin(moves[:, 2]), arcs[:, 1], moves[:, 0]], axis=1), moves[:, 1] - arcs[:, 0]
+        shift, sigma = with_priors(columns, sideways, np.array([math.inf, _SLIDE_SIGMA_S, _MAX_SLIDE_RAD]))
+        half_m = 0.5 * self._robot.geometry.wheelbase_m
+        if abs(shift) - _SHIFT_SIGMAS * sigma < max(_MIN_SHIFT_M, half_m) or not _is_equally_long(*self._compare(frame)[:2]):
+            return None
+        turns_about_m = float(np.clip(self._robot.models.get("skid_steer", {}).get("x_cr_0", 0.0), -half_m, half_m))
+        return shift + turns_about_m, sigma
 
-    def _shifted(self, frame: str, direction: float) -> LidarFinding | None:
+    def _shifted(self, frame: str) -> LidarFinding | None:
         """A LiDAR that is elsewhere along the robot; None where it is where its mount has it."""
-        ahead, mount = self._shift(frame, direction), self._mounts[frame]
-        if ahead is None:
+        found, mount = self._shift(frame), self._mounts[frame]
+        if found is None:
             return None
-        right, error_m = round(mount.x + ahead, 3), 0.25 * self._robot.geometry.wheelbase_m
+        ahead, sigma = found
+        right, error_m = round(mount.x + ahead, 3), math.hypot(0.25 * self._robot.geometry.wheelbase_m, sigma)
         text = (
             f"{self._topic}: in turns it moves sideways as a sensor does that is {abs(ahead):.2f} m"
             f" {'ahead of' if ahead > 0.0 else 'behind'} the mount of '{frame}', farther than from any point between the axles, about which"
@@ -239,7 +245,7 @@ class LidarCheck:
             f" {right:g} m (+- {error_m:.2f}, as the point about which it turns is not known) in /tf_static, or in [mounts.{frame}] where"
             " the log has none."
         )
-        return LidarFinding(text, frame, replace(mount, x=right), is_certain=True)
+        return LidarFinding(text, frame, replace(mount, x=right), is_certain=sigma < _CERTAIN_SHIFT_M)
 
     def _by_turns(self, frame: str) -> LidarTurns | None:
         """Against wheels and gyro; None for too few turns."""
@@ -317,7 +323,7 @@ class LidarCheck:
         if direction is None:
             direction = straight
         if direction is not None and abs(direction) <= _MAX_SLIDE_RAD and (straight is None or abs(straight) < _MIN_YAW_RAD):
-            return self._shifted(frame, direction)
+            return self._shifted(frame)
         if direction is None:
             return None
         if (turned_rad := _largest_change(*_without_far(by_wheels, by_scans))) > _MAX_SLIDE_RAD:
@@ -431,13 +437,16 @@ def _register(travel: _Travel, scan: Scan, mount: Mount, config: LidarConfig) ->
     motion = travel.odometry.register(profile_of(scan, mount, config))
     now = scan.middle_ns
     if motion is None or travel.delta is None:
-        travel.begin_ns, travel.delta = now, np.zeros(3)
+        travel.begin_ns, travel.last_ns, travel.delta, travel.arc = now, now, np.zeros(3), np.zeros(2)
         return
-    x, y, turn = motion.delta.tolist()
-    travel.delta = se2.compose(travel.delta, np.array([x, y, turn] if motion.has_translation else [math.nan, math.nan, turn]))
+    x, y, turn = motion.delta.tolist() if motion.has_translation else (math.nan, math.nan, float(motion.delta[2]))
+    chord_m, speed = x / math.cos(0.5 * turn), x / max((now - travel.last_ns) * 1e-9, 1e-3)
+    travel.arc = travel.arc + np.array([chord_m * math.sin(travel.delta[2] + 0.5 * turn), speed * turn])
+    travel.delta, travel.last_ns = se2.compose(travel.delta, np.array([x, y, turn])), now
     if now - travel.begin_ns >= _INTERVAL_S * 1e9:
         travel.rows.append((travel.begin_ns, now, travel.delta))
-        travel.begin_ns, travel.delta = now, np.zeros(3)
+        travel.arcs.append(travel.arc)
+        travel.begin_ns, travel.delta, travel.arc = now, np.zeros(3), np.zeros(2)
 
 
 def _ways(wheels: Sequence[WheelSample], radius_m: float) -> tuple[FloatArray, FloatArray]:
@@ -457,6 +466,17 @@ def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
     if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < _MIN_COHERENCE * size:
         return None
     return float(np.angle(product.sum()))
+
+
+def with_priors(columns: FloatArray, values: FloatArray, sigmas: FloatArray) -> tuple[float, float]:
+    """First coefficient of the least squares of ``values`` (n,) on ``columns`` (n, k) with priors of mean 0 and ``sigmas`` (k,), and its
+    standard error, with the scatter of what is left as noise."""
+    noise = _MIN_SIDEWAYS_M
+    for _ in range(3):
+        covariance = np.linalg.inv(columns.T @ columns / noise**2 + np.diag(sigmas**-2.0))
+        found = covariance @ columns.T @ values / noise**2
+        noise = max(_MIN_SIDEWAYS_M, math.sqrt(float(np.mean((values - columns @ found) ** 2))))
+    return float(found[0]), math.sqrt(float(covariance[0, 0]))
 
 
 def _is_equally_long(by_wheels: FloatArray, by_scans: FloatArray) -> bool:

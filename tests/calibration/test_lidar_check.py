@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.calibration.lidar_check import LidarCheck, check_lidar, corrected, open_log_checked
+from localization.calibration.lidar_check import LidarCheck, check_lidar, corrected, open_log_checked, with_priors
 from localization.evaluation.references import reference_track
 from localization.evaluation.scores import score
 from localization.events import ImuSample, Scan, WheelSample
@@ -25,6 +25,7 @@ from tests.helpers.entrance_drives import Publishing, Vehicle, drive, records_of
 from tests.helpers.extended import cases
 from tests.helpers.hostile_logs import Case, write_case
 from tests.helpers.online import ROBOT, drive_log
+from tests.studies.lidar_mounts import found_on
 
 CASE = Path(__file__).parents[1] / "data" / "cases" / "H11-lidar-yaw-180"
 
@@ -76,9 +77,32 @@ def test_lidar_that_is_elsewhere_along_the_robot_is_found_in_turns(tmp_path: Pat
 
 @pytest.mark.extended
 def test_robot_that_slides_outwards_in_one_curve_has_its_lidar_where_it_is(tmp_path: Path) -> None:
-    """12 s of a simulated lap, taken for a LiDAR .29 m farther back."""
+    """12 s of a simulated lap in which a turn begins within an interval."""
     log = write_case(Case(0, "laps", "mcap-file", "none", ""), tmp_path, 1)
     assert check_lidar(open_log(log, load_robot("vaultbot"))) is None
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("shift", [-0.45, 0.0, 0.45])
+def test_place_of_a_lidar_shows_in_wide_curves(shift: float) -> None:
+    """Laps of a robot that slides outwards, with its centre of gravity aside."""
+    effects = {"cg_offset_x": 0.03, "lateral_slip_speed": 0.05, "lidar_offset_x": shift}
+    found, _, left_m = found_on("pioneer_3at", "laps", 5, effects)
+    assert len(found) == (shift != 0.0)
+    assert abs(left_m) < 0.1
+
+
+def test_place_of_a_lidar_is_open_on_a_circle() -> None:
+    """Its yaw would explain the same motion."""
+    sizes: list[tuple[float, float]] = []
+    for way in (np.full(60, 0.4), np.linspace(-0.4, 0.4, 60)):
+        turn = np.full(60, 0.2)
+        columns = np.stack([np.sin(turn), 0.8 * turn * way, way], axis=1)
+        sizes.append(with_priors(columns, 0.45 * np.sin(turn), np.array([math.inf, 0.1, 0.35])))
+    (_, on_circle), (place, both_ways) = sizes
+    assert on_circle > 0.3
+    assert place == pytest.approx(0.45, abs=0.01)
+    assert both_ways < 0.01
 
 
 @pytest.mark.parametrize("degrees", cases([90.0, -90.0, 45.0, 30.0, 178.0], ("178.0",)))
