@@ -29,7 +29,7 @@ from scipy.stats import chi2
 
 from localization.errors import EvaluationError
 from localization.evaluation.metrics import match
-from localization.evaluation.references import ReferenceTrack
+from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -42,7 +42,7 @@ _MIN_STEP_M, _MIN_STEP_RAD = 0.01, 0.01
 _STRETCHES = (16, 8)
 """The most that the reference's noise allows. With sixteen, half the sigma of distances alone shows in 95 % of drives: 4 chi2(16) / 16 is
 above 1.8, the 97.5th percentile of one that is right."""
-_MIN_STRETCHES = 6
+_MIN_STRETCHES, _MIN_NEIGHBOURS = 6, 30
 _MAX_NOISE_SHARE = 1.0 / 3.0
 """Largest share of the reference in a stretch's variance: neighbours share it, and what is left must show an error of the claim."""
 
@@ -259,13 +259,45 @@ def pose_consistency(
     return _along_one_run(found, probability, is_dead_reckoning)
 
 
+@dataclass(frozen=True)
+class ScatterConsistency:
+    """NEES with the noise of a reference that has no covariances, as its poses scatter from one to the next."""
+
+    consistency: Consistency
+    sigma_m: float
+    sigma_rad: float
+
+
+def scatter_consistency(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: float = 1.0) -> ScatterConsistency | None:
+    """NEES of a trajectory with white noise of the reference: half the mean square of the errors' change from one pose to the next.
+
+    Slow errors, as of covariances that are too small, are not in it. None where `pose_consistency` has none, or of too few neighbours.
+    """
+    if trajectory.covariances is None or reference.yaws is None:
+        return None
+    found = pose_errors(trajectory, reference, max_gap_s)
+    near = np.diff(found.stamps_ns) < max_gap_s * 1e9
+    if found.covariances is None or found.motions is None or near.sum() < _MIN_NEIGHBOURS:
+        return None
+    change = np.diff(_start_R_body(found.motions) @ found.errors[..., None], axis=0)[near, :, 0]
+    x, y, yaw = 0.5 * np.mean(change**2, axis=0)
+    sigma_m, sigma_rad = math.sqrt(0.5 * float(x + y)), math.sqrt(float(yaw))
+    consistent = pose_consistency(trajectory, with_noise(reference, sigma_m, sigma_rad), max_gap_s=max_gap_s)
+    return None if consistent is None else ScatterConsistency(consistent, sigma_m, sigma_rad)
+
+
+def _start_R_body(motions: FloatArray) -> FloatArray:
+    """(N, 3, 3) rotations of errors in the body to the frame of the start, by ``motions`` (N, 3)."""
+    c, s, o = np.cos(motions[:, 2]), np.sin(motions[:, 2]), np.zeros(len(motions))
+    return np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)
+
+
 def _along_one_run(found: PoseErrors, probability: float, is_dead_reckoning: bool) -> Consistency:
     assert found.covariances is not None
     assert found.motions is not None
     errors, covariances = found.errors, found.covariances
     if errors.shape[1] == 3:  # an offset in the plane stays, while its components in the body turn with the robot
-        c, s, o = np.cos(found.motions[:, 2]), np.sin(found.motions[:, 2]), np.zeros(len(errors))
-        start_R_body = np.stack([np.stack([c, -s, o], -1), np.stack([s, c, o], -1), np.stack([o, o, o + 1.0], -1)], axis=-2)
+        start_R_body = _start_R_body(found.motions)
         errors = np.einsum("nij,nj->ni", start_R_body, errors)
         covariances = start_R_body @ covariances @ np.swapaxes(start_R_body, 1, 2)
     _, dof, whitened = normalize(errors, covariances)

@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from localization.evaluation.consistency import Consistency, pose_consistency, position_consistency, stretch_consistency
+from localization.evaluation.consistency import (
+    Consistency,
+    ScatterConsistency,
+    pose_consistency,
+    position_consistency,
+    scatter_consistency,
+    stretch_consistency,
+)
 from localization.evaluation.metrics import Accuracy, evaluate
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
@@ -36,6 +43,8 @@ class Result:
     """NEES of distances from the start, 1 expected, where the reference has positions and their covariances, but no headings."""
     stretch_nees: Consistency | None = None
     """NEES of dead reckoning's motions over stretches of the drive, 3 expected, 1 of positions, where the reference has covariances."""
+    scatter_nees: ScatterConsistency | None = None
+    """NEES with the scatter of a reference without covariances, where `nees_mean` is above its band."""
     contradictions: tuple[str, ...] = ()
     """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
 
@@ -115,4 +124,6 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None, contradiction
     by_distances = None
     if reference.yaws is None:
         by_distances = position_consistency(published, reference, _LEVER_SIGMA_M, is_dead_reckoning=drifts)
-    return Result(run, accuracy, mean, live, band, by_distances, stretches)
+    is_over = found is not None and found.mean > found.band[1] and reference.covariances is None
+    scatter = scatter_consistency(published, reference) if is_over and not drifts else None
+    return Result(run, accuracy, mean, live, band, by_distances, stretches, scatter)

@@ -243,6 +243,8 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
         results_.append((verdict_, text))
     if nees is not None and not math.isnan(nees):
         results_.append(_test("NEES", nees, _nees_band(line.result), "errors"))
+        if explained := _by_scatter(line.result, nees, [word for word, _ in results_[:-1]]):
+            results_[-1] = ("fits", explained)
         by_pose = results_[-1][0]
     elif (distances := line.result.position_nees) is not None:
         results_.append(_test("NEES of distances", distances.mean, distances.band, "errors", dof=1))
@@ -273,6 +275,17 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     return [f"{whose} could not be tested: that takes scans, or a reference with headings or with covariances of its positions."]
 
 
+def _by_scatter(result: Result, nees: float, innovations: Sequence[str]) -> str:
+    """That the scatter of a reference without covariances explains the errors beyond theirs, where innovations fit as well; else ""."""
+    if (scatter := result.scatter_nees) is None or innovations != ["fits"] or scatter.consistency.verdict == "overconfident":
+        return ""
+    noise = f"{metres(scatter.sigma_m)} and {math.degrees(scatter.sigma_rad):.2g} deg"
+    return (
+        f"mean NEES {scatter.consistency.mean:.3g}, where {_DOF} is expected, with {noise} by which the poses of the reference scatter from"
+        f" one to the next ({nees:.3g} if it were exact)"
+    )
+
+
 def _shown(result: Result) -> str:
     """Which errors of the covariances the few independent samples of one drive show."""
     dof, band = _DOF, _nees_band(result)
@@ -287,6 +300,8 @@ def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[
     nees = best.result.nees_mean
     if not isinstance(reference, ReferenceTrack) or reference.covariances is not None or nees is None or nees <= _nees_band(best.result)[1]:
         return []
+    if best.result.scatter_nees is not None and best.result.scatter_nees.consistency.verdict != "overconfident":
+        return ["The scatter may be the reference's or the estimate's: pass the reference's noise with --reference-sigma."]
     return ["NEES takes this reference as exact, because it has no covariances: pass its noise with --reference-sigma."]
 
 

@@ -8,6 +8,8 @@ import pytest
 from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.evaluation.scores import score
 from localization.report.summary import verdict
+from localization.trajectory import Trajectory
+from motion_models import se2
 from tests.helpers.report import run, track
 
 SIGMA_M = 0.6
@@ -56,3 +58,25 @@ def test_summary_of_covariances_too_large_takes_the_errors_found():
     assert "Errors below 0.797 m" in text
     assert "by its own covariances of 14.1 m" in text
     assert "% less than dead reckoning" in text
+
+
+@pytest.mark.parametrize(
+    ("jitter_m", "drift_m", "expected"), [(0.1, 0.0, "consistent"), (0.0, 0.6, "overconfident"), (0.1, 1.2, "overconfident")]
+)
+def test_summary_takes_the_scatter_of_a_reference_without_covariances_as_its_noise(jitter_m: float, drift_m: float, expected: str):
+    """A slow error of the estimate is none."""
+    rng = np.random.default_rng(11)
+    exact = track()
+    jitter = rng.normal(scale=jitter_m, size=exact.positions.shape)
+    reference = dataclasses.replace(exact, positions=exact.positions + jitter, yaws=exact.yaws + 0.1 * rng.normal(scale=jitter_m, size=400))
+    one = run("diff_drive", "ekf", nis=rng.chisquare(3, size=400))
+    slow = np.column_stack([drift_m * np.sin(np.linspace(0.0, 6.0, 400)), np.zeros((400, 2))])
+    poses = se2.compose(one.trajectory.poses, slow)
+    small = np.broadcast_to(np.diag([0.02, 0.02, 0.005]) ** 2, (400, 3, 3)) * np.linspace(0.01, 1.0, 400)[:, None, None]
+    one = dataclasses.replace(one, trajectory=Trajectory(one.trajectory.stamps_ns, poses, small))
+    results = score([one], reference)
+    assert f"covariances are {expected}" in verdict(results, reference)
+    scatter = results[0].scatter_nees
+    if scatter is not None and jitter_m:
+        assert scatter.sigma_m == pytest.approx(jitter_m, rel=0.1)
+        assert ("poses of the reference scatter" in verdict(results, reference)) == (expected == "consistent")
