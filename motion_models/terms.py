@@ -30,7 +30,7 @@ _LARGEST = 1e6
 """Largest coefficient, in SI units."""
 _TIME_CONSTANTS_S = (0.1, 1e5)
 """Least and largest time constant of a rise [s]: a sample, and more than a day."""
-_MOST_TERMS = 32
+MOST_TERMS = 32
 """Most terms of one model: each is a parameter that the filter may correct."""
 
 
@@ -259,8 +259,8 @@ def parse_terms(table: Any, where: str) -> tuple[Term, ...]:
             if term.name in found:
                 raise RobotError(f"{where}.{component}: {term.expression} stands there twice; add its coefficients.")
             found[term.name] = term
-    if len(found) > _MOST_TERMS:
-        raise RobotError(f"{where}: has {len(found)} terms; at most {_MOST_TERMS} make sense.")
+    if len(found) > MOST_TERMS:
+        raise RobotError(f"{where}: has {len(found)} terms; at most {MOST_TERMS} make sense.")
     return tuple(sorted(found.values(), key=lambda term: COMPONENTS.index(term.component)))
 
 

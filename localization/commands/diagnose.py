@@ -18,7 +18,7 @@ from localization.calibration.windows import WindowConfig
 from localization.commands.common import in_radians, new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
-from localization.diagnosis.diagnose import DiagnosisConfig, examine
+from localization.diagnosis.diagnose import DiagnosisConfig
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
 from localization.diagnosis.extension import EXTEND_ADVICE, EXTENSION_HEADS, ExtendedResult, extend, suggests_extension
 from localization.diagnosis.findings import (
@@ -33,11 +33,11 @@ from localization.diagnosis.findings import (
     describe_tolerated,
     is_contesting,
     sentence,
-    unit_of,
 )
 from localization.diagnosis.handover import Reader, check_findings
 from localization.diagnosis.linearization import default_model
 from localization.diagnosis.result import DiagnosisResult
+from localization.diagnosis.suited_model import examine_beside_suited
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -109,8 +109,9 @@ class Diagnose:
             with console.status("reading the healthy drive"):
                 baseline = estimate_baseline(self._cut(self._open(self.healthy, robot)), model)
         with console.status("searching for causes"):
-            found = examine(drive, model, self.config, baseline)
-            by_suited, is_named = self._notes_by_suited_model(found, drive)
+            of_model = examine_beside_suited(drive, model, self.config, baseline)
+            found, by_suited = of_model.found, of_model.notes
+            is_named = of_model.suited is not None and of_model.suited.verdict != "unexplained"
         extended = None
         if self.extend:
             with console.status("searching for terms"):
@@ -169,19 +170,6 @@ class Diagnose:
     def _cut(self, log: Log) -> Drive:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
-
-    def _notes_by_suited_model(self, found: DiagnosisResult, drive: Drive) -> tuple[tuple[str, ...], bool]:
-        """What the model that suits the robot would find, in a sentence, where a simpler one was chosen and differs from the drive: what it
-        does not have comes out as causes, or as unexplained; and whether the suited model explains the drive."""
-        d, name = found.diagnosis, default_model(drive.robot)
-        is_off = bool(d.findings) or d.verdict == "unexplained"
-        if not self.model or self.model == name or not is_off or self.healthy is not None:
-            return (), False
-        other = examine(drive, make_model(name, drive.robot), self.config).diagnosis
-        causes = ", ".join(f"{f.definition.label} {f.size:+.3g}{unit_of(f.cause)}" for f in other.findings) or "no cause"
-        return (
-            f"{name}, which suits {drive.robot.name}, is {other.verdict} on this drive and names {causes}.",
-        ), other.verdict != "unexplained"
 
     def _with_written_robot(self, found: DiagnosisResult, reader: Reader | None) -> DiagnosisResult:
         """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""

@@ -123,19 +123,25 @@ def diagnose(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = 
     return examine(drive, model, config, baseline).diagnosis
 
 
-def examine(drive: Drive, model: MotionModel, config: DiagnosisConfig | None = None, baseline: Baseline | None = None) -> DiagnosisResult:
-    """Diagnosis as by `diagnose`, with what pictures, patches and other methods start from."""
+def examine(
+    drive: Drive,
+    model: MotionModel,
+    config: DiagnosisConfig | None = None,
+    baseline: Baseline | None = None,
+    names: Sequence[Cause] | None = None,
+) -> DiagnosisResult:
+    """Diagnosis as by `diagnose`, with what pictures, patches and other methods start from; of all causes, or of those of ``names``."""
     config = config or DiagnosisConfig()
     if len(drive.maneuvers) < config.fewest_windows:
         return DiagnosisResult(_with_data_errors(_undecidable(drive, model, config), drive), None, None)
     rng = np.random.default_rng(config.seed)
     predictor = make_predictor(drive, model, baseline)
-    searched = _search_contacts(predictor, config)
+    searched = _search_contacts(predictor, config) if names is None else _with_given(_start(predictor, config), names)
     chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
     if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
         searched, chosen = searched._replace(linearization=searched.first), ()
     found = _with_confirmed_names(searched, _conclude(searched, chosen, rng, config), config)
-    return _without_names_of_terms(searched, found, config)
+    return dataclasses.replace(_without_names_of_terms(searched, found, config), names=names)
 
 
 def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
@@ -234,6 +240,17 @@ def _is_error_less(new: _Searched, old: _Searched) -> bool:
     """Whether the contacts of ``new`` may be what those of ``old`` are off: beside them and all causes at any plausible size less than half
     of the model's error is left, or not clearly more than a wrong contact leaves."""
     return new.error.log_odds < max(_MAX_ERROR_SHARE * old.error.log_odds, _FOREIGN_LOG_ODDS)
+
+
+def _with_given(start: _Searched, names: Sequence[Cause]) -> _Searched:
+    """The causes of ``names`` about the contacts of the ``start``, with those that hold in a part of the drive, at the sizes that it
+    shows."""
+    known = {cause.key for cause in start.first.causes}
+    causes = (*start.first.causes, *(cause for cause in names if cause.key not in known and cause.spell is not None))
+    state = linearize(start.predictor, causes, {}, TOLERANCE)
+    chosen = tuple(i for i, cause in enumerate(causes) if cause.key in {named.key for named in names})
+    sizes = {causes[i]: float(np.clip(s, *causes[i].bounds)) for i, s in zip(chosen, state.problem.fit(chosen)[0], strict=True)}
+    return start._replace(linearization=linearize(start.predictor, causes, sizes, TOLERANCE), chosen=chosen)
 
 
 def _search(start: _Searched) -> _Searched:

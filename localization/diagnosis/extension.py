@@ -214,7 +214,7 @@ def extend(
     if not extension.is_better:
         return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
     left = _without(drive, predictor, search.removed) if search.effects else drive
-    again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config, predictor.baseline)
+    again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config, predictor.baseline, found.names)
     return ExtendedResult(_with_extension(again, extension, found), extension, whole.robot)
 
 
@@ -296,7 +296,7 @@ def _with_effects(
     if not extension.effects or found.predictor is None:
         return found
     drive, removed, before = found.predictor.drive, search.removed, found.diagnosis
-    again = examine(_without(drive, found.predictor, removed), model, config, found.predictor.baseline)
+    again = examine(_without(drive, found.predictor, removed), model, config, found.predictor.baseline, found.names)
     d = again.diagnosis
     rows = dict(d.discrepancy)
     for effect in extension.effects:

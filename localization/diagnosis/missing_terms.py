@@ -304,7 +304,14 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     design = _make_design(predictor, state, with_sizes(sizes), range(f), candidates, bound)
     own = 2.0 * math.log(len({cause.group for cause in state.causes})) + math.log(max(state.problem.count, 2))
     least = min(c.price for c in candidates)
-    prices = np.array([*(own for _ in state.causes), *(c.price for c in candidates), *(least + s.price for s in shapes)])
+    allowed = {cause.key for cause in (state.causes if found.names is None else found.names)}
+    prices = np.array(
+        [
+            *(own if cause.key in allowed else math.inf for cause in state.causes),
+            *(c.price for c in candidates),
+            *(least + s.price for s in shapes),
+        ]
+    )
     limits = np.full((len(prices), 2), (-math.inf, math.inf))
     limits[:f] = _size_limits(state)
     noise, chosen, previous = state.noise, named, None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Diagnosis
 from localization.diagnosis.linearization import Linearization
@@ -32,3 +34,5 @@ class DiagnosisResult:
     residuals: DriveDiscrepancies | None
     linearization: Linearization | None = None
     """The last linearization of the drive: its signatures, and its noise."""
+    names: Sequence[Cause] | None = None
+    """Causes to which it was limited; None without a limit."""

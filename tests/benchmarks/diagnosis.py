@@ -8,8 +8,8 @@ A case is determined by its number. No robot is exactly as its file: beside what
 deviate by as much as the diagnosis takes for the accuracy of robot files (`TOLERANCE`), and intervals are to hold the hidden size.
 Tables come from the rows: `--report` prints them without running anything.
 
-`--public [--quick] [--sources simulator,mujoco,windows] [--out FILE.jsonl] [--drives FOLDER]` runs the public benchmark instead
-(`tests.helpers.diagnosis_public`): effects of 30 kinds, most in no list, and other methods beside the diagnosis.
+`--public [--quick] [--sources simulator,mujoco,windows,fr079,csail] [--out FILE.jsonl] [--drives FOLDER]` runs the public benchmark
+instead (`tests.helpers.diagnosis_public`): effects of 32 kinds, most in no list, and other methods beside the diagnosis.
 """
 
 from __future__ import annotations
