@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,9 +17,10 @@ from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import TOLERANCE, candidate_causes, linearize, make_predictor
 from localization.diagnosis.result import DiagnosisResult
-from localization.diagnosis.spells import with_intervals
+from localization.diagnosis.spells import find_spells, with_intervals
 from localization.logs import open_log
 from localization.simulation.experiments import Experiment, ExperimentConfig, Phase, PickUp
+from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import Robot
@@ -75,6 +77,21 @@ def test_examine_cause_in_the_whole_drive_has_no_moments() -> None:
     found = examined(0, COUNT, 4)
     assert of_radius(found).definition.spell is None
     assert found.diagnosis.verdict != "unexplained"
+
+
+@pytest.mark.parametrize("last", [COUNT, 28])
+def test_find_spells_mount_that_moved_does_not_return(last: int) -> None:
+    """A LiDAR 60 mm to the left from window 12 on was pushed; one that is back after window 28 is not offered."""
+    plain = load_robot("husky_a200")
+    made = [
+        dataclasses.replace(m, measured=se2.compose(se2.compose([0.0, -0.06, 0.0], m.measured), [0.0, 0.06, 0.0])) if 12 <= i < last else m
+        for i, m in enumerate(windows([plain] * COUNT, MODEL, 5))
+    ]
+    predictor = make_predictor(drive_of_windows(plain, made), make_model(MODEL, plain))
+    state = linearize(predictor, candidate_causes(predictor, 0), {}, TOLERANCE)
+    found = [cause.spell for cause in find_spells(predictor, state, ()) if cause.id == "lidar_offset_y"]
+    assert all(spell is not None and (spell.start_s == 0.0 or math.isinf(spell.end_s)) for spell in found)
+    assert last < COUNT or found == [Spell(float(predictor.drive.starts_s[12]))]
 
 
 @pytest.mark.extended

@@ -220,6 +220,7 @@ def answer_of(found: DiagnosisResult, result: ExtendedResult) -> Answer:
     robot = result.robot
     if robot is None and findings:
         robot = correct_robot(predictor, {f.definition: f.size for f in findings}).robot
+        robot = None if robot == predictor.drive.robot else robot
     is_alarm = d.verdict not in ("consistent", "undecidable")
     size = named[0][1] if named else math.nan
     return Answer(tuple(n for n, _ in named), is_alarm, size, math.nan, robot)
