@@ -44,6 +44,7 @@ from tests.helpers.diagnosis_public import (
     METHODS,
     QUICK,
     SOURCES,
+    acts_on,
     baseline_of,
     cases,
     flat_k,
@@ -226,6 +227,9 @@ def run_public(sources: tuple[str, ...], names: tuple[str, ...], out: Path, fold
             print(f"mujoco: k of turns in place on flat ground {k:.3f}")
         baseline = baseline_of(source, folder)
         for _, name, *drives in cases((source,), names, folder):
+            if name != "nothing" and not acts_on(drives[0], simulate(source, "train", "", 0.0, folder)):
+                print(f"{source:10s} {name:36s} does not act on this drive")
+                continue
             for method in methods:
                 if (source, name, method) in done:
                     continue

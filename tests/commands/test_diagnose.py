@@ -255,9 +255,7 @@ def test_diagnose_gyro_is_corrected_in_the_robot_file(tmp_path: Path, capsys: py
 
 @pytest.mark.extended
 @pytest.mark.parametrize("seed", [34, 35])
-def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int
-) -> None:
+def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
     """A healthy robot that skids: effects that diff_drive does not have are unexplained, without a cause in their place, and no term is
     suggested for them; and the friction model finds nothing."""
     log = bag(tmp_path / "drive.mcap", {}, seed, "husky_a200")

@@ -70,6 +70,8 @@ FLAT_K = (0.45, 0.65)
 """k of turns in place on flat ground that skid-steer robots have (`docs`, thesis: .55); MuJoCo's contacts must give it."""
 _NS = 1e-9
 _MIN_SIGMAS = 3.0
+_LEAST_SQUARES = 30.0
+"""Squares over the reference's noise by which an effect has to change a drive: of less, files cannot be judged."""
 _RISE = re.compile(r"rise\(t,[^)]*\)")
 """What warms up, of any time constant."""
 
@@ -122,7 +124,8 @@ class Answer(NamedTuple):
 
 
 def simulate(source: str, role: str, cause: str, size: float, folder: Path) -> Drive:
-    """A drive of ``source`` for a ``role`` of `ROUTES`, with a ``cause`` of this ``size``; kept in ``folder``. Of a measured log, a third."""
+    """A drive of ``source`` for a ``role`` of `ROUTES`, with a ``cause`` of this ``size``, or a third of a measured log; kept in
+    ``folder``."""
     file = folder / f"{source}-{role}-{cause or 'plain'}.pickle"
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
@@ -196,6 +199,17 @@ def baseline_of(source: str, folder: Path) -> Baseline | None:
         return None
     healthy = simulate(source, "healthy", "", 0.0, folder)
     return estimate_baseline(healthy, make_model(default_model(healthy.robot), healthy.robot))
+
+
+def acts_on(measured: Drive, plain: Drive) -> bool:
+    """Whether an effect changes the drive ``plain``, in windows of the same motion, by more than nothing: no log drives in all ways."""
+    if len(measured.maneuvers) != len(plain.maneuvers):
+        return True
+    name = default_model(plain.robot)
+    before, after = (make_predictor(d, make_model(name, plain.robot)) for d in (plain, measured))
+    sigmas = np.sqrt(np.diagonal(before.batch.cov, axis1=1, axis2=2))
+    change = (after.discrepancies(Hypothesis()) - before.discrepancies(Hypothesis()))[:, :3] / sigmas
+    return float(np.nansum(change**2)) > _LEAST_SQUARES
 
 
 def ours(measured: Drive, baseline: Baseline | None) -> Answer:
@@ -378,7 +392,8 @@ def score(method: str, name: str, drives: tuple[Drive, Drive, Drive], baseline: 
 
 
 def removed_share(answer: Answer, fresh: Drive, floor: Drive, robot: Robot, baseline: Baseline | None) -> float:
-    """Share of the effect's squares on the ``fresh`` drive that the written file, read again, takes off; below 0 where it adds to them."""
+    """Share of the effect's squares on the ``fresh`` drive that the written file, read again, takes off; below 0 where it adds to them, and
+    NaN where the effect does not act there."""
     name = default_model(robot)
     before, least = (make_predictor(d, make_model(name, robot), baseline) for d in (fresh, floor))
     sigmas = np.sqrt(np.diagonal(before.batch.cov, axis1=1, axis2=2))
@@ -392,19 +407,21 @@ def removed_share(answer: Answer, fresh: Drive, floor: Drive, robot: Robot, base
             read = load_robot(path)
         moved = read.center_of_gravity - robot.center_of_gravity  # none of these robots has arms
         corrected = CorrectedRobot(read, (), np.tile(moved, (len(before.batch.dt), 1)))
-        after = predictor_after(before, corrected, name).discrepancies(_moved_lidar(fresh, read))[:, :3]
+        after = predictor_after(before, corrected, name).discrepancies(_read_with(fresh, read))[:, :3]
     else:
         after = rows[0]
     old, lowest, new = (float(np.nansum(np.clip(r / sigmas, -1e3, 1e3) ** 2)) for r in (*rows, after))
-    return 1.0 - (new - lowest) / max(old - lowest, 1e-9)
+    return 1.0 - (new - lowest) / (old - lowest) if old - lowest > _LEAST_SQUARES else math.nan
 
 
-def _moved_lidar(drive: Drive, robot: Robot) -> Hypothesis:
-    """That the LiDAR sits where the file of ``robot`` has it: the ``drive`` was measured by its mount of before."""
+def _read_with(drive: Drive, robot: Robot) -> Hypothesis:
+    """That the wheels' clock is that of the file of ``robot``, and the LiDAR where it has it: the ``drive`` was read with those of
+    before."""
+    late_s = robot.clock.wheel_time_offset_s - drive.robot.clock.wheel_time_offset_s
     old, new = drive.lidar_mount, robot.mounts.get(drive.lidar_frame)
     if old is None or new is None or drive.lidar_frame not in robot.tf.overridden:
-        return Hypothesis()
-    return Hypothesis(lidar_offset=(new.x - old.x, new.y - old.y, new.yaw - old.yaw))
+        return Hypothesis(wheel_time_offset_s=late_s)
+    return Hypothesis(wheel_time_offset_s=late_s, lidar_offset=(new.x - old.x, new.y - old.y, new.yaw - old.yaw))
 
 
 def table(rows: list[dict[str, Any]]) -> str:
