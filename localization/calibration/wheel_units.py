@@ -139,7 +139,8 @@ def without_outliers(speed: FloatArray, other: FloatArray) -> FloatArray:
     ratios = other[fast] / speed[fast]
     usual = float(np.nanmedian(ratios)) if np.isfinite(ratios).any() else 0.0
     is_near = np.abs(other - usual * speed) <= _NEAR * abs(usual) * np.abs(speed) + _NEAR_M_S
-    is_enough = np.isfinite(other[is_near]).sum() >= _MIN_INTERVALS and is_near[fast].mean() >= _MIN_NEAR
+    known = fast & np.isfinite(other)  # scans of a corridor have no speed
+    is_enough = is_near.sum() >= _MIN_INTERVALS and is_near[known].sum() >= _MIN_NEAR * known.sum()
     return np.where(is_near, other, np.nan) if is_enough else other
 
 

@@ -449,10 +449,12 @@ def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterat
 
 
 def moved_back(item: Item, by_ns: int) -> Item:
-    """``item`` recorded and stamped earlier by ``by_ns`` [ns]; one without a stamp has none after it."""
+    """``item`` recorded and stamped earlier by ``by_ns`` [ns]; one without a stamp has none after it, and one that was stamped before the
+    clock was set keeps its stamp."""
     if not by_ns:
         return item
-    return _restamped(item._replace(log_ns=item.log_ns - by_ns), item.stamp_ns - by_ns if item.stamp_ns else 0)
+    is_earlier = item.log_ns - item.stamp_ns > by_ns // 2
+    return _restamped(item._replace(log_ns=item.log_ns - by_ns), item.stamp_ns - (0 if is_earlier else by_ns) if item.stamp_ns else 0)
 
 
 def _restamped(item: Item, stamp_ns: int) -> Item:

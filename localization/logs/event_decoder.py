@@ -60,6 +60,9 @@ _MIN_SWAPS = 6
 _VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
 """Noise and largest acceleration of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size
 brake at up to 3 m/s^2."""
+_SAME_WAY = 0.3
+"""Difference of the way from pose to pose and of that by the speed, of this one, up to which they agree: a speed changes by so much from
+one message to the next."""
 _MORE = 1.2
 """Travelled by a second publisher over that of the one in use, from where on the second is used: equal ones do not take turns."""
 _FROZEN_AFTER_RAD = 0.5
@@ -304,7 +307,15 @@ def _may_follow(publisher: _Publisher, stamp_ns: int, motion: _Motion) -> bool:
     change = np.abs(motion.velocity - publisher.motion.velocity)
     moved = np.abs(motion.pose - publisher.motion.pose)[:2]
     is_too_fast = bool((change > _VELOCITY_NOISE + _MAX_ACCELERATION * passed_s).any() or (moved > _MAX_SPEED_M_S * passed_s).any())
-    return not is_too_fast  # a comparison with NaN is false
+    return not is_too_fast or _has_moved_as_fast(motion, moved, passed_s)  # a comparison with NaN is false
+
+
+def _has_moved_as_fast(motion: _Motion, moved: FloatArray, passed_s: float) -> bool:
+    """Whether the pose has gone on by the way (0 or 2,) that the reading's own speed makes, as none of another publisher has."""
+    if not len(moved):
+        return False
+    expected = math.hypot(*motion.velocity[:2].tolist()) * passed_s
+    return abs(math.hypot(*moved.tolist()) - expected) < _SAME_WAY * expected
 
 
 class JointsToWheels:

@@ -43,39 +43,37 @@ Reading = JointReading | OdometryReading
 def find_set_forwards(messages: Iterable[RawMessage], wheels: str, decode: Callable[[RawMessage], Reading | None]) -> list[SetForward]:
     """Where the clock was set forward among the ``messages`` of all topics in use, in order of recording; ``decode`` reads those of the
     topic ``wheels``."""
-    before: deque[RawMessage] = deque(maxlen=2)
-    after: list[RawMessage] = []
+    near: deque[RawMessage] = deque(maxlen=2)
     found: list[SetForward] = []
-    last_ns, jump_ns = None, 0
+    last_ns, jump_ns, recorded_ns, until = None, 0, 0, 0
     for raw in messages:
         if last_ns is not None and raw.log_ns - last_ns > MIN_STEP_NS:
-            jump_ns, after = raw.log_ns, []
+            jump_ns, recorded_ns, until = raw.log_ns, raw.log_ns - last_ns, len(near) + 2
+            near = deque(near, maxlen=until + 1)
         last_ns = raw.log_ns
         if raw.topic != wheels:
             continue
-        if not jump_ns:
-            before.append(raw)
+        near.append(raw)
+        if not jump_ns or len(near) < until:
             continue
-        after.append(raw)
-        if len(after) == 2:
-            by_ns = _step(before, after, decode)
-            if by_ns:
-                found.append(SetForward(jump_ns, by_ns))
-            before.extend(after)
-            jump_ns = 0
+        by_ns = _step(list(near)[-4:], recorded_ns, decode)
+        if by_ns:
+            found.append(SetForward(jump_ns, by_ns))
+        if by_ns or len(near) > until:  # the first message after the jump may be stamped before it
+            jump_ns, near = 0, deque(near, maxlen=2)
     return found
 
 
-def _step(before: Sequence[RawMessage], after: Sequence[RawMessage], decode: Callable[[RawMessage], Reading | None]) -> int:
-    """By how much the clock was set between two messages ``before`` and two ``after`` [ns]; 0 for a pause, or where it is not known."""
-    readings = [decode(raw) for raw in (*before, *after)]
-    if len(readings) != 4 or any(reading is None for reading in readings):
+def _step(messages: Sequence[RawMessage], recorded_ns: int, decode: Callable[[RawMessage], Reading | None]) -> int:
+    """By how much the clock was set in the middle of four ``messages`` [ns], where times of recording jump by ``recorded_ns``; 0 for a
+    pause, or where it is not known."""
+    readings = [reading for reading in map(decode, messages) if reading is not None]
+    if len(readings) != 4:
         return 0
-    stamps = [reading.stamp_ns for reading in readings if reading is not None]
-    places = [_place(reading) for reading in readings if reading is not None]
+    stamps, places = [reading.stamp_ns for reading in readings], [_place(reading) for reading in readings]
     period_ns = (stamps[1] - stamps[0] + stamps[3] - stamps[2]) // 2
     step_ns = stamps[2] - stamps[1]
-    if period_ns <= 0 or abs(step_ns - (after[0].log_ns - before[1].log_ns)) > _MAX_OTHER_STEP_NS:
+    if period_ns <= 0 or abs(step_ns - recorded_ns) > _MAX_OTHER_STEP_NS:
         return 0
     ways = [np.abs(there - here) for here, there in itertools.pairwise(places)]
     least = (_MIN_RATE_RAD_S if isinstance(readings[0], JointReading) else _MIN_SPEED_M_S) * period_ns * 1e-9

@@ -203,6 +203,14 @@ def test_length_unit_of_metres_is_left_as_it_is() -> None:
     assert not check_length_unit(1000.0 * speed, None, ROBOT).findings
 
 
+def test_length_unit_where_a_corridor_hides_half_of_the_speeds_and_some_scans_match_backwards() -> None:
+    speed = 0.5 * np.ones(180)
+    by_scans = speed.copy()
+    by_scans[:80], by_scans[80:92] = np.nan, -0.5
+    report = check_length_unit(3.3 * speed, by_scans, ROBOT)
+    assert float(report.keys["driver.length_unit_m"]) == pytest.approx(1.0 / 3.3, rel=0.03)
+
+
 def test_length_unit_of_ways_at_half_their_size_is_another_wheel_radius() -> None:
     """No slip makes a LiDAR faster than the wheels."""
     speed = 0.5 * np.sin(0.2 * np.arange(100.0))

@@ -289,6 +289,18 @@ def test_second_publisher_of_odometry_of_equal_ways_is_left_out(tmp_path: Path) 
     assert "of a second publisher whose wheels turn no more, left out" in warnings_of(log)
 
 
+def test_odometry_whose_speed_alternates_and_whose_pose_goes_on_is_one_publisher(tmp_path: Path) -> None:
+    """fr079's robot in feet: its speeds differ by 1.4 m/s from one message to the next, and its ways as much."""
+    records, x = [], 0.0
+    for i in range(400):
+        speed = 2.8 if i % 4 == 3 else 1.4
+        x += 0.12 * speed
+        records.append(("/odom", bags.odometry(START + i * 120_000_000, x=x, vx=speed), START + i * 120_000_000))
+    log = opened(tmp_path, records)
+    assert len(wheels_of(log)) == 400
+    assert log.warnings() == []
+
+
 def test_odometry_that_stops_at_once_is_no_second_publisher(tmp_path: Path) -> None:
     records = [
         ("/odom", bags.odometry(START + i * S // 50, x=0.5 * min(i, 250) / 50, vx=0.5 if i < 250 else 0.0), START + i * S // 50)

@@ -47,6 +47,19 @@ def test_clock_set_forward_while_wheels_turn_is_undone(tmp_path: Path, is_odomet
     assert "clock was set forward by 600.0 s, 10.0 s after the start" in " ".join(log.warnings())
 
 
+def test_message_stamped_before_the_clock_was_set_keeps_its_stamp(tmp_path: Path) -> None:
+    """It was on its way while the clock was set: recorded after it."""
+    records = []
+    for i in range(400):
+        measured, jump = START + i * S // 20, round(STEP_S * S)
+        stamp, recorded = (measured + (jump if i >= at else 0) for at in (201, 200))
+        records.append(("/joint_states", bags.joint_state(stamp, NAMES, np.full(4, i / 10.0), np.full(4, 2.0)), recorded + S // 100))
+    log = open_log(bags.write_mcap(tmp_path / "log.mcap", records), load_robot("husky_a200"))
+    stamps = np.array([event.stamp_ns for event in log.events() if isinstance(event, WheelSample)])
+    np.testing.assert_allclose(np.diff(stamps) * 1e-9, 0.05, atol=1e-6)
+    assert "clock was set forward by 600.0 s" in " ".join(log.warnings())
+
+
 @pytest.mark.parametrize(
     "angle",
     [

@@ -22,7 +22,7 @@ from motion_models.robot_file import load_robot
 from tests.helpers import bags
 from tests.helpers.bags import START, Record, S
 from tests.helpers.entrance_drives import with_times
-from tests.studies.entrance_commands import Case, Edit, judge_scores, replayed, run_command, warnings_in
+from tests.studies.entrance_commands import Case, Edit, contradictions, judge_scores, replayed, run_command, warnings_in
 from tests.studies.entrances import Found, choose_outcome
 
 DATA, ROBOTS = Path("tests/data"), Path("motion_models/robots")
@@ -276,12 +276,9 @@ def based(
         ours = {k: error_of(found[k], best.truth[k]) for k in found}
         is_right = is_open or (not refused and all(ours[k] < 1.3 * best.errors[k] + base.tolerance_m for k in ours))
         state = "[" + ", ".join(f"{k} {ours[k]:.3f} ({best.errors[k]:.3f})" for k in ours) + " m]"
-        code, _ = run_command("check", str(log), "--robot", str(path), "--json", str(folder / "check.json"))
-        checked = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []
-        wrong = [f"{row['quantity']}: {row['advice']}" for row in checked if row["verdict"] == "contradiction"]
-        return Found(
-            choose_outcome(is_right, is_named, bool(warned), words), f"{state} check: {wrong or code or 'no contradiction'}\n{warned}"
-        )
+        outcome = choose_outcome(is_right, is_named, bool(warned), words)
+        checked = "" if outcome == "right" else f" check: {contradictions(folder, log, path)}"
+        return Found(outcome, f"{state}{checked}\n{warned}")
 
     return Case(kind, name, judge)
 

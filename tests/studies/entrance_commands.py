@@ -1,8 +1,8 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [symptoms | mixed | forum | closing | threads | last | other | more | hostile | KIND | part of
-a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of wheels alone
-and of the EKF, with those of the same drive with nothing wrong in brackets.
+`python -m tests.studies.entrance_commands [base | symptoms | mixed | forum | closing | threads | last | other | more | hostile | KIND |
+part of a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of
+wheels alone and of the EKF, with those of the same drive with nothing wrong in brackets.
 """
 
 from __future__ import annotations
@@ -103,6 +103,14 @@ def warnings_in(text: str) -> str:
     )
 
 
+def contradictions(folder: Path, log: Path, robot: Path) -> str:
+    """What `skidloc check` of a log contradicts."""
+    code, _ = run_command("check", str(log), "--robot", str(robot), "--json", str(folder / "check.json"))
+    rows = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []
+    wrong = [f"{row['quantity']}: {row['advice']}" for row in rows if row["verdict"] == "contradiction"]
+    return str(wrong or code or "none")
+
+
 def driven(
     kind: str,
     name: str,
@@ -112,7 +120,7 @@ def driven(
     edit: Edit = lambda records: records,
     refused: bool = False,
 ) -> Case:
-    """A log: right where `replay` is as good as with nothing wrong and a warning has one of ``words``; what `check` contradicts is printed.
+    """A log: right where `replay` is as good as with nothing wrong and a warning has one of ``words``; else `check` is printed as well.
 
     ``refused``: that it ends with exit 2 and one of ``words`` is right.
     """
@@ -126,12 +134,9 @@ def driven(
             return Found(choose_outcome(refused, is_named, True, words), f"[exit {code}] {warned or text}")
         ours, best = errors_of(folder / "out", motion), healthy_errors(vehicle)
         state = f"[odometry {ours[0]:.3f} ({best[0]:.3f}), EKF {ours[1]:.3f} ({best[1]:.3f}) m]"
-        is_right = all(a < 1.5 * b + 0.03 for a, b in zip(ours, best, strict=True))
-        code, text = run_command("check", str(log), "--robot", str(robot), "--json", str(folder / "check.json"))
-        checked = json.loads((folder / "check.json").read_text())["rows"] if code == 0 else []
-        wrong = [row for row in checked if row["verdict"] == "contradiction"]
-        state += f" check: {[row['quantity'] + ': ' + row['advice'] for row in wrong] or code or 'no contradiction'}\n"
-        return Found(choose_outcome(is_right, is_named, bool(warned), words), state + warned)
+        outcome = choose_outcome(all(a < 1.5 * b + 0.03 for a, b in zip(ours, best, strict=True)), is_named, bool(warned), words)
+        checked = "" if outcome == "right" else f" check: {contradictions(folder, log, robot)}"
+        return Found(outcome, f"{state}{checked}\n{warned}")
 
     return Case(kind, name, judge)
 
@@ -258,6 +263,7 @@ def main(arguments: Sequence[str]) -> None:
 
     wanted = [a for a in arguments if not a.startswith("-")]
     sets = {
+        "base": CASES,
         "more": MORE,
         "hostile": HOSTILE,
         "other": OTHER,
@@ -272,7 +278,7 @@ def main(arguments: Sequence[str]) -> None:
     for case in (
         c
         for c in (*SYMPTOMS, *MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
-        if not wanted or any(w == c.kind or w in c.name or c in sets.get(w, ()) for w in wanted)
+        if not wanted or any(c in sets[w] if w in sets else w == c.kind or w in c.name for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:
             try:

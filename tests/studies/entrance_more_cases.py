@@ -196,7 +196,7 @@ LOGS = (
     driven("more", "scan in an optical frame", SCANS, words=["laser"], edit=optical(SCANS)),
     driven("more", "one wheel's angle within a turn", JACKAL, edit=each("/joint_states", from_zero_each)),
     driven("more", "recorder's clock set forward", SCANS, edit=recorder_set(60)),
-    driven("more", "all clocks set forward", SCANS, words=["no wheel data for 3599"], edit=clocks_set(3600)),
+    driven("more", "all clocks set forward", SCANS, words=["clock was set forward by 3600"], edit=clocks_set(3600)),
     driven("more", "second joint states that stand", SCANS, edit=doubled("/gazebo/joint_states")),
     driven(
         "more", "right reversed, prefix of the joints", JACKAL, Publishing(signed(1, 1, -1, -1)), ["joints.reversed"], in_namespace("w1")
