@@ -8,7 +8,7 @@ from localization.calibration.wheel_signals import STEP_S, WheelSignals
 from localization.calibration.wheel_units import expected_scaling
 from localization.errors import EvaluationError
 from localization.evaluation.reference_check import reference_contradictions
-from localization.evaluation.references import ReferenceTrack
+from localization.evaluation.references import ReferenceTrack, no_overlap_message
 from localization.logs import Log
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -48,6 +48,17 @@ def check_reference(log: Log, signals: WheelSignals | None, reference: Reference
     """Refuse a ``reference`` whose clock, scale, axes or run are not those of the log's wheels and gyro. Raises `EvaluationError`."""
     if signals is None:
         return
-    found = reference_contradictions([dead_reckon(log, signals)], reference)
+    path = dead_reckon(log, signals)
+    if apart := disjoint_message(log, path, reference):
+        raise EvaluationError(apart)
+    found = reference_contradictions([path], reference)
     if found:
         raise EvaluationError(f"{' '.join(found)} Nothing is fitted to such a reference.")
+
+
+def disjoint_message(log: Log, path: Trajectory, reference: ReferenceTrack) -> str:
+    """That no pose of ``reference`` is of the log's time, by its recording or by the stamps of ``path``, and why; "" where some are."""
+    spans = [(log.start_ns, log.end_ns), (int(path.stamps_ns[0]), int(path.stamps_ns[-1]))]
+    if any(((reference.stamps_ns >= start) & (reference.stamps_ns <= end)).any() for start, end in spans):
+        return ""
+    return no_overlap_message(path.stamps_ns, reference.stamps_ns, reference.source, 0)

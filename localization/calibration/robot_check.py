@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from localization.calibration.dead_reckoning import dead_reckon, forward_rate
+from localization.calibration.dead_reckoning import dead_reckon, disjoint_message, forward_rate
 from localization.calibration.lidar_check import CheckedLog, open_log_checked
 from localization.calibration.log_survey import survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
@@ -408,7 +408,10 @@ def _reference_row(log: Log, signals: WheelSignals | None, given: str | None) ->
     found = load_reference(log, topic)
     if isinstance(found, Relations):
         return CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")
-    compared = None if signals is None else compare_reference([dead_reckon(log, signals)], found)
+    path = None if signals is None else dead_reckon(log, signals)
+    if path is not None and (apart := disjoint_message(log, path, found)):
+        return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", apart)
+    compared = None if path is None else compare_reference([path], found)
     if compared is None and signals is not None:
         run = _replayed(log, log.mounts, "odometry", signals, _REFERENCE_S)
         compared = None if run is None else compare_reference([run.trajectory], found)

@@ -114,8 +114,13 @@ def spoiled_reference(path: Path, scale: float = 1.0, late_s: float = 0.0, mirro
 
 
 SPOILED = cases(
-    [("scale is 1000", {"scale": 1000.0}), ("18.0 s ahead of", {"late_s": 18.0}), ("mirrored", {"mirror": -1.0})],
-    usual=["18.0 s ahead of"],
+    [
+        ("scale is 1000", {"scale": 1000.0}),
+        ("18.0 s ahead of", {"late_s": 18.0}),
+        ("mirrored", {"mirror": -1.0}),
+        ("none lies within the trajectory's time", {"late_s": -30 * 86400.0}),
+    ],
+    usual=["18.0 s ahead of", "none lies within the trajectory's time"],
 )
 
 
