@@ -135,9 +135,11 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     motion = None if signals is None else lidar_motion(log, signals)
     by_lidar = {} if signals is None or checked_log.lidar else _by_lidar(log, signals, motion)
     rows += _wiring_rows(wiring, by_lidar)
+    measured_robot = log.robot
     if signals is not None:
-        rows += [*_scale_rows(log, wiring, signals, motion), *_lidar_rows(checked_log, signals, motion)]
-    run = _replayed(log, checked_log.mounts, "ekf", signals)
+        radius_row, measured_robot = _radius(log, wiring, signals, motion)
+        rows += [radius_row, *_lidar_rows(checked_log, signals, motion)]
+    run = _replayed(log, measured_robot, checked_log.mounts, "ekf", signals)
     rows += [
         *_filter_rows(log, run),
         *_imu_rows(log),
@@ -145,11 +147,11 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     ]
     rows[:0] = [CheckRow("log file", "damaged, incomplete or corrected", "", "note", text) for text in log.damage()]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
-    model = make_model(model_of(log.robot), log.robot)
+    model = make_model(model_of(measured_robot), measured_robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
     params = tuple(measured[name][0] if name in measured else float(v) for name, v in zip(model.param_names, model.nominal, strict=True))
     sigmas = {name: sigma for name, (_, sigma) in measured.items()}
-    checked = _with_scaling(log.robot, params, sigmas) if not wiring.is_ambiguous else robot
+    checked = _with_scaling(measured_robot, params, sigmas) if not wiring.is_ambiguous else robot
     topic = log.sources.lidar.topic if log.sources.lidar is not None and log.sources.lidar.kind == "scan" else ""
     return RobotCheck(path.name, checked, log.duration_s, tuple(rows), params, sigmas, topic)
 
@@ -171,15 +173,15 @@ def _with_scaling(robot: Robot, params: Sequence[float], sigmas: dict[str, float
 
 
 def _replayed(
-    log: Log, mounts: Mapping[str, Mount], estimator: str, signals: WheelSignals | None, duration_s: float = _REPLAYED_S
+    log: Log, robot: Robot, mounts: Mapping[str, Mount], estimator: str, signals: WheelSignals | None, duration_s: float = _REPLAYED_S
 ) -> Run | None:
-    """Result of ``estimator`` on the first ``duration_s`` of driving; None where nothing corrects the wheels."""
+    """Result of ``estimator`` for ``robot`` on the first ``duration_s`` of driving; None where nothing corrects the wheels."""
     if signals is None or (log.sources.lidar is None and log.sources.imu is None):
         return None
     start_ns = signals.first_ns + int((signals.start_s - _STANDING_S) * 1e9)
-    trial = Trial(make_model(model_of(log.robot), log.robot), estimator)
+    trial = Trial(make_model(model_of(robot), robot), estimator)
     try:
-        return replay(_first(log, start_ns, duration_s), [trial], log.robot, mounts, log.sources.lidar is not None)[0]
+        return replay(_first(log, start_ns, duration_s), [trial], robot, mounts, log.sources.lidar is not None)[0]
     except LogError:
         return None
 
@@ -277,8 +279,8 @@ def _sign_row(name: str, value: float) -> CheckRow:
     return CheckRow("signs and sides", "as in the robot file", measured, "contradiction", f"{name}: {advice}")
 
 
-def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: LidarMotion | None) -> list[CheckRow]:
-    """Radius by measured speeds."""
+def _radius(log: Log, wiring: WiringReport, signals: WheelSignals, motion: LidarMotion | None) -> tuple[CheckRow, Robot]:
+    """Radius by measured speeds, and the robot with it, as k and what sensors contradict follow from it."""
     radius = log.robot.geometry.wheel_radius_m if signals.joints else log.robot.driver.wheel_radius_m
     ratios = {name: value for name, value in wiring.ratios.items() if " by the speed of " in name}
     if motion is not None and not ratios:
@@ -289,16 +291,19 @@ def _scale_rows(log: Log, wiring: WiringReport, signals: WheelSignals, motion: L
             ratios = {"way by the LiDAR": float(np.median(way[both] / wheels[both]))}
     if not ratios:
         advice = "drive straight on for 10 s with a LiDAR, or record the driver's odometry."
-        return [CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice)]
+        return CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice), log.robot
     name, ratio = next(iter(ratios.items()))
-    is_same = abs(math.log(ratio)) <= _SAME_SCALE or bool(wiring.findings)
-    advice = (
-        ""
-        if is_same
-        else f"write {'geometry' if signals.joints else 'driver'}.wheel_radius_m = {radius * ratio:.4g}, or check units and gear."
-    )
-    verdict: CheckVerdict = "ok" if is_same else "contradiction"
-    return [CheckRow("wheel radius", f"{radius:.4g} m", f"{radius * ratio:.4g} m, {name}", verdict, advice)]
+    second = f"{radius * ratio:.4g} m, {name}"
+    if abs(math.log(ratio)) <= _SAME_SCALE or wiring.findings:
+        return CheckRow("wheel radius", f"{radius:.4g} m", second, "ok"), log.robot
+    part = "geometry" if signals.joints else "driver"
+    others = "units, gear and the LiDAR's ranges" if "LiDAR" in name else "units and gear"
+    advice = f"write {part}.wheel_radius_m = {radius * ratio:.4g}, or check {others}."
+    row, robot = CheckRow("wheel radius", f"{radius:.4g} m", second, "contradiction", advice), log.robot
+    if signals.joints:
+        robot = replace(robot, geometry=replace(robot.geometry, wheel_radius_m=float(f"{radius * ratio:.4g}")))
+        row = replace(row, advice=f"{advice} All below, and robot.toml, are with this radius.")
+    return row, robot
 
 
 def _lidar_rows(checked: CheckedLog, signals: WheelSignals, motion: LidarMotion | None) -> list[CheckRow]:
@@ -413,7 +418,7 @@ def _reference_row(log: Log, signals: WheelSignals | None, given: str | None) ->
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", apart)
     compared = None if path is None else compare_reference([path], found)
     if compared is None and signals is not None:
-        run = _replayed(log, log.mounts, "odometry", signals, _REFERENCE_S)
+        run = _replayed(log, log.robot, log.mounts, "odometry", signals, _REFERENCE_S)
         compared = None if run is None else compare_reference([run.trajectory], found)
     if compared is None:
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ import pytest
 
 from localization.cli import main
 from localization.logs import open_log
-from motion_models.robot_file import load_robot
+from motion_models.robot_file import load_robot, robot_toml
+from tests.helpers import entrance_drives
+from tests.helpers.entrance_drives import Publishing, Vehicle, write
 from tests.helpers.extended import cases
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, drive
 
@@ -143,3 +146,17 @@ def test_spoiled_reference_is_named_and_nothing_is_fitted_to_it(
     assert main(args) == 2
     assert text in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_check_with_a_wrong_radius_has_k_of_the_measured_one(tmp_path: Path) -> None:
+    """No sentence on what only follows from the radius, and a robot file in which radius and k belong together."""
+    vehicle = Vehicle(0.165, 0.555, 0.512, 0.5, scan_hz=8.0, beams=180, seed=77)
+    log = write(tmp_path / "log.mcap", vehicle, entrance_drives.drive(vehicle), Publishing())
+    right = vehicle.robot()
+    wrong = dataclasses.replace(right, geometry=dataclasses.replace(right.geometry, wheel_radius_m=0.215))
+    (tmp_path / "wrong.toml").write_text(robot_toml(wrong))
+    found = check(tmp_path, log, "--robot", str(tmp_path / "wrong.toml"))
+    assert quantities(found, "contradiction") == {"wheel radius"}
+    robot = load_robot(tmp_path / "out" / "robot.toml")
+    assert robot.geometry.wheel_radius_m == pytest.approx(0.165, rel=0.01)
+    assert robot.models["skid_steer"]["k_0"] == pytest.approx(0.5, abs=0.02)
