@@ -98,8 +98,9 @@ _CONTACTS_LOG_ODDS = 7.0
 33. MuJoCo's drives gain 9 to 90 (five healthy ones), drives of the simulator lose 32 and 60."""
 _MAX_ERROR_SHARE, _FOREIGN_LOG_ODDS = 0.5, 500.0
 """Share of the model's error (twice the log-likelihood of slips by kind of motion) that other contacts may leave, and error that they may
-leave anyway, for causes to be searched about them. Eight drives of MuJoCo with hidden causes have 102 at the most; laws that no contact
-has 2,600 to 40,000, and contacts leave 0.85 of these and more: such searches took half of a diagnosis of 40 s of CPU."""
+leave anyway, for causes to be searched about them. Drives of MuJoCo, healthy or with hidden causes, have 110 at the most (8 developed on,
+16 others); laws that no contact has 2,300 to 40,000, and contacts leave 0.85 of the larger ones and more: such searches took half of a
+diagnosis of 40 s of CPU. By 200 or 1,000 none of 20 other drives (nulls, causes and laws) is searched otherwise."""
 _MIN_GAPS = 3  # fewer gaps between messages are pauses
 
 
@@ -156,11 +157,12 @@ def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: D
 
 
 def _without_names_of_terms(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
-    """``found`` without the names in whose place terms explain the drive better, where a part of it stays unexplained: what such a name
-    improves on windows that it was not fitted to is then the term's."""
+    """``found`` without the names in whose place terms explain the drive better, where a part of it stays unexplained, or where the robot
+    file with these names improves nothing: what such a name explains is then the term's."""
     d = found.diagnosis
     named = {f.definition.key for f in d.findings if not f.is_counted}
-    search = find_terms(found, np.random.default_rng(config.seed)) if named and d.verdict == "unexplained" else None
+    is_open = d.verdict == "unexplained" or not d.is_confirmed
+    search = find_terms(found, np.random.default_rng(config.seed)) if named and is_open else None
     if search is None or not (search.terms or search.effects):
         return found
     kept = named & {search.state.causes[i].key for i in search.kept}

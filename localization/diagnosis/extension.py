@@ -37,7 +37,7 @@ from localization.diagnosis.missing_terms import (
 )
 from localization.diagnosis.noise import reference_sigmas
 from localization.diagnosis.result import DiagnosisResult
-from localization.diagnosis.verdict import noise_excess
+from localization.diagnosis.verdict import noise_ratios
 from localization.events import Turn
 from localization.gyro import GyroRecord
 from motion_models import se2
@@ -290,15 +290,16 @@ def _refusal(predictor: DrivePredictor, search: Search, whole: CandidateRobot) -
 
 
 def _noise_left(state: Linearization, predictor: DrivePredictor) -> float:
-    """Noise of the drive beside the terms, over that of its motion reference, in the component of a log that has most; 1 for tables, whose
-    noise is as they give it.
+    """Noise of the drive beside the terms, over that of its motion reference, in the component of a log that has most, as the median of the
+    windows: what a term is off in some motions is no sign of another one. 1 for tables, whose noise is as they give it.
 
     Of 50 laws (`tests.studies.unseen_effects`, draws 5 to 8) four leave 5 times the noise of scan matching and more, and their terms remove
     0.26 of the law on a fresh drive at most (least -12); others leave up to 1.7 times in x and y.
     """
     stated = reference_sigmas(predictor) if predictor.drive.kind == "log" else None
     known = np.isfinite(state.rows)
-    return max(noise_excess(state, stated, known[:, c], c) for c in range(3))
+    ratios = [noise_ratios(state, stated, known[:, c], c) for c in range(3)]
+    return max((float(np.median(r)) for r in ratios if len(r)), default=1.0)
 
 
 def _differ_between_parts(checks: Sequence[HandoverCheck]) -> bool:

@@ -21,7 +21,7 @@ from motion_models.se2 import FloatArray
 
 Verdict = Literal["consistent", "explained", "extended", "ambiguous", "unexplained", "undecidable"]
 MAX_NOISE_OVER_REFERENCE = 3.0
-"""Noise of the drive, over that of the motion reference by its own covariance: up to 1.5 where nothing is hidden, 3.1 to 200 for effects
+"""Noise of the drive, over that of the motion reference by its own covariance: up to 2.0 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.studies.unknown_effects --develop`)."""
 
 _MAX_GROWTH = 1.02

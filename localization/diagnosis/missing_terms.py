@@ -39,7 +39,6 @@ _POWERS = ("", "{0}", "abs({0})", "{0}^2", "{0}*abs({0})", "sign({0})", "{0}^3")
 _ONE_SIDED = ("max({0},0)", "min({0},0)")
 """Shapes that act to one side alone, as a slip in left turns. By abs() such a law is half in a term, and half in what is tolerated of the
 causes, which no file holds."""
-_BESIDE_ONE_SIDED = ("", "{0}", "abs({0})")
 _OF_CAUSES = frozenset({("vx", "v"), ("vx", "wz"), ("vy", "v"), ("vy", "wz"), ("wz", "v"), ("wz", "wz")})
 """Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference. A term has them only where such a
 cause would be larger than robots have it."""
@@ -150,7 +149,7 @@ class Search(NamedTuple):
 def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[CandidateTerm, ...]:
     """Candidates for a drive in which ``count`` numbers were measured, beside so many ``others``; CG products only where the CG moves."""
     powers = list(itertools.product(_POWERS, _POWERS))[1:]
-    powers += [pair for x, y in itertools.product(_ONE_SIDED, _BESIDE_ONE_SIDED) for pair in ((x, y), (y, x))]
+    powers += [pair for x, y in itertools.product(_ONE_SIDED, _POWERS) for pair in ((x, y), (y, x))]
     texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
     has_cg = bool(np.std(predictor.batch.cg, axis=0).max() > _CG_MOVES_M)
     whole = float(predictor.batch.t.max(initial=0.0))

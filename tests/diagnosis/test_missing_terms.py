@@ -84,7 +84,9 @@ def test_extend_finds_what_fades(seed: int) -> None:
     assert result.robot is not None
 
 
-@pytest.mark.parametrize(("component", "text"), [("wz", "max(wz,0)"), ("vx", "min(v,0)"), ("vy", "abs(v)*min(wz,0)")])
+@pytest.mark.parametrize(
+    ("component", "text"), [("wz", "max(wz,0)"), ("vx", "min(v,0)"), ("vy", "abs(v)*min(wz,0)"), ("vx", "min(v,0)*wz*abs(wz)")]
+)
 def test_extend_finds_what_acts_to_one_side(component: str, text: str) -> None:
     """By abs() half of it would be a term, and half within the tolerance of radii, track and mounts, which no file holds."""
     hidden = term(component, text, 0.1)

@@ -35,6 +35,7 @@ from localization.diagnosis.verdict import (
     decide,
     find_trends,
     mark_trends,
+    noise_excess,
     separating_drive,
     trend_motions,
 )
@@ -303,3 +304,18 @@ def test_diagnose_casters_name_the_track_in_metres() -> None:
     assert found.findings[0].cause == "track_width"
     assert found.findings[0].size == pytest.approx(0.012, abs=3.0 * found.findings[0].sigma)
     assert "rotation_scale" not in {name for f in found.findings for name in (f.cause, *dict(f.aliases))}
+
+
+def test_noise_of_a_few_windows_is_more_than_the_references() -> None:
+    """A law in a third of the windows is noise there, and not in the median window."""
+    robot = load_robot("vaultbot")
+    drive = drive_of_table("grid", robot, rotations_as_maneuvers(read_rotation_table(GRID), robot), "rotations")
+    predictor = make_predictor(drive, make_model("friction", drive.robot))
+    state = linearize(predictor, candidate_causes(predictor, 0), {}, TOLERANCE)
+    stated, noisy = np.ones_like(state.rows), np.arange(len(state.rows)) % 3 == 0
+    sigmas = np.where(noisy[:, None], 14.0, 1.0) * stated
+    state = dataclasses.replace(state, noise=given_noise(state.rows, sigmas, state.noise.follows))
+    known = np.ones(len(state.rows), dtype=bool)
+    assert noise_excess(state, stated[:, :3], known, 0) == pytest.approx(np.sqrt(np.mean(sigmas[:, 0] ** 2)))
+    assert noise_excess(state, stated[:, :3], ~noisy, 0) == pytest.approx(1.0)
+    assert noise_excess(state, None, known, 0) == 1.0

@@ -1,6 +1,6 @@
 """How small a cause may be to be named: each at its typical size, half and a quarter of it, in the simulator's robots.
 
-python -m tests.studies.sensitivity [--every 3] [--folder FOLDER]
+python -m tests.studies.sensitivity [--every 3] [--first 0] [--folder FOLDER]
 
 Of the causes of `tests.benchmarks.diagnosis` every third is hidden at three sizes, with the robot, drive and deviations of a case of that
 benchmark that nothing was developed on. It counts where the drive shows it to three sigma beside what is tolerated, and is named where it
@@ -39,12 +39,13 @@ def hidden(index: int, factor: float) -> Case:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--every", type=int, default=3, help="which share of the causes")
+    parser.add_argument("--first", type=int, default=0, help="index of the first cause")
     parser.add_argument("--folder", type=Path, default=Path("sensitivity"), help="keeps simulated drives")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     hits: dict[float, list[bool]] = defaultdict(list)
     wrong, inside = [], []
-    for index in range(0, len(TYPICAL), given.every):
+    for index in range(given.first, len(TYPICAL), given.every):
         for factor in FACTORS:
             case = hidden(index, factor)
             file = given.folder / f"{index}-{factor:g}.pickle"
