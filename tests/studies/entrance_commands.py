@@ -1,7 +1,7 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [base | symptoms | mixed | forum | closing | threads | last | other | more | hostile | KIND |
-part of a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of
+`python -m tests.studies.entrance_commands [base | field | symptoms | mixed | forum | closing | threads | last | other | more | hostile |
+KIND | part of a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of
 wheels alone and of the EKF, with those of the same drive with nothing wrong in brackets.
 """
 
@@ -252,6 +252,7 @@ def main(arguments: Sequence[str]) -> None:
     """Judge those that are named, by default all."""
     from tests.studies.entrance_closing_cases import CLOSING
     from tests.studies.entrance_command_cases import CASES
+    from tests.studies.entrance_field_cases import FIELD
     from tests.studies.entrance_forum_cases import FORUM
     from tests.studies.entrance_hostile_cases import HOSTILE
     from tests.studies.entrance_last_cases import LAST
@@ -273,11 +274,12 @@ def main(arguments: Sequence[str]) -> None:
         "forum": FORUM,
         "mixed": MIXED,
         "symptoms": SYMPTOMS,
+        "field": FIELD,
     }
     found = []
     for case in (
         c
-        for c in (*SYMPTOMS, *MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
+        for c in (*FIELD, *SYMPTOMS, *MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
         if not wanted or any(c in sets[w] if w in sets else w == c.kind or w in c.name for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:
