@@ -7,6 +7,7 @@ A TUM file has one pose a line, ``timestamp tx ty tz qx qy qz qw``, in seconds a
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -209,8 +210,18 @@ def tum_rows(path: str | Path) -> Iterator[tuple[int, int, list[float]]]:
         yield line, parse_seconds(words[0], f"{path}, line {line}"), values
 
 
+def whole_lines(text: str) -> list[str]:
+    """Lines of a table, without a last one that is cut: its writer was stopped, so that it has fewer columns than the others and no end."""
+    lines = text.splitlines()
+    if len(lines) > 2 and not text.endswith(("\n", "\r")) and not lines[-2].lstrip().startswith("#"):
+        last, before = (len(re.split(r"[,;\s]+", line.strip())) for line in (lines[-1], lines[-2]))
+        return lines[:-1] if last < before else lines
+    return lines
+
+
 def number_rows(path: str | Path, columns: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:
-    """(line number, words) of every line that is not empty or a comment. Raises `EvaluationError` unless it has all ``columns``."""
+    """(line number, words) of every line that is not empty, a comment or cut at the end of the file. Raises `EvaluationError` unless it has
+    all ``columns``."""
     try:
         check_file(path)
         text = Path(path).read_text(encoding="utf-8-sig")
@@ -219,7 +230,7 @@ def number_rows(path: str | Path, columns: tuple[str, ...]) -> Iterator[tuple[in
     except UnicodeDecodeError as error:
         raise EvaluationError(f"'{path}' is not a text file. A line should be '{' '.join(columns)}'.") from error
     found = False
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(whole_lines(text), start=1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue

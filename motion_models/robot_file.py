@@ -94,6 +94,11 @@ def load_robot(robot: str | Path) -> Robot:
         except UnicodeDecodeError as error:
             raise RobotError(f"robot file '{path}' is not text (byte {error.start} is not UTF-8).") from error
         return parse_robot(text, source=str(path), folder=path.parent.absolute())
+    if path.suffix in (".urdf", ".xacro", ".yaml", ".yml", ".json"):
+        raise RobotError(
+            f"'{path}' is no robot file (.toml): `skidloc init LOG --urdf ROBOT.urdf --controller CONTROL.yaml --out robot.toml` writes one"
+            " of a URDF and a controller's YAML."
+        )
     if str(robot) not in robot_names():
         raise RobotError(f"no robot '{robot}'; shipped are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
     text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from localization.calibration.lidar_turns import GyroHeading, LidarTurns, compare_clocks, compare_turns
+from localization.calibration.wheel_signals import MAX_SLIDE_RAD, MIN_COHERENCE
 from localization.calibration.wheel_units import CORRECTED
 from localization.calibration.wheel_wiring import WiringReport, open_checked
 from localization.events import Event, ImuSample, Scan, WheelSample
@@ -37,10 +38,6 @@ _MAX_CURVATURE_RAD_M = 0.6
 _SURE_WAY_M, _MAX_S, _MAX_SCANS = 1.0, 60.0, 1200
 """Way after which a mount is healthy, and the longest that is read [s from the first motion; scans in all]."""
 _SCANS_PER_RESULT = 10  # after that way
-_MIN_COHERENCE = 0.9
-_MAX_SLIDE_RAD = math.radians(20.0)
-"""Largest angle between the ways by wheels and LiDAR that a slide explains [rad], as in the sensor check of the direction of travel: no
-slide of 99.9 % of the windows of three buildings is larger."""
 _STRAIGHT_RAD_M, _STRAIGHT_WAY_M, _CERTAIN_WAY_M, _MIN_STRAIGHT = 0.2, 3.0, 10.0, 6
 """Largest curvature of straight driving, its least way and intervals, and the way [m] after which a yaw is certain. A centre of
 rotation 0.1 m off turns the direction by 1 degree there."""
@@ -191,7 +188,7 @@ class LidarCheck:
     def _is_healthy(self, frame: str) -> bool:
         direction = _direction(*self._compare(frame)[:2])
         is_known = self._is_clock_known or (self._wheels_late_s(frame) if self._gyro is None else self._by_turns(frame)) is not None
-        if direction is None or not is_known or abs(direction) > _MAX_SLIDE_RAD or self._shift(frame) is not None:
+        if direction is None or not is_known or abs(direction) > MAX_SLIDE_RAD or self._shift(frame) is not None:
             return False
         return abs(direction) <= _HEALTHY_RAD or abs(self._straight(frame) or math.pi) <= _HEALTHY_RAD
 
@@ -224,7 +221,7 @@ class LidarCheck:
         if float(np.abs(moves[:, 2]).sum()) < _SHIFT_TURN_RAD:
             return None
         columns, sideways = np.stack([np.sin(moves[:, 2]), arcs[:, 1], moves[:, 0]], axis=1), moves[:, 1] - arcs[:, 0]
-        shift, sigma = with_priors(columns, sideways, np.array([math.inf, _SLIDE_SIGMA_S, _MAX_SLIDE_RAD]))
+        shift, sigma = with_priors(columns, sideways, np.array([math.inf, _SLIDE_SIGMA_S, MAX_SLIDE_RAD]))
         half_m = 0.5 * self._robot.geometry.wheelbase_m
         if abs(shift) - _SHIFT_SIGMAS * sigma < max(_MIN_SHIFT_M, half_m) or not _is_equally_long(*self._compare(frame)[:2]):
             return None
@@ -267,7 +264,7 @@ class LidarCheck:
         by_wheels, by_scans, _ = self._compare(frame)
         if not len(by_wheels):
             return 0.0
-        if abs(float(np.angle(np.sum(by_scans * by_wheels.conj())))) > _MAX_SLIDE_RAD:
+        if abs(float(np.angle(np.sum(by_scans * by_wheels.conj())))) > MAX_SLIDE_RAD:
             return self._way_m
         if abs(straight := self._straight(frame) or 0.0) >= _MIN_YAW_RAD:
             return self._way_m * math.sin(0.5 * abs(straight))
@@ -322,11 +319,11 @@ class LidarCheck:
         straight = self._straight(frame)
         if direction is None:
             direction = straight
-        if direction is not None and abs(direction) <= _MAX_SLIDE_RAD and (straight is None or abs(straight) < _MIN_YAW_RAD):
+        if direction is not None and abs(direction) <= MAX_SLIDE_RAD and (straight is None or abs(straight) < _MIN_YAW_RAD):
             return self._shifted(frame)
         if direction is None:
             return None
-        if (turned_rad := _largest_change(*_without_far(by_wheels, by_scans))) > _MAX_SLIDE_RAD:
+        if (turned_rad := _largest_change(*_without_far(by_wheels, by_scans))) > MAX_SLIDE_RAD:
             text = (
                 f"{self._topic}: its scans travel {math.degrees(turned_rad):.0f} deg apart before and after some point of the first"
                 f" {np.abs(by_wheels).sum():.1f} m: '{frame}' was turned on the way (a bump, a loose mount, a pan joint). Fix its mount."
@@ -463,7 +460,7 @@ def _direction(by_wheels: FloatArray, by_scans: FloatArray) -> float | None:
     """Direction of the LiDAR's travel against the wheels' [rad]; None where the drive does not show one."""
     product = by_scans * by_wheels.conj()
     size = float(np.abs(product).sum())
-    if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < _MIN_COHERENCE * size:
+    if float(np.abs(by_wheels).sum()) < 0.5 * _SURE_WAY_M or size == 0.0 or abs(product.sum()) < MIN_COHERENCE * size:
         return None
     return float(np.angle(product.sum()))
 

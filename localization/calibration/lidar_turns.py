@@ -18,9 +18,11 @@ _MIN_INTERVALS, _MIN_TURN_RAD = 12, 1.5
 """Intervals, and turns in all, that are compared."""
 _SURE_LIKENESS = 0.95
 """Correlation about zero of turns that are the same motion; healthy logs have more, slipping wheels too."""
-_MAX_LATE_S, _MIN_LATE_S, _STEP_S = 1.5, 0.15, 0.01
-"""Largest offset that is searched, the smallest that is named (drivers have latencies of up to 0.1 s, which the filter estimates), and the
-step [s]. Clocks that are further apart are set by the times of recording."""
+_MAX_LATE_S, _MAX_LATE_OF_THREE_S, _MIN_LATE_S = 1.5, 5.0, 0.15
+"""Largest offsets that are searched, of two sensors and of three, and the smallest that is named (drivers have latencies of up to 0.1 s,
+which the filter estimates) [s]. Clocks that are further apart are set by the times of recording."""
+_COARSE_S, _STEP_S = 0.05, 0.01
+"""Steps of the search, and about its best [s]."""
 _SAME_CLOCK_S = 0.1
 """Largest offset between two sensors that agree."""
 _MIN_GAIN = 3.0
@@ -91,7 +93,7 @@ def compare_clocks(rows: Rows, wheels: Track, origin_ns: int) -> float | None:
     edges, scans = _turns_by_scans(rows, origin_ns)
     if len(scans) < _MIN_INTERVALS or np.abs(scans).sum() < _MIN_TURN_RAD:
         return None
-    offset = _offset(scans, wheels, edges)
+    offset = _offset(scans, wheels, edges, _MAX_LATE_S)
     if offset.likeness < _SURE_LIKENESS or not offset.is_only:
         return None
     return -round(offset.late_s, 2) if abs(offset.late_s) >= _MIN_APART_S else 0.0
@@ -109,7 +111,7 @@ def compare_turns(rows: Rows, wheels: Track, gyro: GyroHeading, origin_ns: int) 
     known = np.isfinite(by_wheels) & np.isfinite(by_gyro)
     if known.sum() < _MIN_INTERVALS or np.abs(by_gyro[known]).sum() < _MIN_TURN_RAD:
         return None
-    wheels_offset, scans_offset = (_offset(turns, heading, edges) for turns in (by_wheels, scans))
+    wheels_offset, scans_offset = (_offset(turns, heading, edges, _MAX_LATE_OF_THREE_S) for turns in (by_wheels, scans))
     if wheels_offset.likeness < _SURE_LIKENESS or abs(scans_offset.likeness) < _SURE_LIKENESS:
         return LidarTurns()
     return LidarTurns(scans_offset.likeness < 0.0, *_odd_clock(wheels_offset, scans_offset))
@@ -134,14 +136,22 @@ def _odd_clock(wheels: _Offset, scans: _Offset) -> tuple[Sensor, float]:
     return "lidar", 0.0
 
 
-def _offset(turns: FloatArray, heading: Track, edges: NDArray[np.float64]) -> _Offset:
-    """Offset of ``turns`` (N,) over ``edges`` (N, 2) of stamps [s] that are late."""
-    offsets = np.arange(-round(_MAX_LATE_S / _STEP_S), round(_MAX_LATE_S / _STEP_S) + 1) * _STEP_S
-    found = np.array([_likeness(_turns(heading, edges, late), turns) for late in offsets])
-    best, at_zero = int(np.abs(found).argmax()), float(found[len(offsets) // 2])
-    others = np.abs(found)[np.abs(offsets - offsets[best]) > _MIN_APART_S]
-    is_clear, is_only = (1.0 - other > _MIN_GAIN * (1.0 - abs(found[best])) for other in (abs(at_zero), others.max()))
-    return _Offset(float(offsets[best]), float(found[best]), is_clear, bool(is_only))
+def _offset(turns: FloatArray, heading: Track, edges: NDArray[np.float64], most_s: float) -> _Offset:
+    """Offset, up to ``most_s``, of ``turns`` (N,) over ``edges`` (N, 2) of stamps [s] that are late."""
+    offsets = np.asarray(np.arange(-round(most_s / _COARSE_S), round(most_s / _COARSE_S) + 1) * _COARSE_S, dtype=float)
+    found = _likenesses(turns, heading, edges, offsets)
+    middle, steps = float(offsets[int(np.abs(found).argmax())]), round(_COARSE_S / _STEP_S)
+    about = np.asarray(middle + np.arange(-steps, steps + 1) * _STEP_S, dtype=float)
+    near = _likenesses(turns, heading, edges, about)
+    best, at_zero = int(np.abs(near).argmax()), float(found[len(offsets) // 2])
+    others = np.abs(found)[np.abs(offsets - about[best]) > _MIN_APART_S]
+    is_clear, is_only = (1.0 - other > _MIN_GAIN * (1.0 - abs(near[best])) for other in (abs(at_zero), others.max()))
+    return _Offset(float(about[best]), float(near[best]), is_clear, bool(is_only))
+
+
+def _likenesses(turns: FloatArray, heading: Track, edges: NDArray[np.float64], offsets: FloatArray) -> FloatArray:
+    """(n,) with each of ``offsets`` (n,)."""
+    return np.array([_likeness(_turns(heading, edges, late), turns) for late in offsets])
 
 
 def _turns(heading: Track, edges: NDArray[np.float64], late_s: float) -> FloatArray:

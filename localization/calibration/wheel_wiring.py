@@ -47,7 +47,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _MIN_CORRELATION = 0.6
-"""Correlation above which a source does not contradict the robot file, as in the sensor checks: no window of healthy logs is below."""
+"""Correlation above which a source does not contradict the robot file, as in the senso. checks: no window of healthy logs is below."""
 _SURE_CORRELATION = 0.9
 """What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
 _MIN_REVERSED_SIDE_CORRELATION = 0.8
@@ -59,6 +59,8 @@ _MIN_CLOCK_INTERVALS = 60
 _UNKNOWN_YAW_RAD2_PER_RAD, _UNKNOWN_WAY_M2_PER_M = 4.0 * math.pi, 40.0
 """Variance per radian turned and metre driven with an unknown sign: a heading of one radian, and a way of ten metres, may be the opposite
 (4 x^2)."""
+_UNKNOWN_TURN_RAD2_PER_S = 0.25
+"""Variance of the heading per second where the wheels have no turns: 30 degrees in a second, as robots turn in place."""
 _SAME_TURN, _OTHER_TURN = 0.05, 0.3
 """A driver's turn is the gyro's, and is not what the robot file's multiplier has: relative differences."""
 _MAX_CLOCK_S = 10.0
@@ -119,14 +121,14 @@ class WiringReport:
     keys: Mapping[str, str] = field(default_factory=dict)
     """Entries to write to the robot file, by their key: text of the value in TOML."""
     is_ambiguous: bool = False
-    """Wheels and another sensor contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
+    """Wheels and another senso. contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
     that, and the gyro is not to be used unless the wheels alone are in question."""
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Correlation of the wheels' turn and speed with each source, as the robot file has them."""
     ratios: Mapping[str, float] = field(default_factory=dict)
     """Measured over expected motion, by what was compared."""
     has_lost_signs: bool = False
-    """The wheels' rates are speeds without a sign: they alone are in question."""
+    """The wheels' rates are speeds without a sign, or a driver's odometry has no turns: they alone are in question."""
 
 
 def open_checked(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> tuple[Log, WiringReport]:  # noqa: B008
@@ -384,12 +386,23 @@ def _corrected(sensors: Log | LiveSensors, signals: WheelSignals, base: Wiring, 
     found = _best(signals, signals.joint_rates, _alternatives(signals, base))
     if not found:
         return WiringReport(sensors.robot, correlations=measured)
+    found = _at_their_end(sensors, signals, found)
     if len({wiring.signature for wiring in found}) > 1:
         return _ambiguous(sensors, [wiring.text for wiring in found], measured)
     speeds = [name for name in measured if name.startswith("speed")]
     if {*found[0].reversed} == {*range(len(signals.joints))} and speeds == ["speed by the LiDAR"]:
         return _front_of(sensors, signals, found[0], measured)
     return _certain(sensors, signals, found[0], measured)
+
+
+def _at_their_end(sensors: Log | LiveSensors, signals: WheelSignals, found: list[Wiring]) -> list[Wiring]:
+    """Those of ``found`` with which the LiDAR is at its own end of the robot. A gyro of the other sign beside a LiDAR that is mounted
+    backwards, and wheels that all count backwards beside one that is upside down, differ in that alone."""
+    is_turned = [wiring.gyro < 0.0 and wiring.lidar == (-1.0, 1.0) for wiring in found]
+    share = _share_of_other_end(sensors, signals) if any(is_turned) and len(found) > 1 else None
+    if share is None or _SAME_END <= share <= 1.0 - _SAME_END:
+        return found
+    return [wiring for wiring, turned in zip(found, is_turned, strict=True) if turned == (share > 0.5)]
 
 
 def _front_of(sensors: Log | LiveSensors, signals: WheelSignals, backwards: Wiring, measured: Mapping[str, float]) -> WiringReport:
@@ -459,6 +472,8 @@ def _odometry_of(
         )
         return WiringReport(_with_unknown_signs(log.robot), (text,))
     gyro, turn = signals.turns.get("gyro"), signals.turns.get(topic)
+    if fastest > 0.0 and turn is not None and float(np.nanmax(np.abs(turn))) == 0.0:
+        return _without_turns(log, signals, topic)
     if gyro is None or turn is None or not signals.is_gyro_upright:
         return WiringReport(log.robot)
     r = correlation(turn, gyro, MIN_TURN_RAD_S, MAX_BIAS_RAD_S)
@@ -491,6 +506,23 @@ def _odometry_of(
     text = f"the gyro's sign is reversed (correlation of {_numbers(measured)}). {CORRECTED} imu.rate_unit_rad_s = {unit:g}."
     robot = replace(log.robot, imu=replace(log.robot.imu, rate_unit_rad_s=unit))
     return WiringReport(robot, (text,), {"imu.rate_unit_rad_s": f"{unit:g}"}, correlations=measured)
+
+
+def _without_turns(log: Log | LiveSensors, signals: WheelSignals, topic: str) -> WiringReport:
+    """A driver's odometry that goes ahead alone; nothing is wrong where no other senso. turns."""
+    signals = with_lidar(log, signals)
+    others = {name: turn for name, turn in signals.turns.items() if name in ("gyro", "LiDAR")}
+    turned = {name: float(np.nansum(np.abs(turn))) * STEP_S for name, turn in others.items() if np.nanstd(turn) > MIN_TURN_RAD_S}
+    if not turned:
+        return WiringReport(log.robot)
+    name, angle = next(iter(turned.items()))
+    text = (
+        f"{topic}: it goes ahead and never turns, while the robot turns by {math.degrees(angle):.0f} deg in all by the {name}: its driver"
+        " does not reckon headings (a firmware of ways alone, or an axis filled in wrongly). Turns are left to the other sensors, and"
+        " the covariance has any heading. Let the driver publish angular.z and the orientation, or record the wheels' joint states."
+    )
+    noise = replace(log.robot.wheel_noise, floor_rad2_per_s=_UNKNOWN_TURN_RAD2_PER_S)
+    return WiringReport(replace(log.robot, wheel_noise=noise), (text,), is_ambiguous=True, has_lost_signs=True)
 
 
 def _check_multiplier(log: Log | LiveSensors, ratio: float, measured: Mapping[str, float]) -> WiringReport:
@@ -593,6 +625,9 @@ def _alternatives(signals: WheelSignals, base: Wiring) -> list[Wiring]:
         opposite = "the gyro's sign is reversed"
         found += [w._replace(gyro=-1.0, changes=w.changes + 1, text=f"{w.text}, and {opposite}") for w in found[:3]]
         found.append(base._replace(gyro=-1.0, changes=1, text=f"{opposite} (an IMU upside down)"))
+        if "LiDAR" in signals.turns:
+            text = f"{opposite} (an IMU upside down), and the LiDAR is turned by 180 deg"
+            found.append(base._replace(gyro=-1.0, lidar=(-1.0, 1.0), changes=2, text=text))
     if "LiDAR" in signals.turns:
         if "gyro" in signals.turns and signals.is_gyro_upright:  # which the wheels then agree with
             found += [w._replace(lidar=(1.0, -1.0), changes=2, text=w.text) for w in found[:3]]
@@ -640,7 +675,7 @@ def _ambiguous(log: Log | LiveSensors, ways: Sequence[str], measured: Mapping[st
 def _certain(log: Log | LiveSensors, signals: WheelSignals, wiring: Wiring, measured: Mapping[str, float]) -> WiringReport:
     """Report with the robot corrected. A LiDAR's mount is left to its own check, which measures its angle."""
     is_swapped = {*wiring.left} != {*range(signals.left)}
-    if wiring.lidar != (1.0, 1.0) and not wiring.reversed and not is_swapped:
+    if wiring.lidar != (1.0, 1.0) and not wiring.reversed and not is_swapped and wiring.gyro > 0.0:
         return WiringReport(log.robot, correlations=measured)
     robot, keys = log.robot, {}
     names = signals.joints

@@ -20,7 +20,7 @@ from localization.evaluation.references import RELATION_COLUMNS, ReferenceTrack,
 from localization.events import Scan
 from localization.logs import Log
 from localization.logs.reference_topics import east_north, geodetic_to_ecef
-from localization.trajectory import IntArray, number_rows, parse_float, tum_rows, yaw_of_quaternion
+from localization.trajectory import IntArray, number_rows, parse_float, tum_rows, whole_lines, yaw_of_quaternion
 from motion_models import se2
 from motion_models.se2 import FloatArray
 from motion_models.text_files import check_file
@@ -71,6 +71,8 @@ def read_reference_file(path: str | Path, log_stamps: LogStamps | None = None) -
     if suffix == ".tum" and not _has_commas(path):
         return _read_tum(path)
     lines = _text_lines(path)
+    if any(line.startswith(("# .PCD", "VERSION 0.7", "FIELDS ", "ply")) for line in lines[:3]):
+        raise EvaluationError(f"'{path}' is a point cloud (PCD, PLY), which has no trajectory. {_KNOWN}")
     if any("<gpx" in line[:4096] for line in lines[:5]):
         return _of_poses(_read_gpx(path), path, None)
     if any(re.match(r"\$..(GGA|RMC|GLL|GNS),", line) for line in lines[:_ROWS_PARSED]):
@@ -204,7 +206,7 @@ def _spread_stamps(n: int, log_stamps: LogStamps | None, path: Path) -> IntArray
 def _text_lines(path: Path) -> list[str]:
     try:
         check_file(path)
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return whole_lines(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise EvaluationError(f"'{path}' cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
@@ -469,9 +471,17 @@ _NAMED = {
 }  # fmt: skip
 
 
+_SEXAGESIMAL = {
+    **dict.fromkeys(("min", "mins", "minute", "minutes", "m", "'"), "minutes"),
+    **dict.fromkeys(("sec", "secs", "second", "seconds", "s", '"'), "seconds"),
+}
+"""Parts of a degree in columns of their own."""
+
+
 @dataclass(frozen=True)
 class _Columns:
-    """Column of each quantity: "time", "seconds" and "nanoseconds" of split stamps, x, y, z, qx .. qw, yaw, latitude, ..."""
+    """Column of each quantity: "time", "seconds" and "nanoseconds" of split stamps, x, y, z, qx .. qw, yaw, latitude, "latitude minutes",
+    ..."""
 
     names: tuple[str, ...]
     index: dict[str, int]
@@ -499,6 +509,9 @@ def _role(name: str) -> tuple[str, str]:
     found = unit.group(1).strip().lower() if unit else ""
     if not tokens:
         return "", ""
+    angle, part = _NAMED.get(tokens[0], ""), _SEXAGESIMAL.get(tokens[1] if len(tokens) == 2 else found if len(tokens) == 1 else "")
+    if angle in ("latitude", "longitude") and part:
+        return f"{angle} {part}", ""
     if len(tokens) > 1 and tokens[-1] in {"mm", "cm", "m", "deg", "rad", "ns", "us", "ms", "s"}:
         found = found or tokens.pop()
     last = tokens[-1]
@@ -515,6 +528,17 @@ def _role(name: str) -> tuple[str, str]:
     if last in _POSITION:
         return last, found
     return _NAMED.get(last, ""), found
+
+
+def _in_degrees(angles: FloatArray, path: Path) -> tuple[FloatArray, tuple[str, ...]]:
+    """Latitudes and longitudes (N, 2) [deg], of NMEA's ddmm.mmmm where these are beyond 90; and a sentence of that."""
+    known = angles[np.isfinite(angles).all(axis=1)]
+    if not len(known) or float(np.abs(known[:, 0]).max()) <= 90.0:
+        return angles, ()
+    found = np.copysign(np.abs(angles) // 100.0 + np.abs(angles) % 100.0 / 60.0, angles)
+    if (np.abs(known) % 100.0 >= 60.0).any() or float(np.nanmax(np.abs(found[:, 0]))) > 90.0:
+        raise EvaluationError(f"'{path}': latitudes reach {np.abs(known[:, 0]).max():g}, beyond 90 degrees. {_KNOWN}")
+    return found, (f"latitudes in {path} are beyond 90 degrees: read as degrees and minutes (ddmm.mmmm, as of NMEA).",)
 
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3}
@@ -534,6 +558,11 @@ def _read_columns(columns: _Columns, rows: Sequence[Sequence[str]], path: Path) 
     def lengths(name: str) -> FloatArray:
         return values(name) * _METRES.get(columns.units[name], 1.0)
 
+    def degrees(name: str) -> FloatArray:
+        parts = sum((values(f"{name} {of}") / by for of, by in (("minutes", 60.0), ("seconds", 3600.0)) if f"{name} {of}" in wanted), 0.0)
+        whole = values(name)
+        return np.asarray(whole + np.copysign(parts, whole))
+
     stamps = None
     if "time" in wanted:
         at = wanted["time"]
@@ -545,7 +574,8 @@ def _read_columns(columns: _Columns, rows: Sequence[Sequence[str]], path: Path) 
                 stamps = stamps + values("nanoseconds").astype(np.int64)
     if "latitude" in wanted and "longitude" in wanted and "x" not in wanted:
         height = values("height") if "height" in wanted else np.zeros(len(rows))
-        return _Poses(stamps, _local(np.column_stack([values("latitude"), values("longitude"), height])))
+        angles, warnings = _in_degrees(np.column_stack([degrees("latitude"), degrees("longitude")]), path)
+        return _Poses(stamps, _local(np.column_stack([angles, height])), warnings=warnings)
     positions = np.column_stack([lengths("x"), lengths("y"), lengths("z") if "z" in wanted else np.zeros(len(rows))])
     if {"qx", "qy", "qz", "qw"} <= wanted.keys():
         return _Poses(stamps, positions, np.column_stack([values(name) for name in ("qx", "qy", "qz", "qw")]))

@@ -145,6 +145,10 @@ def make_track(
     if not order.size:
         raise EvaluationError(f"{source} holds no usable sample ({dropped} in it, none of them finite).")
     warnings: tuple[str, ...] = ()
+    held = _held(positions[order])
+    if held.any():
+        order = order[~held]
+        warnings += (f"{held.sum()} of {len(stamps)} positions of {source} were dropped: repeated until a jump, as trackers do when lost.",)
     far = _single_jumps(positions[order])
     if far.any():
         order = order[~far]
@@ -162,9 +166,24 @@ def make_track(
         None if yaws is None else yaws[order],
         None if covariances is None else covariances[order],
         source,
-        dropped + int(far.sum()),
+        dropped + int(held.sum()) + int(far.sum()),
         warnings,
     )
+
+
+def _held(positions: FloatArray) -> BoolArray:
+    """(N,) samples that repeat the position before until one far away follows: a robot at rest moves on by small steps."""
+    found = np.zeros(len(positions), dtype=bool)
+    if len(positions) < _MIN_JUDGED:
+        return found
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    jumps = np.flatnonzero((steps[1:] > _JUMP_STEPS * np.percentile(steps, _FAST_PERCENT)) & (steps[:-1] == 0.0)) + 1
+    for last in jumps.tolist():
+        first = last
+        while first > 0 and steps[first - 1] == 0.0:
+            first -= 1
+        found[first + 1 : last + 1] = True
+    return found
 
 
 def _single_jumps(positions: FloatArray) -> BoolArray:

@@ -266,6 +266,8 @@ def _find_problems(log: Log, topics: list[TopicInfo]) -> list[str]:
         )
     found += _find_uneven_spans(log, topics)
     used = [topic for topic in topics if topic.used_as in ("wheels", "lidar", "imu", "center_of_gravity", "arms")]
+    first_ns = [topic.first_stamp_ns for topic in used if topic.first_stamp_ns is not None]
+    is_one_clock = len(first_ns) > 1 and max(first_ns) - min(first_ns) < _MAX_CLOCK_OFFSET_S * 1e9  # played and recorded anew, or simulated
     for topic in used:
         for count, what in (
             (topic.zero_stamps, "have no stamp"),
@@ -274,8 +276,8 @@ def _find_problems(log: Log, topics: list[TopicInfo]) -> list[str]:
         ):
             if count:
                 found.append(f"{topic.topic}: {count} of {topic.count} messages {what}.")
-        if topic.first_stamp_ns is not None and abs(topic.first_stamp_ns - log.start_ns) * 1e-9 > log.duration_s + _MAX_CLOCK_OFFSET_S:
-            apart = (topic.first_stamp_ns - log.start_ns) * 1e-9
+        apart = 0.0 if topic.first_stamp_ns is None else (topic.first_stamp_ns - log.start_ns) * 1e-9
+        if abs(apart) > log.duration_s + _MAX_CLOCK_OFFSET_S and not is_one_clock:
             found.append(f"{topic.topic}: its stamps are {abs(apart):.0f} s {'after' if apart > 0 else 'before'} the time of recording.")
         if topic.gaps:
             longest = max(topic.gaps, key=lambda gap: gap.duration_s)

@@ -458,6 +458,8 @@ def _open_file(path: Path) -> Source:
         head = file.read(16)
     if not head:
         raise LogError(f"log '{path}' is empty.")
+    if head.startswith(b"version https://"):
+        raise LogError(f"'{path}' is a pointer of Git LFS, not the log itself: `git lfs pull` downloads it.")
     if head.startswith(ros1.MAGIC):
         return ros1.Ros1Bag(path)
     if head.startswith(mcap.MAGIC):

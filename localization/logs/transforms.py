@@ -38,6 +38,12 @@ class FixedTransforms:
         for transform in message.transforms:
             edge = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
             matrix = _matrix(transform.transform)
+            if matrix is None and is_static and _is_unfilled(transform.transform):
+                matrix = _translation(transform.transform)
+                self._no_rotations[edge[1]] = (
+                    f"/tf_static: the transform from '{edge[0]}' to '{edge[1]}' has a quaternion of four zeros, which its publisher has not"
+                    " filled in: taken as no rotation. Write qw = 1 there, or its rotation."
+                )
             if matrix is None or edge[0] == edge[1]:
                 if is_static:
                     reason = "its rotation is no unit quaternion" if matrix is None else "a frame cannot be its own parent"
@@ -151,6 +157,19 @@ def _matrix(transform: Any) -> FloatArray | None:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     matrix[:3, 3] = values[:3]
+    return matrix
+
+
+def _is_unfilled(transform: Any) -> bool:
+    """Whether its rotation was left at zeros, and its translation is one."""
+    t, q = transform.translation, transform.rotation
+    return bool(np.isfinite([t.x, t.y, t.z]).all()) and (q.x, q.y, q.z, q.w) == (0.0, 0.0, 0.0, 0.0)
+
+
+def _translation(transform: Any) -> FloatArray:
+    """(4, 4) of a geometry_msgs/Transform without its rotation."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = transform.translation.x, transform.translation.y, transform.translation.z
     return matrix
 
 

@@ -113,7 +113,9 @@ def urdf_root(text: str, source: str) -> ET.Element:
         root = ET.fromstring(_OPTENV.sub(r"\1", text).lstrip("\ufeff \t\r\n").encode())
     except ET.ParseError as error:
         # An old xacro file may not declare its namespace, which is an error of XML already.
-        raise RobotError(f"{source}: {_XACRO if '<xacro:' in text else f'not valid XML: {error}'}.") from error
+        is_none = "<" not in text
+        what = "no URDF, which begins with <robot>" if is_none else _XACRO if "<xacro:" in text else f"not valid XML: {error}"
+        raise RobotError(f"{source}: {what}{' (init takes a controller YAML as --controller)' if is_none else ''}.") from error
     if root.tag != "robot":
         raise RobotError(f"{source}: the outermost element is <{root.tag}>; a URDF has <robot>.")
     if any("xacro}" in e.tag for e in root.iter()):

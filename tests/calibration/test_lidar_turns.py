@@ -33,7 +33,7 @@ def _compared(
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("late_s", [0.35, -0.2, 1.2, 0.0])
+@pytest.mark.parametrize("late_s", [0.35, -0.2, 1.2, 3.4, 0.0])
 def test_lidar_clock_and_side_are_measured_by_turns(late_s: float, sign: float) -> None:
     found = _compared(late_s, sign)
     assert found is not None

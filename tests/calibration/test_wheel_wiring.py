@@ -263,3 +263,34 @@ def test_front_of_a_robot_with_its_lidar_in_the_middle_is_not_known(tmp_path: Pa
     assert not report.robot.joints.is_front_known
     assert "which end of the robot is its front" in report.findings[0]
     assert report.keys["joints.is_front_known"] == "false"
+
+
+SCANNING = Vehicle(0.1, 0.42, 0.34, 0.6, 0.45, 0.9, wheels_hz=20.0, imu_hz=40.0, scan_hz=8.0, beams=160, room=(11.0, 9.0), seed=51)
+
+
+def _checked(tmp_path: Path, how: Publishing, vehicle: Vehicle = SCANNING) -> WiringReport:
+    log = entrance_drives.write(tmp_path / "log.mcap", vehicle, entrance_drives.drive(vehicle), how)
+    return open_checked(log, vehicle.robot())[1]
+
+
+def test_gyro_of_the_other_sign_beside_a_lidar_that_is_mounted_backwards_is_corrected(tmp_path: Path) -> None:
+    """Wheels that all count backwards beside a LiDAR upside down have the same signs: the end at which it moves in turns decides."""
+    report = _checked(tmp_path, Publishing(gyro=-1.0, lidar_yaw=math.pi))
+    assert dict(report.keys) == {"imu.rate_unit_rad_s": "-1"}
+    assert "the LiDAR is turned by 180 deg" in report.findings[0]
+    backwards = Publishing(lambda a, r: (-a, -r), lidar_flip=True)
+    assert list(_checked(tmp_path, backwards).keys) == ["joints.reversed"]
+
+
+@pytest.mark.parametrize("yaw_deg", [-90.0, 60.0])
+def test_unit_is_found_by_a_lidar_that_is_turned_to_the_side(tmp_path: Path, yaw_deg: float) -> None:
+    vehicle = replace(SCANNING, imu_hz=0.0)
+    report = _checked(tmp_path, Publishing(lambda a, r: (np.zeros(0), 9.5493 * r), lidar_yaw=math.radians(yaw_deg)), vehicle)
+    assert dict(report.keys) == {"joints.rate_unit_rad_s": "0.10472"}
+
+
+def test_driver_that_never_turns_is_named(tmp_path: Path) -> None:
+    report = _checked(tmp_path, Publishing(forms="odometry", odometry_k=0.0))
+    assert "never turns, while the robot turns by" in report.findings[0]
+    assert report.keys == {}
+    assert report.robot.wheel_noise.floor_rad2_per_s > 0.1

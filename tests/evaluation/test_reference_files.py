@@ -207,3 +207,60 @@ def test_reference_of_no_format_is_refused_with_what_works(tmp_path, text, found
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(EvaluationError, match=f"{found}.*KITTI"):
         read_reference_file(tmp_path / "a.txt")
+
+
+def _degrees_of(x: float, y: float) -> tuple[float, float]:
+    """Latitude and longitude [deg] of east and north [m], to centimetres in 10 m."""
+    return 47.3 + math.degrees(y / 6.3674e6), 8.5 + math.degrees(x / (6.3893e6 * math.cos(math.radians(47.3))))
+
+
+@pytest.mark.parametrize("header", ["t,lat_deg,lat_min,lat_sec,lon_deg,lon_min,lon_sec", "t,Lat(D),Lat(M),Lat(S),Lon(D),Lon(M),Lon(S)"])
+def test_reference_in_degrees_minutes_and_seconds_is_read(tmp_path: Path, header: str) -> None:
+    rows = []
+    for t, (x, y, _) in zip(STAMPS, TRUTH, strict=True):
+        parts = [(int(a), int(60.0 * (a % 1.0)), 60.0 * (60.0 * (a % 1.0) % 1.0)) for a in _degrees_of(x, y)]
+        rows.append(f"{t / 1e9:.3f}," + ",".join(f"{d},{m},{s:.8f}" for d, m, s in parts))
+    found = _track(tmp_path / "novatel.csv", [header, *rows])
+    np.testing.assert_allclose(found.positions - found.positions[0], TRUTH[:, :2], atol=0.03)
+
+
+def test_reference_in_minutes_of_nmea_is_read_as_such(tmp_path: Path) -> None:
+    rows = []
+    for t, (x, y, _) in zip(STAMPS, TRUTH, strict=True):
+        latitude, longitude = (100.0 * int(a) + 60.0 * (a % 1.0) for a in _degrees_of(x, y))
+        rows.append(f"{t / 1e9:.3f},{latitude:.9f},{longitude:.9f}")
+    found = _track(tmp_path / "gps.csv", ["time,latitude,longitude", *rows])
+    np.testing.assert_allclose(found.positions - found.positions[0], TRUTH[:, :2], atol=0.03)
+    assert "ddmm.mmmm" in found.warnings[0]
+    with pytest.raises(EvaluationError, match="beyond 90 degrees"):
+        _track(tmp_path / "none.csv", ["time,latitude,longitude", *(f"{t / 1e9:.3f},4790.5,830.5" for t in STAMPS)])
+
+
+def test_last_line_that_is_cut_is_left_out(tmp_path: Path) -> None:
+    rows = [f"{t / 1e9:.3f} {x} {y} 0 0 0 {math.sin(a / 2)} {math.cos(a / 2)}" for t, (x, y, a) in zip(STAMPS, TRUTH, strict=True)]
+    (tmp_path / "cut.tum").write_text("\n".join([*rows, "1700000002.1 4.5 7"]))
+    found = read_reference_file(tmp_path / "cut.tum")
+    assert isinstance(found, ReferenceTrack)
+    _check(found)
+    (tmp_path / "short.tum").write_text("\n".join([*rows, "1700000002.1 4.5 7"]) + "\n")
+    with pytest.raises(EvaluationError, match="line 22: expected 8 numbers"):
+        read_reference_file(tmp_path / "short.tum")
+
+
+def test_point_cloud_is_named_as_no_reference(tmp_path: Path) -> None:
+    (tmp_path / "map.pcd").write_text("# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nDATA ascii\n0 0 0\n")
+    with pytest.raises(EvaluationError, match=r"is a point cloud \(PCD, PLY\), which has no trajectory"):
+        read_reference_file(tmp_path / "map.pcd")
+
+
+def test_poses_that_are_repeated_until_a_jump_are_left_out(tmp_path: Path) -> None:
+    """A tracker that has lost its markers publishes its last pose; a robot that stands moves on by small steps."""
+    t = np.arange(400) * 0.05
+    way = np.minimum(t, 8.0) + np.maximum(t - 10.0, 0.0)
+    held = np.where((t > 15.0) & (t < 17.0), way[t <= 15.0][-1], way)
+    lines = [f"{T0 + at:.3f} {x:.4f} 0 0 0 0 0 1" for at, x in zip(t, held, strict=True)]
+    found = _track(tmp_path / "mocap.tum", lines)
+    at = (found.stamps_ns - T0 * 10**9) * 1e-9
+    assert not ((at > 15.06) & (at < 16.99)).any()
+    assert ((at > 8.0) & (at < 10.0)).sum() == 39
+    assert "repeated until a jump" in " ".join(found.warnings)

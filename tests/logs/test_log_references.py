@@ -230,7 +230,7 @@ def test_transforms_on_tf_that_move_are_no_mounts(tmp_path: Path, ros1: bool) ->
 
 def test_transforms_invalid_are_ignored(tmp_path: Path) -> None:
     zero = bags.quaternion()
-    zero = type(zero)(x=0.0, y=0.0, z=0.0, w=0.0)
+    zero = type(zero)(x=0.0, y=0.0, z=1e-6, w=0.0)
     edges = [("base_link", "a", (0.0, 0.0, 0.0), zero), ("base_link", "b", (np.nan, 0.0, 0.0), bags.quaternion())]
     assert not {"a", "b"} & mounts_of(tmp_path, edges).keys()
 
