@@ -572,7 +572,7 @@ def _left(d: Diagnosis) -> str:
         return contesting[0].text
     implausible = [f"{f.cause} {f.size:+.2g}" for f in d.findings if not f.is_plausible]
     if implausible:
-        return f"{' and '.join(implausible)} would fit, but are more than robots have"
+        return f"{' and '.join(implausible)} would fit, but no robot has as much"
     rows = [
         f"{name} {row.unattributed_rms:.2g} {row.unit}, noise {row.expected_rms:.2g}, {describe_row(row).removeprefix('unexplained: ')}"
         for name, row in d.discrepancy.items()

@@ -290,8 +290,20 @@ def attribute_rows(
             whitened = float(np.sqrt(np.mean(white_rest[known, c] ** 2)))
             listed = np.where(is_significant, shares, 0.0)
             component = _attributed(component, listed, every, linearization.causes, chosen, whitened)
+        elif excess > MAX_NOISE_OVER_REFERENCE and name == "yaw" and _is_confirmed_by_gyro(linearization.noise):
+            component = component.with_status("unexplained", ())
         found[name] = component
     return found
+
+
+def _is_confirmed_by_gyro(noise: Noise) -> bool:
+    """Whether the gyro turns as the motion reference does, so that noise of the predicted headings is no error of the reference: by a law
+    of the floor's direction wheels were off by 54 times the noise of scan matching, and the gyro by no more than its own
+    (`tests.studies.unseen_effects`, draw 12, case 23)."""
+    yaw, gyro = CHANNELS.index("yaw"), CHANNELS.index("gyro")
+    both = noise.known[:, yaw] & noise.known[:, gyro]
+    squares = np.sum(noise.sigmas[both] ** 2, axis=0)
+    return bool(both.any() and squares[yaw] > MAX_NOISE_OVER_REFERENCE**2 * squares[gyro])
 
 
 def _parts_of(change: FloatArray, linear: FloatArray) -> FloatArray:

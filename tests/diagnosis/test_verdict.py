@@ -164,6 +164,22 @@ def test_attribute_rows_p_values_of_noise_are_uniform(rotations: Linearization) 
         assert kstest(column, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.parametrize(("gyro_sigma", "status"), [(0.001, "unexplained"), (0.05, "noise")])
+def test_attribute_rows_noise_of_headings_that_the_gyro_does_not_have_is_no_error_of_the_reference(
+    rotations: Linearization, gyro_sigma: float, status: str
+) -> None:
+    """The wheels' headings scatter by 50 times what the reference states, and the gyro turns with the reference or does not."""
+    gyro = CHANNELS.index("gyro")
+    sigmas = np.full(rotations.rows.shape, 0.05)
+    sigmas[:, gyro] = gyro_sigma
+    drawn = np.random.default_rng(3).normal(0.0, 0.5 * sigmas)
+    drive = measured(rotations, np.where(np.isfinite(rotations.rows) | (np.arange(len(CHANNELS)) == gyro), drawn, np.nan), sigmas)
+    stated = np.full((len(drive.rows), 3), 0.001)
+    row = attribute_rows(drive, drive, (), np.zeros(0), 0.01, stated, np.zeros_like(drive.rows))["yaw"]
+    assert row.noise_over_reference == pytest.approx(50.0)
+    assert row.status == status
+
+
 def test_find_trends_in_noise_are_as_rare_as_their_p_value() -> None:
     """At most 11 of 300 drives have one at a significance of 1 % (binomial, 99.99 %), and each drive has one that is there."""
     drive = law_drive("turtlebot3_burger")
@@ -214,7 +230,7 @@ def test_correctable_findings_are_none_beside_sizes_that_no_robot_has() -> None:
     table = {"yaw": row("attributed")}
     large = finding(size=0.25)
     assert correctable_findings(diagnosis((large,), (), table)) == []
-    assert "would fit, but are more than robots have" in sentence(diagnosis((large,), (), table))
+    assert "would fit, but no robot has as much" in sentence(diagnosis((large,), (), table))
     assert correctable_findings(diagnosis((finding(),), (trend(0.2, "track_width"),), table)) == []
     assert correctable_findings(diagnosis((finding(),), (), table)) == [finding()]
 
@@ -272,7 +288,7 @@ def test_correctable_findings_keep_what_the_contested_one_hardly_moves() -> None
     assert "Correct" not in sentence(d)  # unexplained, and nothing shows that it improves windows held out
     d = dataclasses.replace(d, gain=Gain(2.0, 1.0, 0.5, 0.4, 0.6))
     assert sentence(d).startswith("Correct lidar_yaw")
-    assert "track_width -0.25 would fit, but are more than robots have" in sentence(d)
+    assert "track_width -0.25 would fit, but no robot has as much" in sentence(d)
 
 
 @pytest.mark.parametrize(("robot", "twin_m"), [("jackal", -0.13), ("husky_a200", -0.1)], ids=["jackal", "husky_a200"])
