@@ -1,8 +1,8 @@
 """Logs, descriptions and references as practitioners bring them, through `replay`, `check` and `init` with default settings.
 
-`python -m tests.studies.entrance_commands [base | field | symptoms | mixed | forum | closing | threads | last | other | more | hostile |
-KIND | part of a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of trajectories [m], of
-wheels alone and of the EKF, with those of the same drive with nothing wrong in brackets.
+`python -m tests.studies.entrance_commands [base | verification | field | symptoms | mixed | forum | closing | threads | last | other |
+more | hostile | KIND | part of a NAME] [-v]` prints kind, name and outcome (of `tests.studies.entrances`); with `-v` also the errors of
+trajectories [m], of wheels alone and of the EKF, with those of the same drive with nothing wrong in brackets.
 """
 
 from __future__ import annotations
@@ -261,6 +261,7 @@ def main(arguments: Sequence[str]) -> None:
     from tests.studies.entrance_other_cases import OTHER
     from tests.studies.entrance_symptom_cases import SYMPTOMS
     from tests.studies.entrance_thread_cases import THREADS
+    from tests.studies.entrance_verification_cases import VERIFICATION
 
     wanted = [a for a in arguments if not a.startswith("-")]
     sets = {
@@ -275,11 +276,12 @@ def main(arguments: Sequence[str]) -> None:
         "mixed": MIXED,
         "symptoms": SYMPTOMS,
         "field": FIELD,
+        "verification": VERIFICATION,
     }
     found = []
     for case in (
         c
-        for c in (*FIELD, *SYMPTOMS, *MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
+        for c in (*VERIFICATION, *FIELD, *SYMPTOMS, *MIXED, *FORUM, *CLOSING, *THREADS, *LAST, *OTHER, *MORE, *HOSTILE, *CASES)
         if not wanted or any(c in sets[w] if w in sets else w == c.kind or w in c.name for w in wanted)
     ):
         with tempfile.TemporaryDirectory() as folder:
