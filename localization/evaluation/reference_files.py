@@ -206,11 +206,14 @@ def _spread_stamps(n: int, log_stamps: LogStamps | None, path: Path) -> IntArray
 def _text_lines(path: Path) -> list[str]:
     try:
         check_file(path)
-        return whole_lines(path.read_text(encoding="utf-8-sig"))
+        lines = whole_lines(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise EvaluationError(f"'{path}' cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
         raise EvaluationError(f"'{path}' is not a text file. {_KNOWN}") from error
+    if lines and lines[0].startswith("version https://git-lfs"):
+        raise EvaluationError(f"'{path}' is a pointer of Git LFS, not the reference itself: `git lfs pull` downloads it.")
+    return lines
 
 
 def _has_commas(path: Path) -> bool:

@@ -247,10 +247,13 @@ def test_last_line_that_is_cut_is_left_out(tmp_path: Path) -> None:
         read_reference_file(tmp_path / "short.tum")
 
 
-def test_point_cloud_is_named_as_no_reference(tmp_path: Path) -> None:
+def test_point_cloud_and_pointer_are_named_as_no_reference(tmp_path: Path) -> None:
     (tmp_path / "map.pcd").write_text("# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nDATA ascii\n0 0 0\n")
     with pytest.raises(EvaluationError, match=r"is a point cloud \(PCD, PLY\), which has no trajectory"):
         read_reference_file(tmp_path / "map.pcd")
+    (tmp_path / "truth.tum").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(EvaluationError, match="is a pointer of Git LFS, not the reference itself"):
+        read_reference_file(tmp_path / "truth.tum")
 
 
 def test_poses_that_are_repeated_until_a_jump_are_left_out(tmp_path: Path) -> None:

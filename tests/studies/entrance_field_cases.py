@@ -44,7 +44,7 @@ from tests.studies.entrance_base_logs import (
     written,
 )
 from tests.studies.entrance_command_cases import both, changed, q, shifted, stamp_of, without
-from tests.studies.entrance_commands import Case, Edit, clouded, initialized, replayed, run_command, warnings_in
+from tests.studies.entrance_commands import Case, Edit, clouded, contradictions, initialized, replayed, run_command, warnings_in
 from tests.studies.entrance_edits import (
     NAMES,
     RPM,
@@ -108,9 +108,10 @@ def _healthy_kinds(base: BaseLog) -> frozenset[str]:
 
 
 @functools.cache
-def _healthy_check(base: BaseLog) -> str:
+def _healthy_check(base: BaseLog) -> frozenset[str]:
     with tempfile.TemporaryDirectory() as name:
-        return based("", "", base).judge(Path(name)).text.partition("\n")[0]
+        log, robot, _ = written(Path(name), base, lambda records: records)
+        return frozenset(_kinds(contradictions(Path(name), log, robot)))
 
 
 def quiet(kind: str, name: str, base: BaseLog, edit: Edit) -> Case:
@@ -119,10 +120,11 @@ def quiet(kind: str, name: str, base: BaseLog, edit: Edit) -> Case:
 
     def judge(folder: Path) -> Found:
         found = inner.judge(folder)
-        state, _, warned = found.text.partition("\n")
-        is_checked = "no contradiction" in state or "no contradiction" not in _healthy_check(base)
-        is_quiet = is_checked and not _kinds(warned) - _healthy_kinds(base)
-        return found if found.outcome != "right" or is_quiet else Found("misnamed", found.text)
+        if found.outcome != "right":
+            return found
+        checked = contradictions(folder, folder / "log.mcap", folder / "robot.toml")
+        is_quiet = not _kinds(found.text.partition("\n")[2]) - _healthy_kinds(base) and not _kinds(checked) - _healthy_check(base)
+        return found if is_quiet else Found("misnamed", f"check: {checked} {found.text}")
 
     return Case(kind, name, judge)
 

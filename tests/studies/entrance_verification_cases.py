@@ -55,6 +55,11 @@ def decimal_minutes(t: float, x: float, y: float, a: float) -> tuple[float, ...]
     return tuple(row)
 
 
+def rounded(t: float, x: float, y: float, a: float) -> tuple[float, ...]:
+    """TUM, to centimetres."""
+    return t, round(x, 2), round(y, 2), 0.0, *q(a)
+
+
 def lost(every_s: float, for_s: float) -> Callable[[Trajectory], str]:
     """A tracker that repeats its last pose for a part of the time."""
 
