@@ -292,10 +292,11 @@ def referred(
     edit: Edit = lambda records: records,
     reference: str = "",
     noise_m: float = 0.0,
+    is_corrected: bool = False,
 ) -> Case:
     """A reference (a file, or topic ``reference``) of a base log.
 
-    Right where the runs have the errors of the healthy log, or sentences have all of ``words``.
+    Right where the runs have the errors of the healthy log, or sentences have all of ``words``, which name a correction or a doubt.
     """
 
     def judge(folder: Path) -> Found:
@@ -308,7 +309,7 @@ def referred(
             own = error_of(best.truth["ekf"], best.reference)
             return {"ekf": best.errors["ekf"] or own, **({} if base.load()[1] is None else {"odometry": best.errors["odometry"]})}
 
-        return judge_scores(code, text, folder / "m.json", words, wanted, noise_m)
+        return judge_scores(code, text, folder / "m.json", words, wanted, noise_m, is_corrected)
 
     return Case("references", name, judge)
 
