@@ -383,12 +383,14 @@ class LidarCheck:
         return LidarFinding(text, frame, None, is_certain=True, clock=right)
 
 
-def check_lidar(log: Log, is_clock_known: bool = False) -> LidarFinding | None:
+def check_lidar(log: Log, is_clock_known: bool = False, mounts: Mapping[str, Mount] | None = None) -> LidarFinding | None:
     """Compare the first minute of driving; None where mount and clock agree, unless that ``is_clock_known``, or the drive does not show
-    it."""
+    it. ``mounts``: by frame, in place of the log's."""
     if log.sources.lidar is None or log.sources.wheels is None or log.wheels_error is not None:
         return None
-    check = LidarCheck(log.mounts, log.robot, log.sources.lidar.topic, log.sources.imu is not None, is_clock_known)
+    check = LidarCheck(
+        log.mounts if mounts is None else mounts, log.robot, log.sources.lidar.topic, log.sources.imu is not None, is_clock_known
+    )
     for event in log.events():
         check.add(event)
         if check.is_done:
@@ -419,9 +421,13 @@ def open_log_checked(path: Path | str, robot: Robot, topics: TopicOverrides = To
         log, of_clock = open_log(path, replace(log.robot, clock=found.clock), topics), (found,)
         log.add_notes(wiring.findings)
         found = check_lidar(log, is_clock_known=True)
-    lidar = (*of_clock, *(() if found is None else (found,)))
+    lidar, mounts = (*of_clock, *(() if found is None else (found,))), corrected(log.mounts, found)
+    if found is not None and found.mount is not None:  # one that is turned may be elsewhere, too
+        again = check_lidar(log, is_clock_known=bool(of_clock), mounts=mounts)
+        if again is not None and again.mount is not None:
+            lidar, mounts = (*lidar, again), corrected(mounts, again)
     log.add_notes(one.text for one in lidar)
-    return CheckedLog(log, wiring, corrected(log.mounts, found), lidar)
+    return CheckedLog(log, wiring, mounts, lidar)
 
 
 def _has_moved(first: WheelSample, now: WheelSample) -> bool:

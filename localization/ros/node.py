@@ -381,12 +381,14 @@ class Node:
             if lidar.clock is not None:
                 robot = replace(self.inputs.robot, clock=lidar.clock)
                 self.inputs.rewire(self._keep_wiring(LiveRobot(robot, self._uses_gyro)), self.session.pipeline.mounts)
-            self._begin_anew(corrected(self.session.pipeline.mounts, lidar))
+            before = self.session.pipeline.mounts
+            is_turned = lidar.mount is not None and lidar.mount.x == before[lidar.frame].x  # it may be elsewhere, too
+            self._begin_anew(corrected(before, lidar))
             self._checks.begin(
                 self.session.pipeline.mounts,
-                lidar=is_clock_known,
+                lidar=is_clock_known or is_turned,
                 is_gyro_clock_known=is_clock_known,
-                is_lidar_clock_known=True,
+                is_lidar_clock_known=not is_turned,
             )
         else:
             return

@@ -24,6 +24,7 @@ from tests.helpers.bags import S, write_mcap
 from tests.helpers.entrance_drives import Publishing, Vehicle, drive, records_of, write
 from tests.helpers.extended import cases
 from tests.helpers.hostile_logs import Case, write_case
+from tests.helpers.hostile_mounts import rear_lidar_described_at_the_front
 from tests.helpers.online import ROBOT, drive_log
 from tests.studies.lidar_mounts import found_on
 
@@ -90,6 +91,14 @@ def test_place_of_a_lidar_shows_in_wide_curves(shift: float) -> None:
     found, _, left_m = found_on("pioneer_3at", "laps", 5, effects)
     assert len(found) == (shift != 0.0)
     assert abs(left_m) < 0.1
+
+
+def test_lidar_at_the_rear_that_is_described_at_the_front_is_turned_and_moved(tmp_path: Path) -> None:
+    log, vehicle, _ = rear_lidar_described_at_the_front(tmp_path)
+    checked = open_log_checked(log, vehicle.robot())
+    assert len(checked.lidar) == 2
+    assert checked.mounts["laser"].x == pytest.approx(-0.3, abs=0.05)
+    assert abs(checked.mounts["laser"].yaw) == pytest.approx(math.pi)
 
 
 def test_place_of_a_lidar_is_open_on_a_circle() -> None:

@@ -15,16 +15,19 @@ from localization.ros.node import Node
 from localization.ros.session import Files
 from localization.ros.settings import LiveRun, NodeConfig
 from motion_models.registry import make_model
+from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
+from tests.helpers.hostile_mounts import rear_lidar_described_at_the_front
 from tests.helpers.online import LogTransport, track
 
 CASE = Path(__file__).parents[1] / "data" / "cases" / "H11-lidar-yaw-180"
 pytestmark = pytest.mark.xdist_group("online")
 
 
-def test_live_lidar_turned_by_180_deg_is_corrected_from_the_start_on() -> None:
-    robot, reports = load_robot(CASE / "robot.toml"), []
-    transport = LogTransport(CASE / "log.mcap")
+def spun(log: Path, robot: Robot) -> tuple[Node, LogTransport, list[str]]:
+    """A node that had all messages of ``log``, and its reports."""
+    reports: list[str] = []
+    transport = LogTransport(log)
     run = LiveRun(
         robot,
         lambda has_lidar: Trial(make_model("skid_steer", robot), "ekf"),
@@ -35,6 +38,12 @@ def test_live_lidar_turned_by_180_deg_is_corrected_from_the_start_on() -> None:
     WarmUp(run).wait(with_clouds=False)  # the transport has no time: everything would come while the node compiles
     node = Node.start(transport, run, reports.append)
     node.spin(transport.is_empty)
+    return node, transport, reports
+
+
+def test_live_lidar_turned_by_180_deg_is_corrected_from_the_start_on() -> None:
+    robot = load_robot(CASE / "robot.toml")
+    node, transport, reports = spun(CASE / "log.mcap", robot)
     assert sum("the yaw of 'laser' is wrong by 180 deg" in report for report in reports) == 1
     truth = list(open_log(CASE / "log.mcap", robot).references("/ground_truth/odom"))
     live = track(transport)
@@ -42,3 +51,13 @@ def test_live_lidar_turned_by_180_deg_is_corrected_from_the_start_on() -> None:
     true = truth[-1].position - truth[0].position
     assert np.linalg.norm(live[last][0][:2]) == pytest.approx(np.linalg.norm(true), abs=0.02)
     assert all("differ" not in warning for warning in node.session.pipeline.warnings())
+
+
+@pytest.mark.extended
+def test_live_lidar_at_the_rear_that_is_described_at_the_front_is_turned_and_moved(tmp_path: Path) -> None:
+    log, vehicle, motion = rear_lidar_described_at_the_front(tmp_path)
+    node, transport, reports = spun(log, vehicle.robot())
+    assert [sum(text in report for report in reports) for text in ("wrong by 180 deg", "behind the mount of 'laser'")] == [1, 1]
+    assert node.session.pipeline.mounts["laser"].x == pytest.approx(-0.3, abs=0.05)
+    live = track(transport)
+    assert live[max(live)][0][:2] == pytest.approx(motion.poses[-1, :2], abs=0.05)
