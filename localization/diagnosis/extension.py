@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot
 from localization.diagnosis.diagnose import DiagnosisConfig, examine
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import DrivePredictor
-from localization.diagnosis.findings import CLEAR_SIGMAS, MAX_NOISE_OVER_REFERENCE, Attribution, HandoverCheck
+from localization.diagnosis.findings import CLEAR_SIGMAS, MAX_NOISE_OVER_REFERENCE, Attribution, Component, HandoverCheck
 from localization.diagnosis.handover import CandidateRobot, Reader, check_written
 from localization.diagnosis.linearization import Linearization
 from localization.diagnosis.missing_terms import (
@@ -375,12 +375,31 @@ def _with_extension(again: DiagnosisResult, extension: Extension, before: Diagno
     d = again.diagnosis
     if again.residuals is not None and before.residuals is not None:
         again = dataclasses.replace(again, residuals=dataclasses.replace(again.residuals, rows=before.residuals.rows))
+    d = dataclasses.replace(d, discrepancy=_with_terms_in_rows(d.discrepancy, before.diagnosis.discrepancy, extension.terms))
     verdict = "extended" if d.verdict in ("consistent", "explained") else d.verdict
     rest = "" if d.verdict == "consistent" else f" {d.sentence}"
     rest = f" {extension.describe_effects()}{rest}" if extension.effects else rest
     if d.verdict == "consistent" and d.suspected is not None:  # too weak to be named, and so is the drive that would settle it
         d = dataclasses.replace(d, suspected=None, next_drive="")
     return dataclasses.replace(again, diagnosis=dataclasses.replace(d, verdict=verdict, sentence=f"{extension.describe()}.{rest}"))
+
+
+def _with_terms_in_rows(rows: Mapping[str, Component], before: Mapping[str, Component], terms: Sequence[FoundTerm]) -> dict[str, Component]:
+    """``rows`` of the extended model that begin with the discrepancies of the plain one (``before``), and attribute to each term what its
+    component no longer has."""
+    found = dict(rows)
+    for name, row in rows.items():
+        old = before.get(name)
+        if old is None or name not in _CHANNEL_OF.values():
+            continue
+        share = 1.0 - min((row.rms / max(old.rms, 1e-12)) ** 2, 1.0)
+        is_turned = name != "yaw" and old.status != "noise"  # what acts sideways acts along the end of an arc as well
+        own = [t for t in terms if _CHANNEL_OF[t.term.component] == name] or [t for t in terms if is_turned]
+        row = dataclasses.replace(row, rms=old.rms, p_value=old.p_value)
+        parts = tuple(Attribution(t.term.name, t.term.value, share / len(own), True) for t in own)
+        status = row.status if row.status == "unexplained" or not own else "attributed"
+        found[name] = row.with_status(status, (*parts, *row.attributions))
+    return found
 
 
 def _robot_by(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> tuple[CorrectedRobot, dict[Cause, float]]:

@@ -237,6 +237,8 @@ class Replayed(NamedTuple):
         return self.after_m > _MAX_GROWTH * self.before_m and self.after_m**2 - self.before_m**2 > self.noise_m**2
 
 
+_SHOWN_CHANGE = 0.01
+"""Relative change of a component that is printed."""
 CLEAR_SIGMAS = 3.0
 """Sigmas of the drive's noise by which a half that was held out has to show a change: neighbouring windows share some of it."""
 
@@ -272,8 +274,9 @@ class HandoverCheck:
         return is_gain and not any(one.is_worse for one in self.replays.values())
 
     def describe(self) -> str:
-        """Errors of the half held out before and after, as a sentence without a stop."""
-        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in self.before)
+        """Errors of the half held out before and after, of the components that change, as a sentence without a stop."""
+        changed = [c for c in self.before if abs(self.after[c] - self.before[c]) > _SHOWN_CHANGE * self.before[c]] or list(self.before)
+        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in changed)
         text = f"half of the drive ({self.windows} windows), corrected by the other half alone: {rows} (root mean square)"
         return f"{text}; {self.describe_replays()}" if self.replays else text
 

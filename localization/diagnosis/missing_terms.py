@@ -330,7 +330,8 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
             break
         previous = terms
         noise = noise_beside(predictor, state, design.columns[..., list(terms)])
-    chosen = _with_clock_for_gains(design.problem(noise), state.causes, candidates, chosen)
+    if any(finding.definition.is_clock for finding in found.diagnosis.findings):
+        chosen = _with_clock_for_gains(design.problem(noise), state.causes, candidates, chosen)
     chosen, stability = _supported(design, noise, chosen, f, rng)
     has_sides = not _has_mirrored_rival(design.problem(noise), prices, limits, chosen, dict(enumerate(candidates, f)))
     return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(has_sides=has_sides)
@@ -339,7 +340,7 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
 def _with_clock_for_gains(
     problem: _Regression, causes: Sequence[Cause], candidates: Sequence[CandidateTerm], chosen: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """``chosen`` with the wheels' clock in the place of gains in speed and in turning rate that are alike: to first order late stamps are
+    """``chosen`` with the wheels' clock, which is named, in the place of gains in speed and in turning rate that are alike: to first order late stamps are
     vx = c dv and wz = c dwz.
 
     On MIT-CSAIL, whose positions and headings give clocks of -217 and -152 ms, the two terms explain the drive better, by -183 and -164 ms.

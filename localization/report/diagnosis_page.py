@@ -29,7 +29,7 @@ _MAX_PANELS = 4
 _VERDICTS = {
     "consistent": "No discrepancy exceeds noise and tolerances; the table shows each component.",
     "explained": "Each discrepancy that exceeds its noise has a cause with a name.",
-    "extended": "With terms that no physical cause is known for, each discrepancy is explained; the table is that of the extended model.",
+    "extended": "With terms that no physical cause is known for, each discrepancy is explained; RMS is that of the model without them.",
     "ambiguous": "The discrepancies are explained, but by more than one cause; this drive cannot separate them.",
     "unexplained": "The discrepancies have a part that no cause explains.",
     "undecidable": "This drive cannot show whether the model is right.",
