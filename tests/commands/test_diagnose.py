@@ -99,7 +99,8 @@ def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float]
 
 @pytest.mark.slow
 def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """diff_drive has no parameter for either: the file's [geometry] and [clock] hold them for every model."""
+    """diff_drive has no parameter for either: the file's [geometry] and [clock] hold them for every model. What else a robot that skids is
+    off by diff_drive stays: no cause stands for it."""
     log = bag(tmp_path / "drive.mcap", {"wheel_radius_difference": 0.04, "wheel_time_offset": 0.06}, 1, "husky_a200")
     out = tmp_path / "out"
     assert main(["diagnose", str(log), "--robot", "husky_a200", "--model", "diff_drive", "--out", str(out)]) == 0
@@ -107,7 +108,7 @@ def test_diagnose_out_hands_radii_and_clock_to_diff_drive(tmp_path: Path, capsys
     content = json.loads((out / "diagnosis.json").read_text())["handover"]
     assert content["is_better"]
     ratios = {name: content["rms_after"][name] / content["rms_before"][name] for name in ("x", "yaw")}
-    assert max(ratios.values()) < 0.6, ratios
+    assert max(ratios.values()) < 0.75, ratios
     robot = load_robot(out / "robot.toml")
     assert robot.clock.wheel_time_offset_s == pytest.approx(0.06, abs=0.01)
     assert robot.geometry.left_wheel_radius_multiplier == pytest.approx(1.02, abs=0.003)
