@@ -340,8 +340,8 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
 def _with_clock_for_gains(
     problem: _Regression, causes: Sequence[Cause], candidates: Sequence[CandidateTerm], chosen: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """``chosen`` with the wheels' clock, which is named, in the place of gains in speed and in turning rate that are alike: to first order late stamps are
-    vx = c dv and wz = c dwz.
+    """``chosen`` with the wheels' clock, which is named, in the place of gains in speed and in turning rate that are alike: to first order
+    late stamps are vx = c dv and wz = c dwz.
 
     On MIT-CSAIL, whose positions and headings give clocks of -217 and -152 ms, the two terms explain the drive better, by -183 and -164 ms.
     """
