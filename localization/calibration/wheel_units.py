@@ -388,6 +388,6 @@ def _name_range(report: UnitReport, signals: WheelSignals) -> UnitReport:
     value = counter if counter is not None else float(f"{size:.6g}")
     what = f"a counter of {math.log2(counter):.0f} bits" if counter is not None else "a counter that wraps"
     times = f"{len(sizes)} time{'s' * (len(sizes) > 1)}"
-    text = f"positions of the wheels jump by {value:.10g} ({times}): {what}. {CORRECTED} joints.angle_range = {value:.0f}."
+    text = f"positions of the wheels jump by {value:.10g} ({times}): {what}. {CORRECTED} joints.angle_range = {value:.10g}."
     robot = replace(report.robot, joints=replace(joints, angle_range=value))
     return replace(report, robot=robot, findings=(*report.findings, text), keys={**report.keys, "joints.angle_range": f"{value:.10g}"})

@@ -438,7 +438,8 @@ class JointsToWheels:
         jumped = np.abs(step) * self._radius > _MAX_SPEED_M_S * max(dt, _MIN_INTERVAL_S)
         expected = np.nan_to_num(velocity) * dt
         wrapped = np.remainder(step + 0.5 * self.angle_period, self.angle_period) - 0.5 * self.angle_period
-        is_wrap = np.abs(wrapped - expected) < np.where(np.isfinite(velocity), _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD)
+        deviation = np.where(np.isfinite(velocity), _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD)
+        is_wrap = (np.abs(step) < 1.5 * self.angle_period) & (np.abs(wrapped - expected) < deviation)  # one period, never two
         return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:

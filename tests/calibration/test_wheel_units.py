@@ -78,6 +78,16 @@ def test_units_of_counters_of_16_bits_lose_no_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(turned[-1] - turned[0], whole[-1] - whole[0], rtol=0.1)
 
 
+def test_units_of_angles_within_two_turns_lose_no_motion(tmp_path: Path) -> None:
+    log, report = open_checked(drive(tmp_path / "log.mcap", lambda position, velocity: (np.mod(position, 4.0 * math.pi), NOTHING)), ROBOT)
+    value = report.robot.joints.angle_range
+    assert value == pytest.approx(4.0 * math.pi, rel=0.02)
+    assert any(f"joints.angle_range = {value:.6g}" in finding for finding in report.findings)
+    turned = [event.position for event in log.events() if isinstance(event, WheelSample)]
+    whole = [event.position for event in open_log(CASES / "base-log" / "log.mcap", ROBOT).events() if isinstance(event, WheelSample)]
+    np.testing.assert_allclose(turned[-1] - turned[0], whole[-1] - whole[0], rtol=0.02)
+
+
 def test_units_of_positions_that_are_reset_once_are_no_counter(tmp_path: Path) -> None:
     """The driver starts anew half way."""
 

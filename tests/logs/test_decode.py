@@ -369,6 +369,17 @@ def test_wheel_angles_after_encoder_reset_lose_one_increment(tmp_path: Path) -> 
     assert any("/joint_states: 1 message with a wheel angle" in note for note in log.warnings())
 
 
+@pytest.mark.parametrize("turns", [1, 2])
+def test_wheel_angle_that_jumps_by_more_than_one_turn_is_named(tmp_path: Path, turns: int) -> None:
+    """A driver that undoes wraps the wrong way jumps by two; an angle that wraps, by one."""
+    angles = 0.05 * np.arange(40)[:, None] + np.where(np.arange(40) < 20, 0.0, turns * math.tau)[:, None]
+    messages = [bags.joint_state(START + i * S // 50, position=[*a] * 4) for i, a in enumerate(angles)]
+    log = log_of(tmp_path, "/joint_states", messages, S // 50)
+    moved = wheels_of(log)[-1].position
+    np.testing.assert_allclose(moved, 0.05 * (39 if turns == 1 else 38), atol=1e-9)
+    assert any("/joint_states: 1 message with a wheel angle" in note for note in log.warnings()) == (turns > 1)
+
+
 @pytest.mark.parametrize("value", [0.0, np.nan], ids=["frozen", "NaN"])
 def test_wheel_encoder_that_fails_on_the_way_is_left_out(tmp_path: Path, value: float) -> None:
     """Of four, for five of twenty seconds; the wheels of a side turn unlike each other, and where it counts again it begins at zero."""
