@@ -18,10 +18,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from localization.calibration.lidar_check import open_log_checked
 from localization.errors import CheckpointError, OutputError
 from localization.estimators import check_estimator
 from localization.events import Event
-from localization.logs import open_log
 from localization.output import fingerprint
 from localization.pipeline import Pipeline
 from localization.ros.diagnostics import ERROR, OK, WARN, Status
@@ -82,20 +82,20 @@ class OnlineCommand(OnlineSettings):
                 view.close()
 
     def _play(self, console: Console, path: Path, rate: float, run: LiveRun, stop: StopSignal, view: View | None) -> None:
-        robot, files = run.robot, run.files
-        log = open_log(path, robot, self.topic)
+        files, checked = run.files, open_log_checked(path, run.robot, self.topic)
+        log, robot, mounts = checked.log, checked.log.robot, checked.mounts
         has_lidar = log.sources.lidar is not None
         check_estimator(self.estimator, has_lidar, self.map is not None, log.no_wheels)
-        trial = self.make_trial(has_lidar)
+        trial = self.make_trial(has_lidar, robot)
         if trial.prior is not None:
             trial.prior.check_lidar(log.sources.has_clouds, bool(self.config.step.planar))
-        made = made_by(trial, robot, log.mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
-        pipeline = Pipeline(trial, robot, log.mounts, has_lidar, self.config)
+        made = made_by(trial, robot, mounts, has_lidar, self.config, f"log {fingerprint(path)[:12]}")
+        pipeline = Pipeline(trial, robot, mounts, has_lidar, self.config)
         session = Session.start(files, SessionState(pipeline), f"{trial.model.name}_{trial.estimator}", made, shared_of(trial))
         is_done = False
         try:
             if view is not None:
-                view.begin(robot, log.mounts)
+                view.begin(robot, mounts)
                 session.view = view
             if session.head:
                 console.print(f"resumed from {files.state} after {session.count} events", markup=False, soft_wrap=True)

@@ -214,12 +214,14 @@ class OnlineSettings:
         """Raises `OutputError` for names that cannot be used."""
         return Files(self.out, self.state)
 
-    def make_trial(self, has_lidar: bool) -> Trial:
-        """Motion model, estimator and saved map. Raises `EstimatorError`, `MapError`, `ModelError` and `RobotError`."""
+    def make_trial(self, has_lidar: bool, robot: Robot | None = None) -> Trial:
+        """Motion model of ``robot`` (by default that of the file), estimator and saved map. Raises `EstimatorError`, `MapError`,
+        `ModelError` and `RobotError`."""
         name = self.estimator if self.map is None else LOCALIZER
         check_estimator(name, has_lidar, self.map is not None)
         (form,) = check_forms([self.corrections])
-        return Trial(make_model(self.model, load_robot(self.robot)), name, form, None if self.map is None else self._prior(self.map))
+        model = make_model(self.model, robot or load_robot(self.robot))
+        return Trial(model, name, form, None if self.map is None else self._prior(self.map))
 
     def _prior(self, path: Path) -> PriorMap:
         return PriorMap(make_places(load_map(path).map, self.config.estimator.lidar.range_noise_m))

@@ -1,19 +1,27 @@
-"""The picture in the terminal, on a run of the node."""
+"""`skidloc online`: the picture in the terminal, on a run of the node; and a log whose robot is described wrong."""
 
 from __future__ import annotations
 
 import functools
 import io
+from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from localization.cli import main
 from localization.commands.online import terminal_view
+from localization.logs import open_log
 from localization.ros.diagnostics import ERROR, WARN, Status
+from localization.trajectory import read_tum
+from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers.extended import cases
+from tests.helpers.hostile_mounts import rear_lidar_described_at_the_front
 from tests.helpers.online import LogTransport, drive_log, run_node
 
+CASES = Path(__file__).parents[1] / "data" / "cases"
 pytestmark = pytest.mark.xdist_group("online")
 STATUSES = [
     Status("lidar"),
@@ -57,3 +65,35 @@ def test_terminal_view_before_the_first_estimate_names_what_it_needs():
     console = Console(file=io.StringIO(), width=80)
     console.print(terminal_view(node.session, node.seconds, []))
     assert "no estimate yet" in console.file.getvalue()
+
+
+WRONG = {
+    "H11-lidar-yaw-180": "the yaw of 'laser' is wrong by 180 deg",
+    "H06-right-side-inverted": "joints.reversed = [",
+    "H13-wheel-rates-in-rpm": "joints.rate_unit_rad_s = 0.10472",
+}
+
+
+@pytest.mark.parametrize("case", cases(WRONG, ("H11-lidar-yaw-180", "H13-wheel-rates-in-rpm")))
+def test_online_of_a_log_corrects_what_contradicts_the_robot_file(case, tmp_path, capsys):
+    log, robot = CASES / case / "log.mcap", CASES / case / "robot.toml"
+    assert main(["online", str(log), "--robot", str(robot), "--rate", "max", "--out", str(tmp_path / "run.tum")]) == 0
+    text = capsys.readouterr().out
+    assert WRONG[case] in text
+    assert not any(words in text for words in ("LiDAR lost", "differ by more"))
+    truth = list(open_log(log, load_robot(robot)).references("/ground_truth/odom"))
+    true = truth[-1].position - truth[0].position
+    assert np.linalg.norm(read_tum(tmp_path / "run.tum").poses[-1, :2]) == pytest.approx(np.linalg.norm(true), abs=0.05)
+
+
+def test_online_of_a_log_with_a_turned_lidar_writes_what_replay_does(tmp_path):
+    """LiDAR at the rear, described at the front: turned by 180 deg, and elsewhere."""
+    log, vehicle, motion = rear_lidar_described_at_the_front(tmp_path)
+    robot = tmp_path / "robot.toml"
+    robot.write_text(robot_toml(vehicle.robot()))
+    options = ["--robot", str(robot), "--out"]
+    assert main(["online", str(log), "--rate", "max", *options, str(tmp_path / "run.tum")]) == 0
+    only = ["--model", "skid_steer", "--estimator", "ekf", "--reference", "none", "--static"]
+    assert main(["replay", str(log), *only, *options, str(tmp_path / "replayed")]) == 0
+    assert (tmp_path / "run.tum").read_bytes() == (tmp_path / "replayed" / "skid_steer_ekf.tum").read_bytes()
+    assert read_tum(tmp_path / "run.tum").poses[-1, :2] == pytest.approx(motion.poses[-1, :2], abs=0.05)
