@@ -50,13 +50,18 @@ on, and from this share of the file's value. ACES, fr079, CSAIL and the Husky ou
 (two wheels, and a caster that drags)."""
 _CENTER_X = "x_cr"
 """Centre of rotation ahead of base_link, which in turns moves a LiDAR to the side as its own place ahead does."""
-_TURNING = ("k_0", "wheel_separation_multiplier", "rotation_scale")
+_MULTIPLIER = "wheel_separation_multiplier"
+_TURNING = ("k_0", _MULTIPLIER, "rotation_scale")
 _MATCHED_S = 2.0
 """Scans that were matched so recently hold the pose, whatever wheels and gyro do [s]."""
 _MAX_CLIPPED_SIGMAS = 3.0
 """Largest sum of innovations over a window, in sigmas, where the gyro's rates end at a value."""
 _REPEATED_RAD_S, _MIN_REPEATED_S, _MIN_CLIPPED_RAD_S = 1e-9, 0.5, 0.05
 """Rates that are equal to the last digit, for so long, and far from zero, are the end of the gyro's range."""
+_PLAIN_MODEL = (
+    " The model is {model} with a wheel_separation_multiplier of 1: where wheels slide as the robot turns, that is the factor, and `skidloc"
+    " calibrate` fits it."
+)
 _USE_WITHOUT_SCANS = "The covariance has the distance between both while that lasts."
 _USE_WITH_SCANS = "The scans decide."
 
@@ -108,7 +113,7 @@ class SensorConsistency:
             if innovation is None:
                 continue
             if self._windows[pair].add(*innovation, self._totals, self._faults.now_s, self._reckoning.poses):
-                self._compare(pair)
+                self._compare(pair, learned)
                 has_ended = True
         if has_ended:
             self._compare_parameters(learned())
@@ -141,14 +146,17 @@ class SensorConsistency:
         """(3,) of the dead reckoning from the estimate since the begin of ``episode``."""
         return self._reckoning.distance(episode.poses, episode.row)
 
-    def _compare(self, pair: Pair) -> None:
-        """Report whether ``pair`` differs now, and begin or end an episode."""
+    def _compare(self, pair: Pair, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
+        """Report whether ``pair`` differs now, and begin or end an episode; parameters ``learned`` so far are for the sentence."""
         fault, worst = DIFFERENCES[pair], self._windows[pair].worst()
         is_clipped = self._clipping.is_clipped and pair != LIDAR_WHEELS_WAYS
         if self._is_explained(fault, NAMED[pair]) or worst is None or worst.sigmas < (_MAX_CLIPPED_SIGMAS if is_clipped else _MAX_SIGMAS):
             self._end(fault)
             return
         regressor, cause = worst.explain(pair, CAUSES[pair])
+        if regressor == TURN:
+            unset = [p for p in learned() if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value]
+            cause += "".join(_PLAIN_MODEL.format(model=p.owner) for p in unset)
         if is_clipped:
             regressor, cause = TURN, self._clipping.describe()
         is_by_lidar = regressor == TURN_CHANGE
@@ -174,7 +182,7 @@ class SensorConsistency:
         numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
         ahead_m = off.value - off.file_value
         far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
-        numbers |= {"file": off.file_value, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
+        numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
         self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
@@ -228,7 +236,7 @@ def _farthest(learned: Sequence[LearnedParameter]) -> LearnedParameter | None:
 
     def distance(p: LearnedParameter) -> float:
         least = max(_MIN_PRIOR_SIGMAS * p.prior_sigma, _MIN_LEARNED_SIGMAS * p.sigma)
-        if p.name == "wheel_separation_multiplier" and p.file_value == 1.0 < p.value:
+        if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value:
             return 0.0  # a driver's factor that nobody has set, of a robot that slides as it turns
         if p.name in _TURNING:
             least = max(_MIN_TURNING_SIGMAS * p.prior_sigma, _MIN_TURNING_SHARE * abs(p.file_value), _MIN_LEARNED_SIGMAS * p.sigma)

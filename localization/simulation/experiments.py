@@ -373,7 +373,9 @@ _ALL = (
     Experiment("rotation_grid", "68 rotations in place over a grid of CGs (Ebersole 2016, 4.2)", "lab", (0.0, 0.0, 0.0), _rotation_grid),
     Experiment("preliminary", "arc, s-curve and rotation of Ebersole 2016, eqs. 1.9-1.11", "hall", (0.0, 0.0, 0.0), _preliminary),
     Experiment(
-        "controller_evaluation", "6 trajectories x 7 arm configurations x 2 controllers", "hall", (0.0, 0.0, 0.0), _controller_evaluation
+        "controller_evaluation",
+        "6 trajectories x 7 arm configurations x 2 controllers (without arms: a ballast is moved, of which the log has nothing)",
+        *("hall", (0.0, 0.0, 0.0), _controller_evaluation),
     ),
     Experiment("laps", "laps through four rooms, the arms in another posture on each", "rooms", (0.0, -4.0, 0.0), _laps),
     Experiment("corridor", "a bare corridor of 60 m, there and back", "corridor", (0.0, 0.0, 0.0), _corridor),

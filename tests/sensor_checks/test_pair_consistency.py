@@ -95,7 +95,8 @@ def test_healthy_tour_of_a_room_is_not_reported(number: int) -> None:
 class Driven:
     """Steps of a tenth of a second with given residuals, into the check alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, parameter: str = "k_0", owner: str = "the robot") -> None:
+        self.parameter, self.owner = parameter, owner
         self.faults = FaultLog(CovarianceInflation())
         self.check = SensorConsistency(self.faults)
         self.seconds = 0.0
@@ -105,6 +106,7 @@ class Driven:
     ) -> None:
         """``innovation`` [rad/s] of a gyro; turn ``rate`` [rad/s] and ``speed`` [m/s] of the wheels."""
         rng = np.random.default_rng(0)
+        parameter = LearnedParameter(self.parameter, learned, 0.01, 1.0, 0.15, self.owner)
         for _ in range(round(10 * seconds)):
             start, self.seconds = round(self.seconds * S), self.seconds + 0.1
             delta = se2.exp(np.array([speed, 0.0, rate]) * 0.1)
@@ -116,7 +118,7 @@ class Driven:
             reckoning.predict(step)
             moved = se2.exp(np.array([speed, 0.0, rate + innovation]) * 0.1)
             reckoning.correct(step, se2.compose(reckoning.before[ESTIMATE], moved), delta)
-            self.check.add(step, Residuals((0.1 * innovation, 1e-5), delta), lambda: [LearnedParameter("k_0", learned, 0.01, 1.0, 0.15)])
+            self.check.add(step, Residuals((0.1 * innovation, 1e-5), delta), lambda: [parameter])
             self.check.compare_estimate(nis)
 
     @property
@@ -145,6 +147,16 @@ def test_report_names_the_pair_the_time_and_the_best_cause(rate: float, speed: f
     assert cause in warning
     assert "the turns by the gyro and those by the wheels differ" in warning
     assert 1.0 < robot.faults.found[TURNS_DIFFER].at_s < 3.0
+
+
+@pytest.mark.parametrize(("learned", "is_named"), [(1.6, True), (0.7, False)], ids=["sliding", "turning more"])
+def test_factor_on_turns_names_the_model_whose_multiplier_is_unset(learned: float, is_named: bool) -> None:
+    robot = Driven("wheel_separation_multiplier", "diff_drive")
+    for _ in range(4):
+        robot.drive(2.0, 0.0)
+        robot.drive(2.0, -0.09, 0.3, 0.0, learned=learned)
+    warning = next(text for text in robot.faults.warnings() if "A factor of 0.70 on the wheels' turns" in text)
+    assert ("The model is diff_drive with a wheel_separation_multiplier of 1" in warning) == is_named
 
 
 def test_bias_before_the_first_motion_is_measured_and_not_reported() -> None:
