@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -176,12 +177,12 @@ class Diagnose:
         d = found.diagnosis
         if d.handover is None or found.predictor is None or found.linearization is None or reader is None:
             return found
-        named = d.handover.corrected if d.handover.is_better else [f.definition.key for f in correctable_findings(d)]
+        named = d.handover.corrected if d.is_confirmed else [f.definition.key for f in correctable_findings(d)]
         try:
             handover = check_findings(found.predictor, found.linearization, named, reader)
         except SkidlocError as error:  # a robot that no command runs with keeps its old values
             note = f"the corrected robot cannot be replayed: {error}"
-            handover = dataclasses.replace(d.handover, gain=Interval(0.0, 0.0, 0.0))
+            handover = dataclasses.replace(d.handover, gain=Interval(0.0, 0.0, 0.0), shown=(0.0, math.inf))
             d = dataclasses.replace(d, warnings=(*d.warnings, note))
         d = dataclasses.replace(d, handover=handover or d.handover)
         return dataclasses.replace(found, diagnosis=dataclasses.replace(d, sentence=sentence(d)))
@@ -201,7 +202,7 @@ class Diagnose:
             corrected = [f for f in confirmed_findings(d) if is_held(predictor, f)]
             patch = correct_robot(predictor, sizes)
             new, manual_steps = patch.robot, patch.manual_steps
-        if d.handover is not None and not d.handover.is_better:
+        if d.handover is not None and not d.is_confirmed:
             manual_steps = (NOT_BETTER, *manual_steps)
         remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}."]
         for title, findings in (
@@ -287,7 +288,7 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
         console.print(f"{label}: {trend.text}", markup=False, soft_wrap=True)
     if d.handover is not None:
         console.print(f"corrected robot, {d.handover.describe()}", markup=False, soft_wrap=True)
-        if not d.handover.is_better:
+        if not d.is_confirmed:
             console.print(NOT_BETTER, markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)

@@ -331,11 +331,16 @@ class Diagnosis:
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether the robot may be corrected by the findings: by the file that they make, on the part of the drive that did not make it;
-        where there is no such file and a part of the drive stays unexplained, by windows that sizes were not fitted to."""
-        if self.handover is not None:
-            return self.handover.is_better
-        return self.verdict != "unexplained" or (self.gain is not None and self.gain.low > 0.0)
+        """Whether the robot may be corrected by the findings: by the file that they make, on the part of the drive that did not make it.
+
+        Where a part of the drive stays unexplained, errors have to shrink beyond their scatter over the windows: what is unexplained is in
+        the drive's noise, whose sigma does not say whether a change was shown. Without such a file they are those of windows that sizes
+        were not fitted to.
+        """
+        if self.handover is not None and not self.handover.is_better:
+            return False
+        check = self.gain if self.handover is None else self.handover.gain
+        return self.verdict != "unexplained" or (check is not None and check.low > 0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """The format of `diagnose --json`, whose keys stay as they are."""
@@ -353,7 +358,7 @@ class Diagnosis:
             "next_drive": self.next_drive,
             "sentence": self.sentence,
             "tolerances": dict(self.tolerances),
-            "handover": None if self.handover is None else self.handover.to_dict(),
+            "handover": None if self.handover is None else {**self.handover.to_dict(), "is_better": self.is_confirmed},
             "contradictions": list(self.contradictions),
             "outlier_windows_s": list(self.outliers_s),
             "witness": self.motion_reference,

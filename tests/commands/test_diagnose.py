@@ -18,6 +18,7 @@ from localization.logs import open_log
 from localization.trajectory import Trajectory, write_tum
 from motion_models import se2
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
+from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import bag, drive
@@ -95,6 +96,25 @@ def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float]
         assert main(["replay", str(log), *options]) == 0
         errors[name] = json.loads((replayed / "metrics.json").read_text())["results"][0]["rpe_translation_percent"]
     assert errors["after"] < 0.6 * errors["before"]
+
+
+@pytest.mark.extended
+def test_diagnose_robot_that_cannot_be_replayed_keeps_old_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However clearly predicted windows show the change."""
+
+    def refuse(*_: object) -> None:
+        raise CalibrationError("no command runs with it")
+
+    log = bag(tmp_path / "drive.mcap", {"wheel_radius_scale": 0.05}, 1, "husky_a200")
+    out = tmp_path / "out"
+    monkeypatch.setattr("localization.commands.diagnose.check_findings", refuse)
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(out)]) == 0
+    content = json.loads((out / "diagnosis.json").read_text())
+    assert "wheel_radius_scale" in [f["cause"] for f in content["findings"]]
+    assert not content["handover"]["is_better"]
+    assert "the corrected robot cannot be replayed: no command runs with it" in content["notes"]
+    assert "Correct " not in content["sentence"]
+    assert load_robot(out / "robot.toml").geometry == load_robot("husky_a200").geometry
 
 
 @pytest.mark.slow

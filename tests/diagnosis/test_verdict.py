@@ -20,8 +20,10 @@ from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
     Gain,
+    HandoverCheck,
     RowStatus,
     Trend,
+    confirmed_findings,
     correctable_findings,
     describe_row,
     sentence,
@@ -39,6 +41,7 @@ from localization.diagnosis.verdict import (
     separating_drive,
     trend_motions,
 )
+from motion_models.calibration.cross_validation import Interval
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.registry import make_model
@@ -289,6 +292,23 @@ def test_correctable_findings_keep_what_the_contested_one_hardly_moves() -> None
     d = dataclasses.replace(d, gain=Gain(2.0, 1.0, 0.5, 0.4, 0.6))
     assert sentence(d).startswith("Correct lidar_yaw")
     assert "track_width -0.25 would fit, but no robot has as much" in sentence(d)
+
+
+@pytest.mark.parametrize(
+    ("left", "low", "is_confirmed"),
+    [("attributed", -0.1, True), ("unexplained", -0.1, False), ("unexplained", 0.05, True)],
+)
+def test_diagnosis_unexplained_confirms_what_gains_beyond_its_scatter(left: RowStatus, low: float, is_confirmed: bool) -> None:
+    """A corrected robot that shows 1.3 +- 0.2 times its change, by the drive's noise, in a half whose errors scatter."""
+    check = HandoverCheck({"yaw": 0.02}, {"yaw": 0.018}, 18, Interval(0.1, low, 0.3), corrected=("track_width",), shown=(1.3, 0.2))
+    assert check.is_better
+    d = diagnosis((finding(),), (), {"yaw": row("attributed"), "x": row(left)})
+    d = dataclasses.replace(d, handover=check, gain=GAIN)
+    assert d.verdict == ("explained" if left == "attributed" else "unexplained")
+    assert d.is_confirmed == is_confirmed
+    assert [f.cause for f in confirmed_findings(d)] == ["track_width"] * is_confirmed
+    assert ("Correct track_width" in sentence(d)) == is_confirmed
+    assert d.to_dict()["handover"]["is_better"] == is_confirmed
 
 
 @pytest.mark.parametrize(("robot", "twin_m"), [("jackal", -0.13), ("husky_a200", -0.1)], ids=["jackal", "husky_a200"])
