@@ -63,6 +63,8 @@ _MIN_PART = 0.15
 """Smallest part of the way on each side of a change of the mount."""
 _SNAP_RAD = math.radians(4.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that."""
+_MAX_PASSES = 3
+"""A yaw, a place and a clock may all be wrong; each shows when what was found before is corrected."""
 _MIN_LEVEL = 0.5
 """Least vertical component of the axis of a planar LiDAR: beyond 60 degrees of tilt it measures no motion along the floor."""
 _MIN_TURN_RAD, _MIN_TURN_LIKENESS = 0.3, 0.6
@@ -415,19 +417,20 @@ def open_log_checked(path: Path | str, robot: Robot, topics: TopicOverrides = To
     log, wiring = open_checked(path, robot, topics)
     if wiring.is_ambiguous:
         return CheckedLog(log, wiring, log.mounts)
-    found = check_lidar(log)
-    of_clock: tuple[LidarFinding, ...] = ()
-    if found is not None and found.clock is not None:
-        log, of_clock = open_log(path, replace(log.robot, clock=found.clock), topics), (found,)
-        log.add_notes(wiring.findings)
-        found = check_lidar(log, is_clock_known=True)
-    lidar, mounts = (*of_clock, *(() if found is None else (found,))), corrected(log.mounts, found)
-    if found is not None and found.mount is not None:  # one that is turned may be elsewhere, too
-        again = check_lidar(log, is_clock_known=bool(of_clock), mounts=mounts)
-        if again is not None and again.mount is not None:
-            lidar, mounts = (*lidar, again), corrected(mounts, again)
+    mounts, lidar, is_clock_known = log.mounts, list[LidarFinding](), False
+    for _ in range(_MAX_PASSES):
+        found = check_lidar(log, is_clock_known, mounts)
+        if found is None or (not found.is_corrected and any(one.mount is not None for one in lidar)):
+            break
+        lidar.append(found)
+        mounts = corrected(mounts, found)
+        if found.clock is not None:
+            log, is_clock_known = open_log(path, replace(log.robot, clock=found.clock), topics), True
+            log.add_notes(wiring.findings)
+        if not found.is_corrected:
+            break
     log.add_notes(one.text for one in lidar)
-    return CheckedLog(log, wiring, mounts, lidar)
+    return CheckedLog(log, wiring, mounts, tuple(lidar))
 
 
 def _has_moved(first: WheelSample, now: WheelSample) -> bool:

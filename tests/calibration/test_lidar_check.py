@@ -101,6 +101,17 @@ def test_lidar_at_the_rear_that_is_described_at_the_front_is_turned_and_moved(tm
     assert abs(checked.mounts["laser"].yaw) == pytest.approx(math.pi)
 
 
+@pytest.mark.parametrize("late_s", [-0.4, 0.4])
+def test_clock_of_a_gyro_is_found_beside_a_lidar_that_is_turned(tmp_path: Path, late_s: float) -> None:
+    """The yaw is certain before the first turns show the clock."""
+    vehicle = Vehicle(0.165, 0.555, 0.512, 0.5, scan_hz=8.0, beams=180, seed=91)
+    how = Publishing(lidar_yaw=math.pi, offsets_s={"/imu/data": late_s})
+    checked = open_log_checked(write(tmp_path / "log.mcap", vehicle, drive(vehicle), how), vehicle.robot())
+    assert abs(checked.mounts["laser"].yaw) == pytest.approx(math.pi)
+    assert checked.log.robot.clock.gyro_time_offset_s == pytest.approx(late_s, abs=0.03)
+    assert len(checked.lidar) == 2
+
+
 def test_place_of_a_lidar_is_open_on_a_circle() -> None:
     """Its yaw would explain the same motion."""
     sizes: list[tuple[float, float]] = []
