@@ -38,7 +38,7 @@ from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_foreign_frames
-from motion_models.calibration.regressions import RotationTable, read_rotation_table, rotations_as_maneuvers, skid_steer_fit
+from motion_models.calibration.regressions import RotationTable, read_rotations, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
@@ -134,7 +134,7 @@ class Calibrate:
         print_cuts(console, robot, cuts)
         print_fit(console, found, about, cuts, robot)
         if of_rotations:
-            print_rotation_errors(console, found, _rotations(self.source), robot)
+            print_rotation_errors(console, found, _rotations(self.source, robot), robot)
         by_source = _each(found, cuts, robot) if len(cuts) > 1 else []
         print_by_source(console, by_source)
         if self.windows is not None:
@@ -150,14 +150,14 @@ class Calibrate:
             config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
             return cut_log(path, robot, self.topic, self.motion_reference, self.reference, config, sigmas, self.antenna)
         if kind == "rotations":
-            table = read_rotation_table(path)
+            table = read_rotations(path, robot)
             return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")
         maneuvers, notes = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)
         return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows", tuple(notes))
 
     def _regressions(self, console: Console, robot: Robot) -> tuple[Robot, dict[str, float], dict[str, Any]]:
         """The thesis's regressions; what is written are the coefficients by all rows at once, with their sigmas."""
-        table = _rotations(self.source)
+        table = _rotations(self.source, robot)
         multiplier = robot.driver.wheel_separation_multiplier
         found = skid_steer_fit(table, multiplier)
         print_regressions(console, table, found, robot)
@@ -196,8 +196,8 @@ def _kind(path: Path) -> str:
     return "rotations" if {"rotation_ratio"} & set(table_columns(path)) else "windows"
 
 
-def _rotations(paths: Sequence[Path]) -> RotationTable:
-    tables = [read_rotation_table(path) for path in paths]
+def _rotations(paths: Sequence[Path], robot: Robot) -> RotationTable:
+    tables = [read_rotations(path, robot) for path in paths]
     return RotationTable(*(np.concatenate([getattr(table, name) for table in tables]) for name in ("cg", "ratio", "cor")))
 
 

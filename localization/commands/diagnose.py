@@ -44,7 +44,7 @@ from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
 from motion_models.calibration.cross_validation import Interval
 from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
-from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
+from motion_models.calibration.regressions import read_rotations, rotations_as_maneuvers
 from motion_models.errors import CalibrationError, SkidlocError
 from motion_models.prior import unused_terms_notes
 from motion_models.registry import make_model
@@ -159,7 +159,7 @@ class Diagnose:
         if "vision_error_m" in columns:
             return drive_of_runs(name, robot, read_runs(self.source))
         if "rotation_ratio" in columns:
-            maneuvers = rotations_as_maneuvers(read_rotation_table(self.source), robot)
+            maneuvers = rotations_as_maneuvers(read_rotations(self.source, robot), robot)
             return drive_of_table(name, robot, maneuvers, "rotations")
         maneuvers, notes = without_foreign_frames(read_windows(self.source), robot.geometry.wheel_radius_m)
         found = drive_of_table(name, robot, maneuvers, "windows")

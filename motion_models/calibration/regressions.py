@@ -79,6 +79,23 @@ def read_rotation_table(path: str | Path) -> RotationTable:
     return RotationTable(data[:, :2], data[:, 2], data[:, 3:])
 
 
+def read_rotations(path: str | Path, robot: Robot) -> RotationTable:
+    """`read_rotation_table` of ``robot``. Raises `CalibrationError` as well for centres that are not those of its rotations in place: the
+    centre of gravity lies between the wheels, and the centre of rotation not farther off the middle than twice as far as they stand."""
+    table, geometry = read_rotation_table(path), robot.geometry
+    half = 0.5 * np.array([geometry.wheelbase_m, geometry.track_width_m])
+    for name, points, most in (("gravity", table.cg, half), ("rotation", table.cor, 2.0 * half)):
+        off = np.flatnonzero((np.abs(points) > most).any(axis=1))
+        if len(off):
+            (x, y), (far_x, far_y) = points[off[0]], most
+            raise CalibrationError(
+                f"table '{path}': the centres of {name} of {len(off)} of {len(points)} rows, from line {off[0] + 2} on, lie beyond x ="
+                f" +-{far_x:.3f} or y = +-{far_y:.3f} m, the first at ({x:g}, {y:g}) m, where the wheels of {robot.name} stand at"
+                f" +-{half[0]:.3f} and +-{half[1]:.3f} m. All are in metres from the middle between the wheels, x ahead and y to the left."
+            )
+    return table
+
+
 def _cell(text: str | None, column: str, line: int, path: str | Path) -> float:
     try:
         value = float(text or "")

@@ -16,6 +16,7 @@ from motion_models.calibration.regressions import (
     center_of_arc,
     polynomial,
     read_rotation_table,
+    read_rotations,
     regress,
     skid_steer_fit,
 )
@@ -135,6 +136,24 @@ def test_read_rotation_table_takes_columns_in_any_order(tmp_path):
 def test_read_rotation_table_of_bad_cells_names_the_place(tmp_path, rows, header, message):
     with pytest.raises(CalibrationError, match=message):
         read_rotation_table(write(tmp_path / "bad.csv", rows, header))
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "message"),
+    [
+        ("cor_x_m", lambda i, v: v + 2.0 if i in (3, 20, 40) else v, r"centres of rotation of 3 of 68 rows, from line 5 on"),
+        ("cor_y_m", lambda i, v: 1000.0 * v, r"centres of rotation of 6\d of 68 rows"),
+        ("cg_x_m", lambda i, v: 1000.0 * v, r"centres of gravity of .* of 68 rows"),
+    ],
+)
+def test_read_rotations_off_the_robot_names_the_lines(tmp_path, column, change, message):
+    vaultbot = load_robot("vaultbot")
+    good = read_rotation_table(DATA / "rotation_grid.csv")
+    assert len(read_rotations(DATA / "rotation_grid.csv", vaultbot).ratio) == 68
+    rows, at = np.column_stack([good.cg, good.ratio, good.cor]), COLUMNS.index(column)
+    rows[:, at] = [change(i, v) for i, v in enumerate(rows[:, at])]
+    with pytest.raises(CalibrationError, match=message):
+        read_rotations(write(tmp_path / "off.csv", rows.tolist()), vaultbot)
 
 
 @pytest.mark.parametrize(
