@@ -9,11 +9,14 @@ A reference is contradicted only if no run agrees with it better.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from localization.errors import EvaluationError
+from localization.evaluation.metrics import evaluate
+from localization.evaluation.reference_fit import find_lever
 from localization.evaluation.references import ReferenceTrack
 from localization.trajectory import Trajectory
 from motion_models import se2
@@ -97,7 +100,23 @@ def compare_reference(trajectories: Sequence[Trajectory], reference: ReferenceTr
     if best is not None and best.sigmas < _MIN_SIGMAS and reference.yaws is not None:
         inverse = (_compare(trajectory, _inverse(reference, reference.yaws), _CHORDS_S[0]) for trajectory in usable)
         return replace(best, is_inverse=any(found is not None and found.sigmas >= _MIN_SIGMAS for found in inverse))
+    if best is not None and best.sigmas < _MIN_SIGMAS:
+        of_point = (_compare(trajectory, reference, _CHORDS_S[0]) for trajectory in _of_point(usable, reference))
+        return max((best, *(found for found in of_point if found is not None)), key=lambda each: each.sigmas)
     return best
+
+
+def _of_point(trajectories: Sequence[Trajectory], reference: ReferenceTrack) -> Iterator[Trajectory]:
+    """Those of the point off base_link that positions alone measure (an antenna, a prism), where one explains them: it moves when the
+    robot turns in place."""
+    for trajectory in trajectories:
+        try:
+            errors = evaluate(trajectory, reference).errors
+        except EvaluationError:  # of no common time
+            continue
+        found = None if errors is None else find_lever(errors, reference)
+        if found is not None:
+            yield Trajectory(trajectory.stamps_ns, se2.compose(trajectory.poses, np.array([*found[0], 0.0])))
 
 
 def _inverse(reference: ReferenceTrack, yaws: FloatArray) -> ReferenceTrack:

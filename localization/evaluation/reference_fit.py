@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -57,6 +58,14 @@ def find_lever(errors: ErrorSeries, reference: ReferenceTrack) -> tuple[FloatArr
     lever, error = found[3:], math.sqrt(float((offset**2).sum(axis=1).mean()))
     is_possible = rank == 5 and _MIN_LEVER_M < float(np.hypot(*lever)) < _MAX_LEVER_M
     return (lever, left) if is_possible and left < _MAX_REST * error else None
+
+
+def errors_at(errors: ErrorSeries, reference: ReferenceTrack, lever: FloatArray) -> ErrorSeries:
+    """Errors of the point ``lever`` (2,) ahead and to the left of base_link [m], which the ``reference`` measures, aligned to it anew."""
+    positions = reference.positions[np.searchsorted(reference.stamps_ns, errors.stamps_ns)]
+    points = se2.compose(errors.estimate, np.array([*lever, 0.0]))
+    estimate = se2.compose(se2.align_points(points[:, :2], positions), points)
+    return replace(errors, estimate=estimate, position_m=np.linalg.norm(estimate[:, :2] - positions, axis=1))
 
 
 def _offsets(errors: ErrorSeries, reference: ReferenceTrack) -> FloatArray:

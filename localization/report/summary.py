@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2, wilcoxon
 
 from localization.evaluation.consistency import mean_band
-from localization.evaluation.metrics import relation_errors
-from localization.evaluation.reference_fit import find_lever, find_scatter
+from localization.evaluation.metrics import Accuracy, ErrorSeries, relation_errors
+from localization.evaluation.reference_fit import errors_at, find_lever, find_scatter
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
 from localization.report.runs import (
@@ -61,10 +62,17 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
     if reference is None or best is None:
         line = _most_informed(lines)
         return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}")]
+    of_point = ""
+    if (lever := _lever(lines, reference)) is not None and isinstance(reference, ReferenceTrack):
+        of_base = best.error
+        lines = [_at_point(line, reference, lever) for line in lines]
+        best = best_run(lines) or best
+        of_point = _of_point(lever, of_base, reference)
     equals = equally_good(lines, best, reference)
     ranking = _ranking(lines, best, equals, reference)
     return [
         *ranking,
+        *([of_point] if of_point else []),
         *losses,
         *_as_published(best),
         *_coverage(best),
@@ -74,6 +82,36 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         *_by_errors(best, reference),
         *_advice(lines, best, equals, reference),
     ]
+
+
+def _lever(lines: Sequence[PlottedRun], reference: ReferenceTrack | Relations) -> FloatArray | None:
+    """(2,) ahead and to the left of base_link [m] of the point that the reference measures, by the run that it explains best; or None."""
+    if isinstance(reference, Relations):
+        return None
+    series = [line.result.accuracy.errors for line in lines if line.result.accuracy is not None]
+    found = [lever for errors in series if errors is not None and (lever := find_lever(errors, reference)) is not None]
+    return min(found, key=lambda each: each[1])[0] if found else None
+
+
+def _at_point(line: PlottedRun, reference: ReferenceTrack, lever: FloatArray) -> PlottedRun:
+    """``line`` with the position errors of the point ``lever`` (2,) off base_link [m] in place of those of base_link."""
+    accuracy, live = (
+        each if each is None or each.errors is None else _with_errors(each, errors_at(each.errors, reference, lever))
+        for each in (line.result.accuracy, line.result.live)
+    )
+    return replace(line, result=replace(line.result, accuracy=accuracy, live=live))
+
+
+def _with_errors(accuracy: Accuracy, errors: ErrorSeries) -> Accuracy:
+    return replace(accuracy, errors=errors, ate_rmse_m=math.sqrt(float(np.mean(errors.position_m**2))))
+
+
+def _of_point(lever: FloatArray, of_base_m: float | None, reference: ReferenceTrack) -> str:
+    ahead, left = lever
+    along = f"{metres(abs(ahead))} {'ahead of' if ahead > 0.0 else 'behind'} base_link"
+    across = f"{metres(abs(left))} to the {'left' if left > 0.0 else 'right'}"
+    table = "" if of_base_m is None else f"; the table has those of base_link, from {metres(of_base_m)} on"
+    return f"{capitalize(reference.source)} is of a point {along}, {across} (an antenna, a prism): these errors are of that point{table}."
 
 
 def equally_good(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> list[PlottedRun]:
@@ -320,19 +358,11 @@ def _visibility(best: PlottedRun, reference: ReferenceTrack | Relations) -> list
 
 
 def _by_errors(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
-    """Which point of the robot a reference without headings is of, and the scatter of one without covariances, by the errors."""
+    """The scatter of a reference without covariances, by the errors."""
     errors = None if best.result.accuracy is None else best.result.accuracy.errors
     if errors is None or isinstance(reference, Relations):
         return []
-    found, lever = [], find_lever(errors, reference)
-    if lever is not None:
-        (ahead, left), rest = lever
-        along = f"{metres(abs(ahead))} {'ahead of' if ahead > 0.0 else 'behind'} base_link"
-        across = f"{metres(abs(left))} to the {'left' if left > 0.0 else 'right'}"
-        found.append(
-            f"{capitalize(reference.source)} is of a point {along}, {across} (an antenna, a prism): without that, {metres(rest)} of the"
-            " error would be left."
-        )
+    found = []
     scatter = find_scatter(errors, reference) if reference.position_noise_m is None else None
     if scatter is not None:
         found.append(

@@ -159,3 +159,21 @@ def test_position_noise_with_outliers_is_a_quantile_of_the_others(sigma_m: float
     """One outlier of 100 positions is in 4 of 100 third differences: the median of all is a higher quantile of the others."""
     mean, error = _found_noise(np.zeros((1000, 2)), sigma_m, outliers=0.01)
     assert mean == pytest.approx(sigma_m * norm.ppf(0.5 + 0.25 / 0.99**4) / norm.ppf(0.75), abs=3.0 * error)
+
+
+@pytest.mark.parametrize("seed", [3, 11])
+def test_prism_on_a_robot_that_turns_in_place_is_of_the_same_run(seed: int) -> None:
+    """The point moves while the robot does not: its speed is not that of base_link."""
+    n = 600
+    twists = np.zeros((n, 3))
+    for at in range(0, n, 60):
+        twists[at : at + 20, 0] = 0.4
+        twists[at + 20 : at + 60, 2] = np.random.default_rng(seed + at).choice([0.7, -0.7])
+    poses = [np.zeros(3)]
+    for step in se2.exp(twists / 20.0):
+        poses.append(se2.compose(poses[-1], step))
+    drive = Trajectory(DRIVE.stamps_ns[: n + 1], np.array(poses))
+    point = replace(drive, poses=se2.compose(drive.poses, np.array([-0.5, 0.2, 0.0])))
+    assert reference_contradictions([drive], _reference(has_yaws=False, drive=point)) == ()
+    other = replace(drive, poses=_drive(seed + 1).poses[: n + 1])
+    assert reference_contradictions([drive], _reference(has_yaws=False, drive=other)) != ()

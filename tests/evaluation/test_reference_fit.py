@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.evaluation.metrics import evaluate
-from localization.evaluation.reference_fit import find_lever, find_scatter
+from localization.evaluation.reference_fit import errors_at, find_lever, find_scatter
 from localization.evaluation.references import ReferenceTrack, make_track
 from localization.trajectory import Trajectory
 
@@ -56,6 +56,9 @@ def test_lever_of_a_prism_is_found(lever: tuple[float, float]) -> None:
     assert found is not None
     np.testing.assert_allclose(found[0], lever, atol=0.02)
     assert found[1] < 0.02
+    of_point = errors_at(errors, reference, found[0])
+    assert math.sqrt(np.mean(of_point.position_m**2)) == pytest.approx(found[1], rel=0.05)
+    assert math.sqrt(np.mean(errors.position_m**2)) > 0.1
 
 
 def test_lever_is_none_where_the_reference_is_of_the_base() -> None:
