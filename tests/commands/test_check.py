@@ -135,7 +135,7 @@ def test_check_of_reference_names_its_unit_and_clock(tmp_path: Path, text: str, 
     assert [text in row["advice"] for row in found["rows"] if row["quantity"] == "reference"] == [True]
 
 
-@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+@pytest.mark.parametrize("command", ["calibrate", "diagnose", "weigh"])
 @pytest.mark.parametrize(("text", "change"), SPOILED)
 def test_spoiled_reference_is_named_and_nothing_is_fitted_to_it(
     tmp_path: Path, command: str, text: str, change: dict[str, float], capsys: pytest.CaptureFixture[str]
