@@ -334,7 +334,7 @@ class Diagnosis:
         """Whether the robot may be corrected by the findings: by the file that they make, on the part of the drive that did not make it.
 
         Where a part of the drive stays unexplained, errors have to shrink beyond their scatter over the windows: what is unexplained is in
-        the drive's noise, whose sigma does not say whether a change was shown. Without such a file they are those of windows that sizes
+        the drive's noise, whose sigma does not show whether anything changed. Without such a file they are those of windows that sizes
         were not fitted to.
         """
         if self.handover is not None and not self.handover.is_better:

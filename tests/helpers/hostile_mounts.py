@@ -11,7 +11,7 @@ from tests.helpers.entrance_drives import Motion, Publishing, Vehicle, drive, re
 
 
 def rear_lidar_described_at_the_front(folder: Path) -> tuple[Path, Vehicle, Motion]:
-    """It looks backwards from .3 m behind the middle, and /tf_static has it looking ahead from .3 m ahead."""
+    """It faces backwards from .3 m behind the middle, and /tf_static has it facing ahead from .3 m ahead."""
     vehicle = Vehicle(0.11, 0.4, 0.3, 0.55, scan_hz=8.0, beams=180, seed=78)
     motion, rear = drive(vehicle), Publishing(lidar_yaw=math.pi, lidar_ahead_m=-0.3)
     described = records_of(vehicle, motion, replace(rear, lidar_ahead_m=0.3))

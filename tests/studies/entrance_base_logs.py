@@ -296,7 +296,7 @@ def referred(
 ) -> Case:
     """A reference (a file, or topic ``reference``) of a base log.
 
-    Right where the runs have the errors of the healthy log, or sentences have all of ``words``, which name a correction or a doubt.
+    Right where the runs have the errors of the healthy log, or sentences have all of ``words``, which name a correction or contradiction.
     """
 
     def judge(folder: Path) -> Found:

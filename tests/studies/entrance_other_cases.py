@@ -193,7 +193,7 @@ REFERENCES = (
         "fixes 12 s late",
         MEADOW,
         lambda r: "",
-        words=["moved to the time of recording"],  # a doubt of 12 s had been expected; moved, they have none
+        words=["moved to the time of recording"],  # that 12 s are named had been expected; moved, they are right
         edit=fixes_late(12.0),
         reference="/fix",
         is_corrected=True,
