@@ -44,8 +44,8 @@ def diagnosis_charts(found: DiagnosisResult) -> list[Chart]:
     charts = [_discrepancies(found, columns, along, shown)]
     place = _places(found.predictor)
     if place is not None:
-        over_noise = np.nanmean((found.residuals.rows / found.residuals.sigmas) ** 2, axis=0)
-        strongest = max(shown[:3], key=lambda c: float(over_noise[c]))
+        over_noise = (found.residuals.rows / found.residuals.sigmas) ** 2
+        strongest = max(shown[:3], key=lambda c: float(np.nanmean(over_noise[:, c])))
         charts.append(_place_chart({**columns, "place x": place[:, 0], "place y": place[:, 1]}, shown, strongest))
     return [*charts, *_odds(found)]
 
