@@ -47,7 +47,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _MIN_CORRELATION = 0.6
-"""Correlation above which a source does not contradict the robot file, as in the senso. checks: no window of healthy logs is below."""
+"""Correlation above which a source does not contradict the robot file, as in the sensor checks: no window of healthy logs is below."""
 _SURE_CORRELATION = 0.9
 """What another wiring must reach; slip, latency and noise leave 0.95 and more over a drive."""
 _MIN_REVERSED_SIDE_CORRELATION = 0.8
@@ -121,7 +121,7 @@ class WiringReport:
     keys: Mapping[str, str] = field(default_factory=dict)
     """Entries to write to the robot file, by their key: text of the value in TOML."""
     is_ambiguous: bool = False
-    """Wheels and another senso. contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
+    """Wheels and another sensor contradict each other, and nothing decides: the signs are unknown. ``robot``'s wheel noise covers
     that, and the gyro is not to be used unless the wheels alone are in question."""
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Correlation of the wheels' turn and speed with each source, as the robot file has them."""
@@ -509,7 +509,7 @@ def _odometry_of(
 
 
 def _without_turns(log: Log | LiveSensors, signals: WheelSignals, topic: str) -> WiringReport:
-    """A driver's odometry that goes ahead alone; nothing is wrong where no other senso. turns."""
+    """A driver's odometry that goes ahead alone; nothing is wrong where no other sensor turns."""
     signals = with_lidar(log, signals)
     others = {name: turn for name, turn in signals.turns.items() if name in ("gyro", "LiDAR")}
     turned = {name: float(np.nansum(np.abs(turn))) * STEP_S for name, turn in others.items() if np.nanstd(turn) > MIN_TURN_RAD_S}

@@ -81,6 +81,8 @@ _MOST = 4
 _HALVES = 40
 _ALIKE = 0.9
 """Correlation of two candidates that one drive does not separate."""
+_SAME_LAG = 2.0
+"""Ratio of the gains in speed and in turning rate up to which they may be one clock."""
 _MIN_STABILITY = 0.5
 SEARCHED = ("log", "windows")
 """Kinds of drives whose windows have all kinds of motion."""
@@ -122,10 +124,6 @@ class FoundTerm:
     """Twice the log-likelihood that it gains beside the others."""
     alike: tuple[str, ...] = ()
     """Candidates that the drive hardly separates from it, best first."""
-
-
-_ALIKE = 2.0
-"""Ratio of two gains within which they may be one clock."""
 
 
 class Search(NamedTuple):
@@ -352,7 +350,7 @@ def _with_clock_for_gains(
         return chosen
     sizes = dict(zip(chosen, problem.fit(chosen)[0], strict=True))
     ratio = sizes[gains[0]] / sizes[gains[1]]
-    return tuple(sorted({*chosen, clock} - {*gains})) if 1.0 / _ALIKE < ratio < _ALIKE else chosen
+    return tuple(sorted({*chosen, clock} - {*gains})) if 1.0 / _SAME_LAG < ratio < _SAME_LAG else chosen
 
 
 def _noise_beside_terms(predictor: DrivePredictor, state: Linearization, design: _Design, prices: FloatArray) -> Noise:

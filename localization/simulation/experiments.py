@@ -375,7 +375,9 @@ _ALL = (
     Experiment(
         "controller_evaluation",
         "6 trajectories x 7 arm configurations x 2 controllers (without arms: a ballast is moved, of which the log has nothing)",
-        *("hall", (0.0, 0.0, 0.0), _controller_evaluation),
+        "hall",
+        (0.0, 0.0, 0.0),
+        _controller_evaluation,
     ),
     Experiment("laps", "laps through four rooms, the arms in another posture on each", "rooms", (0.0, -4.0, 0.0), _laps),
     Experiment("corridor", "a bare corridor of 60 m, there and back", "corridor", (0.0, 0.0, 0.0), _corridor),
