@@ -20,7 +20,7 @@ from localization.core.policies.outlier import NOTHING_MISSED, PriorOutlier
 from localization.core.policies.slip import SweepSlip
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
-from localization.core.twist import fuse_turn, mean_twist, twist_at_end
+from localization.core.twist import fuse_turn, mean_twist, slip_change_cov, twist_at_end, wheel_twist_cov
 from localization.estimators.estimator import (
     NO_POINTS,
     Estimate,
@@ -99,7 +99,7 @@ class EkfFusion(Estimator):
         if step.restarts_map and self._sensor is not None:
             self._sensor.begin_submap()
         state = clone(self.state, "pose", "start")
-        state = propagate(state, wheel_transition(state, step, motion, self.noise))
+        by_wheels = state = propagate(state, wheel_transition(state, step, motion, self.noise))
         if unseen.any():  # the submap moves along
             state = inflate_both(state, ("pose", "map"), unseen)
         state, turn = self._update_turn(state, step)
@@ -109,7 +109,7 @@ class EkfFusion(Estimator):
         self.last = LastStep(motion, self.state["corrections"], policies.excitation.is_turning, turn, innovation)
         self.state = state
         self.counts_by_name["standing"] += step.is_standing
-        twist, twist_cov = self._estimate_twist(step, is_measured=scan is not None)
+        twist, twist_cov = self._estimate_twist(step, by_wheels, motion.cov, is_measured=scan is not None)
         odometry = None if policies.continuous is None else policies.continuous.add(state)
         return Estimate(step.end_ns, state["pose"], state.cov("pose"), twist, twist_cov, None if scan is None else scan.nis, odometry)
 
@@ -175,19 +175,33 @@ class EkfFusion(Estimator):
         self._policies.wheel_noise.learn(innovation)
         return state, innovation, missed
 
-    def _estimate_twist(self, step: Step, *, is_measured: bool) -> tuple[Twist2, Cov3 | None]:
-        """Twist (3,) at the stamp and its covariance: by the motion in the step, how the wheels' rates changed in it, and the gyro."""
-        if step.duration == 0.0:
+    def _estimate_twist(self, step: Step, by_wheels: State, slip: Cov3, *, is_measured: bool) -> tuple[Twist2, Cov3 | None]:
+        """Twist (3,) at the stamp and its covariance. Each measurement counts once: velocities by the state after the step, which has the
+        scan; the turn rate by that of the wheels alone, ``by_wheels``, updated by the gyro's rate, or without a gyro by the state.
+
+        ``slip`` (3, 3): covariance of the wheels' motion in ``step``.
+        """
+        dt = step.duration
+        if dt == 0.0:
             return step.twist, None
-        mean, cov = mean_twist(*self.state.between("start", "pose"), step.duration)
+        change = step.twist - step.mean_twist
+        mean, mean_cov = mean_twist(*self.state.between("start", "pose"), dt)
         self._policies.slip.end_step(step, mean, is_measured)
-        change, measured_over = step.twist - step.mean_twist, math.inf if is_measured or not step.has_wheels else step.duration
-        twist, cov = twist_at_end(mean, cov, change, measured_over)
-        if step.turn is None or step.is_standing:
+        gyro = None if step.turn is None or step.is_standing else self.gyro_calibration
+        rate = None if gyro is None or step.turn is None else gyro.correct_rate(step.turn)
+        twist, cov = twist_at_end(mean, mean_cov + slip_change_cov(slip, dt), change, math.inf)
+        if is_measured and rate is None:
             return twist, cov
-        gyro = self.gyro_calibration
-        rate = None if gyro is None else gyro.correct_rate(step.turn)
-        return (twist, cov) if rate is None else fuse_turn(twist, cov, *rate)
+        wheels, wheels_cov = mean_twist(*by_wheels.between("start", "pose"), dt)
+        if step.has_wheels:
+            wheels_cov = wheel_twist_cov(wheels_cov, slip, dt)
+        wheels, wheels_cov = twist_at_end(wheels, wheels_cov, change, math.inf)
+        if rate is not None:
+            wheels, wheels_cov = fuse_turn(wheels, wheels_cov, *rate)
+        if not is_measured:
+            return wheels, wheels_cov
+        cov[2, :], cov[:, 2], cov[2, 2] = 0.0, 0.0, wheels_cov[2, 2]
+        return np.append(twist[:2], wheels[2]), cov
 
     @property
     def clock_offset_s(self) -> float:
