@@ -14,7 +14,7 @@ from tests.studies.buildings import BUILDINGS
 ROOT = Path(__file__).parents[2]
 PACKAGES = tuple(str(ROOT / name) for name in ("localization", "motion_models"))
 STEPS, WARM_UP_STEPS = 60, 30
-LIMITS = {"functions": 100, "calls a step": 230, "lines of their files": 3_801}
+LIMITS = {"functions": 101, "calls a step": 231, "lines of their files": 3_846}
 
 
 def trace():
