@@ -96,6 +96,14 @@ class SkidPrior:
     """Source of the numbers, for messages."""
 
 
+def expected_scaling(robot: Robot) -> float:
+    """k of the robot: of its file, else by its geometry; 1 for two driven wheels with casters."""
+    if robot.drive == DIFF_DRIVE:
+        return 1.0
+    known = robot.models.get("skid_steer", {}).get("k_0")
+    return float(skid_prior(robot).coefficients[0]) if known is None else known
+
+
 def skid_prior(robot: Robot) -> SkidPrior:
     """Coefficients of `SkidSteer` for ``robot`` from its geometry and CG alone; its file's own coefficients are not used.
 

@@ -1,0 +1,131 @@
+"""A row of the table of symptoms, and a set of rows of one source with the channels that they make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from motion_models.robot import Mount, Robot
+from motion_models.se2 import FloatArray
+
+TEMPER = 0.3
+"""Share of the bins that is independent: slip, bias and errors of scan matching last for seconds (autocorrelation of three buildings)."""
+OUTLIER = 0.1
+"""Share of bins in which a source slips, is matched to the wrong place or is lost."""
+LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0)
+"""Factors on all noise, of which each log has one, equally probable before: from a simulator to a worn robot on gravel."""
+WAY_M_S, TURN_RAD_S = 0.5, 0.6
+"""Prior standard deviation of a robot's forward speed and yaw rate: those of the drives of `tests/data`."""
+_SIDE_FLOOR_M_S, _SIDE_OF_WAY, _SIDE_OF_TURN_M = 0.02, 0.1, 0.05
+"""Standard deviation of a robot's sideways speed: floor, part of the speed (slides are below 20 degrees in 99.9 % of three buildings), and
+metres per radian of turn beyond its centre of rotation."""
+
+Correction = Callable[[Robot], Robot]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One symptom: what it is called, how often practice has it, and what corrects the robot file."""
+
+    id: str
+    """source.symptom; part of the format of `check --json`."""
+    text: str
+    """Clause of a sentence."""
+    log_odds: float
+    """Logarithm of its prior odds against a source that is as the robot file says."""
+    detail: str = ""
+    value: float | None = None
+    correct: Correction | None = None
+    """The robot file with this row; None where the file cannot express it."""
+    remedy: str = ""
+    """What to do where the robot file cannot express it."""
+    is_fault: bool = True
+    """False for what healthy robots have as well, as a k that changes: it competes with faults for the evidence, and accuses nobody."""
+
+    @property
+    def source(self) -> str:
+        """First part of the id."""
+        return self.id.partition(".")[0]
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Equal for rows that are corrected alike, up to a measured value."""
+        return self.id, self.detail
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """One way in which a source may be wired: its channels as a right one would have measured them."""
+
+    rows: tuple[Row, ...] = ()
+    way: FloatArray | None = None
+    """(n,) forward speed [m/s]; None: not measured."""
+    turn: FloatArray | None = None
+    """(n,) yaw rate [rad/s]; None: not measured."""
+    log_jacobian: float = 0.0
+    """Of all channels, per bin: the density of a change of units."""
+    own: float = 0.0
+    """Evidence that the source has by itself: wheels of a side turn alike, gravity is up, robots do not drive sideways."""
+    way_sigma: float = 0.0
+    """Sigma of the logarithm of the scale of ``way`` that this choice adds to the source's."""
+    turn_sigma: float = 0.0
+    relative: float = 1.0
+    """Factor on the source's relative noise of turns."""
+    delay_s: float = 0.0
+
+    @property
+    def log_prior(self) -> float:
+        """Of its rows."""
+        return sum(row.log_odds for row in self.rows)
+
+
+def mixture(residual: FloatArray, sigma: FloatArray | float, wide: float) -> float:
+    """Tempered log density of ``residual`` (n,) ~ N(0, sigma^2), a share `OUTLIER` of it N(0, wide^2); NaN is not measured.
+
+    ``wide`` is the size of the channel itself, so that a change of units changes the density by its Jacobian alone.
+    """
+    known = np.isfinite(residual)
+    s = np.array(LEVELS)[:, None] * np.broadcast_to(sigma, residual.shape)[known]
+    r = residual[known]
+    inlier = math.log(1.0 - OUTLIER) - 0.5 * (r / s) ** 2 - np.log(s)
+    outlier = math.log(OUTLIER) - 0.5 * (r / wide) ** 2 - math.log(wide)
+    at_level = TEMPER * np.logaddexp(inlier, outlier).sum(axis=1)
+    return float(np.logaddexp.reduce(at_level) - math.log(len(LEVELS)))
+
+
+def side_evidence(side: FloatArray, way: FloatArray, turn: FloatArray, place_sigma_m: float) -> tuple[float, float]:
+    """Evidence of the sideways speed (n,) of a point that should be on the body's x axis, and how far ahead of its place it is [m].
+
+    The place ahead is a x wz with a ~ N(0, place_sigma_m^2), profiled (ridge regression).
+    """
+    sigma = np.sqrt(_SIDE_FLOOR_M_S**2 + (_SIDE_OF_WAY * way) ** 2 + (_SIDE_OF_TURN_M * turn) ** 2)
+    weight = np.where(np.isfinite(side), sigma**-2.0, 0.0)
+    for _ in range(3):
+        information = TEMPER * float((weight * turn * turn)[weight > 0.0].sum())
+        ahead = TEMPER * float((weight * turn * side)[weight > 0.0].sum()) / (information + place_sigma_m**-2)
+        weight = np.where(np.isfinite(side), 1.0 / (sigma**2 * (1.0 + ((side - ahead * turn) / (3.0 * sigma)) ** 2)), 0.0)
+    price = 0.5 * (ahead / place_sigma_m) ** 2 + 0.5 * math.log1p(information * place_sigma_m**2)
+    return mixture(side - ahead * turn, sigma, size_of(np.hypot(way, side))) - price, ahead
+
+
+def size_of(channel: FloatArray) -> float:
+    """Root mean square of a channel, NaN left out."""
+    known = channel[np.isfinite(channel)]
+    return math.sqrt(float(np.mean(known**2)) + 1e-6) if len(known) else 1.0
+
+
+def with_mount(frame: str, change: Callable[[Mount], Mount], mount: Mount, robot: Robot) -> Robot:
+    """``robot`` whose ``frame`` has the changed mount, before what /tf_static says."""
+    from dataclasses import replace
+
+    overridden = tuple(dict.fromkeys((*robot.tf.overridden, frame)))
+    return replace(robot, mounts={**robot.mounts, frame: change(mount)}, tf=replace(robot.tf, overridden=overridden))
+
+
+def mount_correction(frame: str, mount: Mount, change: Callable[[Mount], Mount]) -> Correction:
+    """Correction of the mount of ``frame``, which is ``mount`` now."""
+    return partial(with_mount, frame, change, mount)

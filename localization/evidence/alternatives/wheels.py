@@ -1,0 +1,183 @@
+"""Wheels: signs, sides, units and lengths by joint."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from localization.evidence.alternatives.alternative import Alternative, Row, mixture, size_of
+from localization.evidence.signals import Source
+from motion_models.prior import expected_scaling
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_SPREAD_FLOOR, _SPREAD_OF_SIDE = 0.05, 0.2
+"""Standard deviation of a wheel's rate from that of its side: part of all rates' size (encoder steps), and of the side's rate (slip)."""
+_ODDS = {"sign": math.log(1e-3), "unit": math.log(5e-4), "factor": math.log(3e-4), "side_unit": math.log(1e-4), "k": math.log(0.03)}
+"""Prior odds by kind, from counts of public reports on skid-steer drivers (`docs/theory/set-up.md`)."""
+_GEARS = ((2.0, 0.05), (0.5, 0.05), (0.01, 2.5), (1.0, 0.8))
+"""Factor, and sigma of its logarithm: radius for diameter or half the resolution, their inverses; counts; a gear."""
+
+_HOPELESS = 50.0
+"""Logarithm of the evidence that wheels of a side turn alike, below the best wiring's, from where on no other source can redeem one."""
+
+Wiring = tuple[tuple[int, ...], tuple[int, ...], FloatArray, tuple[Row, ...]]
+"""Columns of the left and right wheels, signs (joints,), rows."""
+
+
+def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
+    """Wirings times units of the ``rates`` (n, joints) [rad/s by the robot file] of ``source``, ``second`` by its velocities."""
+    radius = robot.geometry.wheel_radius_m
+    scale = expected_scaling(robot) * radius / robot.geometry.track_width_m
+    rates = _with_dead_filled(rates, source.left)
+    found = []
+    for left, right, signs, rows, alike in _believable(list(_wirings(source)), rates):
+        of_left, of_right = (rates * signs)[:, left].mean(axis=1), (rates * signs)[:, right].mean(axis=1)
+        way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
+        for factor, sigma, unit_rows in _units(robot):
+            found.append(Alternative((*rows, *unit_rows), factor * way, factor * turn, 2.0 * math.log(factor), alike, sigma, sigma))
+        if not rows:
+            found += [*_of_one_side(source, rates, radius, scale), Alternative((_turns_vary(),), way, turn, 0.0, alike, 0.0, 1.0, 8.0)]
+    return found
+
+
+def _believable(wirings: list[Wiring], rates: FloatArray) -> list[tuple[*Wiring, float]]:
+    """The robot file's wiring, and those whose wheels of one side turn as alike as in the best one, or nearly; with that evidence."""
+    evidence = [_alike_evidence(rates * signs, left, right) for left, right, signs, _ in wirings]
+    return [(*wiring, e) for i, (wiring, e) in enumerate(zip(wirings, evidence, strict=True)) if i == 0 or e > max(evidence) - _HOPELESS]
+
+
+def _with_dead_filled(rates: FloatArray, left: int) -> FloatArray:
+    """``rates`` (n, joints) whose unknown columns have the mean of their side."""
+    found = rates.copy()
+    for side in (slice(0, left), slice(left, None)):
+        known = np.isfinite(rates[:, side])
+        count = known.sum(axis=1)
+        mean = np.where(count > 0, np.where(known, rates[:, side], 0.0).sum(axis=1) / np.maximum(count, 1), np.nan)
+        found[:, side] = np.where(known, rates[:, side], mean[:, None])
+    return found
+
+
+def _alike_evidence(rates: FloatArray, left: tuple[int, ...], right: tuple[int, ...]) -> float:
+    """Wheels of one side turn alike: evidence of the ``rates`` (n, joints), relative to their size, so that no unit changes it."""
+    n = rates.shape[1]
+    if n <= 2:
+        return 0.0
+    size = size_of(rates)
+    sides = [rates[:, side] / size for side in (left, right)]
+    means = [np.broadcast_to(side.mean(axis=1, keepdims=True), side.shape) for side in sides]
+    spread, mean = np.hstack([side - of_side for side, of_side in zip(sides, means, strict=True)]), np.hstack(means)
+    sigma = np.sqrt(_SPREAD_FLOOR**2 + (_SPREAD_OF_SIDE * mean) ** 2)
+    return float((n - 2) / n * mixture(spread, sigma, 1.0))  # of n residuals n - 2 are independent
+
+
+def _wirings(source: Source) -> Iterator[Wiring]:
+    """Sides as the file has them, exchanged, or with one wheel of each exchanged; times signs."""
+    n, nl = len(source.joints), source.left
+    left, right = tuple(range(nl)), tuple(range(nl, n))
+    names = source.joints
+    sides: list[tuple[tuple[int, ...], tuple[int, ...], tuple[Row, ...]]] = [(left, right, ())]
+    exchange = Row(
+        "wheels.sides_exchanged", "left and right wheels are exchanged", _ODDS["sign"], correct=partial(_set_sides, names[nl:], names[:nl])
+    )
+    sides.append((right, left, (exchange,)))
+    for i, j in itertools.product(left, right) if n > 2 else ():
+        new_left = tuple(j if k == i else k for k in left)
+        new_right = tuple(i if k == j else k for k in right)
+        of_left, of_right = tuple(names[k] for k in new_left), tuple(names[k] for k in new_right)
+        text = f"the left wheels are {', '.join(of_left)}, the right ones {', '.join(of_right)}"
+        row = Row("wheels.other_side", text, _ODDS["sign"], ",".join(sorted(of_left)), correct=partial(_set_sides, of_left, of_right))
+        sides.append((new_left, new_right, (row,)))
+    for (a, b, rows), (columns, sign_rows) in itertools.product(sides, _signs(source)):
+        signs = np.ones(n)
+        signs[list(columns)] = -1.0
+        yield a, b, signs, (*rows, *sign_rows)
+
+
+def _signs(source: Source) -> Iterator[tuple[tuple[int, ...], tuple[Row, ...]]]:
+    """Columns that count backwards, and their rows."""
+    n, nl, names = len(source.joints), source.left, source.joints
+    left, right = tuple(range(nl)), tuple(range(nl, n))
+    yield (), ()
+    sets = [
+        ("wheels.left_reversed", f"the left side counts backwards ({', '.join(names[:nl])})", left),
+        ("wheels.right_reversed", f"the right side counts backwards ({', '.join(names[nl:])})", right),
+        ("wheels.all_reversed", "all wheels count backwards", (*left, *right)),
+    ]
+    for key, text, columns in sets:
+        yield columns, (Row(key, text, _ODDS["sign"], correct=partial(_reverse, tuple(names[i] for i in columns))),)
+    for i in range(n) if n > 2 else ():
+        correct = partial(_reverse, (names[i],))
+        yield (i,), (Row("wheels.one_reversed", f"{names[i]} counts backwards", _ODDS["sign"], names[i], correct=correct),)
+
+
+def _units(robot: Robot) -> Iterator[tuple[float, float, tuple[Row, ...]]]:
+    """Factor to rad/s, sigma of its logarithm, rows. The unit is that of the field that is used (angles, where there are any)."""
+    yield 1.0, 0.0, ()
+    radius = robot.geometry.wheel_radius_m
+    named = {
+        "rpm": math.tau / 60.0,
+        "deg/s": math.pi / 180.0,
+        "rev/s": math.tau,
+        "m/s": 1.0 / radius,
+        "mm/s": 1e-3 / radius,
+    }
+    for name, factor in named.items():
+        text = f"the wheels' rates are in {name}, not in rad/s (1 rad/s is {1.0 / factor:.4g} of them)"
+        yield factor, 0.05, (Row("wheels.unit", text, _ODDS["unit"], name, factor, partial(scale_unit, factor)),)
+    for factor, sigma in _GEARS:
+        row = Row("wheels.factor", "the wheels' rates have a factor", _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor))
+        yield factor, sigma, (row,)
+
+
+def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float) -> Iterator[Alternative]:
+    """Rates of one side in another unit."""
+    n, nl = rates.shape[1], source.left
+    sides = tuple(range(nl)), tuple(range(nl, n))
+    for name, factor in (("rpm", math.tau / 60.0), ("deg/s", math.pi / 180.0), ("x 2", 0.5), ("x 1/2", 2.0), ("m/s", 1.0 / radius)):
+        for side, columns in zip(("left", "right"), sides, strict=True):
+            factors = np.ones(n)
+            factors[list(columns)] = factor
+            of_left, of_right = ((rates * factors)[:, part].mean(axis=1) for part in sides)
+            text = f"rates of the {side} wheels are in another unit than the others' ({name})"
+            row = Row(f"wheels.factor_{side}", text, _ODDS["side_unit"], name, factor, partial(_scale_side, side, factor))
+            way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
+            yield Alternative((row,), way, turn, math.log(factor), _alike_evidence(rates, *sides), 0.05, 0.05)
+
+
+def _turns_vary() -> Row:
+    remedy = "k changes with speed, floor or load: calibrate on the floor and at the speeds of the task, or use --model friction."
+    return Row("wheels.turns_vary", "the robot turns by a changing part of what its wheels turn", _ODDS["k"], remedy=remedy, is_fault=False)
+
+
+def _set_sides(left: tuple[str, ...], right: tuple[str, ...], robot: Robot) -> Robot:
+    return replace(robot, joints=replace(robot.joints, left=left, right=right))
+
+
+def _reverse(names: tuple[str, ...], robot: Robot) -> Robot:
+    turned = {*names} ^ {*robot.joints.reversed}
+    backwards = tuple(name for name in (*robot.joints.left, *robot.joints.right) if name in turned)
+    return replace(robot, joints=replace(robot.joints, reversed=backwards))
+
+
+def scale_unit(factor: float, robot: Robot) -> Robot:
+    """``robot`` whose wheel joints have ``factor`` times the units."""
+    joints = robot.joints
+    return replace(
+        robot,
+        joints=replace(joints, angle_unit_rad=_six(joints.angle_unit_rad * factor), rate_unit_rad_s=_six(joints.rate_unit_rad_s * factor)),
+    )
+
+
+def _scale_side(side: str, factor: float, robot: Robot) -> Robot:
+    key = f"{side}_wheel_radius_multiplier"
+    return replace(robot, geometry=replace(robot.geometry, **{key: getattr(robot.geometry, key) * factor}))
+
+
+def _six(value: float) -> float:
+    return float(f"{value:.6g}")

@@ -1,0 +1,178 @@
+"""The one question that all entrances ask of a log: which set-up is it?
+
+`infer_set_up` reads the first two minutes of driving; `open_log_with_set_up` opens a log with what is certain corrected, each contradiction
+in `Log.warnings`. Replay, calibration, diagnosis, comparison and the live node have the same answer, probability and sentence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from localization.events import ImuSample, Scan
+from localization.evidence.search import make_stacks
+from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_scans, is_comparable
+from localization.evidence.verdict import CORRECTED, SetUp, decide
+from localization.logs import Log, TopicOverrides, open_log
+from localization.logs.decode import JointReading, OdometryReading, decode_imu
+from localization.logs.event_decoder import TopicDecoder, late_ns
+from localization.logs.wheel_messages import odometry_decoder, wheel_decoder
+from motion_models.errors import CalibrationError
+from motion_models.robot import Robot
+
+_MOVING_S, _READ_S, _SCANS_S, _STANDING_S = 120.0, 900.0, 75.0, 5.0
+"""Time after the first motion that is read, in all, with scans (registering one takes a millisecond), and kept from before it [s]."""
+_MOVED = 0.02
+"""Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
+_DEG_PER_RAD = 180.0 / math.pi
+
+
+@dataclass(frozen=True, eq=False)
+class SetUpLog:
+    """A log and which set-up it has."""
+
+    log: Log
+    """With what is certain corrected (`Log.robot`, `Log.mounts`)."""
+    set_up: SetUp
+
+
+def open_log_with_set_up(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> SetUpLog:  # noqa: B008
+    """The log at ``path`` as `open_log` opens it, with what is certain corrected. Raises what that does."""
+    log = open_log(path, robot, topics)
+    found = infer_set_up(log)
+    if found.sentences:
+        log = open_log(path, found.robot, topics if found.is_gyro_used else replace(topics, imu=""))
+        log.add_notes(found.sentences)
+    return SetUpLog(log, found)
+
+
+def open_log_as_declared(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008
+    """The log at ``path``, for what is written to a robot file. Raises what `open_log` does, and `CalibrationError` where the sensors
+    refute the robot file: a calibration of wrong signs or units fits nothing."""
+    found = open_log_with_set_up(path, robot, topics)
+    if found.set_up.sentences:
+        texts = " ".join(found.set_up.sentences).replace(CORRECTED, "Write:")
+        raise CalibrationError(f"{texts} Correct the robot file first; `skidloc check` writes it.")
+    return found.log
+
+
+def infer_set_up(log: Log, reference: Source | None = None) -> SetUp:
+    """The set-up of ``log``, by its own sources and a ``reference``."""
+    sources = read_sources(log)
+    return infer([*sources, *([] if reference is None else [reference])], log.robot)
+
+
+def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
+    """The set-up with which ``sources`` are most probable."""
+    used = [source for source in sources if is_comparable(source)]
+    if len(used) < 2:
+        there = used[0].name if used else "no source"
+        return SetUp("undecidable", robot, reason=f"{there} alone measures the motion often enough: nothing can be compared.")
+    start, end = max(source.t[0] for source in used), min(source.t[-1] for source in used)
+    edges = bin_edges(used, start, end)
+    if len(edges) < 12:
+        return SetUp("undecidable", robot, reason=f"the sources overlap by {max(end - start, 0.0):.1f} s: too short to be compared.")
+    if all(float(np.nanmax(np.abs(source.rates(edges)), initial=0.0)) < 1e-3 for source in used):
+        return SetUp("undecidable", robot, reason="nothing moves: drive straight on for 10 s and turn in place both ways.")
+    return decide(used, make_stacks(used, edges, robot), robot)
+
+
+def read_sources(log: Log) -> list[Source]:
+    """Sources of the first two minutes of driving; none where the log has no wheels."""
+    if log.sources.wheels is None or log.wheels_error is not None:
+        return []
+    decoders = _decoders(log)
+    late = {source.topic: late_ns(source.kind, log.robot.clock) for source in log.sources.used()}
+    gathered: dict[str, list[Any]] = {}
+    first_ns = moving_ns = first = None
+    for payload in log.readings({t: TopicDecoder(0, _tagged(t, decode), late.get(t, 0)) for t, decode in decoders.items()}):
+        first_ns = payload.stamp_ns if first_ns is None else first_ns
+        gathered.setdefault(payload.topic, []).append(payload.reading)
+        if moving_ns is None and payload.topic == log.sources.wheels.topic:
+            first = payload.reading if first is None else first
+            moving_ns = payload.stamp_ns if has_moved(first, payload.reading) else None
+        if payload.stamp_ns > (first_ns + _READ_S * 1e9 if moving_ns is None else moving_ns + _MOVING_S * 1e9):
+            break
+    if first_ns is None:
+        return []
+    begin_ns = first_ns if moving_ns is None else max(first_ns, moving_ns - round(_STANDING_S * 1e9))
+    rows = {topic: [r for r in readings if r.stamp_ns >= begin_ns] for topic, readings in gathered.items()}
+    found = sources_of_readings(log, rows, begin_ns)
+    lidar = log.sources.lidar
+    if lidar is not None and (source := from_scans(lidar.topic, _scans_of(log, begin_ns), log.mounts, begin_ns)) is not None:
+        found.append(source)
+    return found
+
+
+def sources_of_readings(log: Any, readings: Mapping[str, Sequence[Any]], first_ns: int) -> list[Source]:
+    """Sources of ``readings`` by topic; ``log``: what has `sources`, `joints` and `mounts`."""
+    found: list[Source | None] = []
+    wheels = sorted((r for source in log.sources.all_wheels for r in readings.get(source.topic, ())), key=lambda reading: reading.stamp_ns)
+    name = " and ".join(source.topic for source in log.sources.all_wheels)
+    joints = [r for r in wheels if isinstance(r, JointReading)]
+    odometry = [r for r in wheels if isinstance(r, OdometryReading)]
+    if joints:
+        found.append(from_joints(name, joints, log.joints, first_ns))
+    elif odometry:
+        found.append(from_odometry(name, odometry, first_ns))
+    if log.sources.imu is not None and readings.get(log.sources.imu.topic):
+        found.append(from_gyro(log.sources.imu.topic, readings[log.sources.imu.topic], log.mounts, first_ns))
+    return [source for source in found if source is not None]
+
+
+def _scans_of(log: Log, begin_ns: int) -> Iterator[Scan]:
+    for scan in log.scans():
+        if scan.stamp_ns > begin_ns + (_STANDING_S + _SCANS_S) * 1e9:
+            return
+        if scan.stamp_ns >= begin_ns:
+            yield scan
+
+
+@dataclass(frozen=True)
+class _Tagged:
+    """A payload with its topic."""
+
+    stamp_ns: int
+    topic: str
+    reading: Any
+
+
+def _tagged(topic: str, decode: Callable[[Any, int], Any]) -> Callable[[Any, int], _Tagged | None]:
+    def tagged(message: Any, stamp: int) -> _Tagged | None:
+        reading = decode(message, stamp)
+        return None if reading is None else _Tagged(reading.stamp_ns, topic, reading)
+
+    return tagged
+
+
+def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
+    """By topic: wheels and IMU."""
+    found: dict[str, Callable[[Any, int], Any]] = {}
+    of_wheels = wheel_decoder((*log.joints[0], *log.joints[1]), log.robot.joints)
+    for source in log.sources.all_wheels:
+        if source.kind == "joint_states":
+            found[source.topic] = of_wheels
+        else:
+            found[source.topic] = odometry_decoder(source.type, log.robot.driver.length_unit_m)
+    if log.sources.imu is not None:
+        found[log.sources.imu.topic] = partial(_decode_fast_imu, unit=log.robot.imu.rate_unit_rad_s)
+    return found
+
+
+def _decode_fast_imu(message: Any, stamp: int, unit: float) -> ImuSample:
+    """Decode an IMU message whose rates only another unit than rad/s explains."""
+    sample = decode_imu(message, stamp, unit / _DEG_PER_RAD)
+    return replace(sample, angular_velocity=_DEG_PER_RAD * sample.angular_velocity)
+
+
+def has_moved(first: Any, reading: Any) -> bool:
+    """Whether the wheels have turned since their ``first`` reading, in any unit."""
+    if isinstance(reading, JointReading):
+        return bool((np.abs(reading.velocity) > _MOVED).any() or (np.abs(reading.position - first.position) > _MOVED).any())
+    return bool((np.abs(reading.twist) > _MOVED).any() or (np.abs(reading.pose - first.pose) > _MOVED).any())

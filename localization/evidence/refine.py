@@ -1,0 +1,46 @@
+"""Values of a set-up's rows, measured with the others as they are: the factor of wheels by their scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+from localization.evidence.alternatives import Row
+from localization.evidence.alternatives.wheels import scale_unit
+from localization.evidence.likelihood import Stack, scales
+from motion_models.robot import Robot
+
+_FREE = 3.0
+"""Sigma of the logarithm of a factor that is measured."""
+_NAMED_SIGMA = 0.03
+"""Sigma of the logarithm of a measured factor by other errors of the radius; within twice that, a factor of two is one."""
+Choice = tuple[int, ...]
+
+
+def refined_rows(stacks: Sequence[Stack], choice: Choice, robot: Robot) -> tuple[Row, ...]:
+    """Rows of ``choice``, with the factor of wheels that have one as it was measured."""
+    single = [Stack(stack.kind, [stack.alternatives[k]]) for stack, k in zip(stacks, choice, strict=True)]
+    found = []
+    for stack in single:
+        for row in stack.alternatives[0].rows:
+            found.append(_with_factor(row, single) if row.id == "wheels.factor" else row)
+    return tuple(found)
+
+
+def _with_factor(row: Row, single: Sequence[Stack]) -> Row:
+    """The factor is that of the ways where another source has them, else that of the turns."""
+    index = next(i for i, stack in enumerate(single) if stack.kind == "wheels")
+    has_way = sum(stack.channel("way") is not None for stack in single) > 1
+    free = [
+        Stack(stack.kind, [replace(stack.alternatives[0], way_sigma=_FREE, turn_sigma=_FREE)]) if i == index else stack
+        for i, stack in enumerate(single)
+    ]
+    c, sigma = scales(free, "way" if has_way else "turn")[index]
+    nominal = row.value or 1.0
+    factor = nominal if abs(c) < 2.0 * max(sigma, _NAMED_SIGMA) and row.detail == "0.05" else float(f"{nominal * math.exp(-c):.4g}")
+    what = "large" if factor < 1.0 else "small"
+    size = 1.0 / factor if factor < 1.0 else factor
+    text = f"the wheels' rates are {size:.3g} (+- {100.0 * sigma:.0f} %) times too {what}"
+    return replace(row, value=factor, text=text, correct=partial(scale_unit, factor))

@@ -1,0 +1,173 @@
+"""The most probable set-ups: from the robot file's, then one more row beside the best, again and again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.evidence.alternatives import MAKERS, Alternative, Row
+from localization.evidence.alternatives.alternative import LEVELS, TEMPER
+from localization.evidence.delays import candidate_delays
+from localization.evidence.likelihood import Stack, log_posterior
+from localization.evidence.signals import Source
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_WIDTHS = (8, 6, 5, 3)
+"""Choices that are expanded by one more row, by depth: three faults at once are found, and the one beside them."""
+_RESCORED = 50
+"""Best choices whose evidence is integrated over the level of the noise."""
+_MAX_BINS = 140
+_CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
+"""Prior odds of a clock that is off by `_CLOCK_S`; of a longer delay x they fall as 1 / x^2, as many delays are tried (`delays`)."""
+_LATENCY_SIGMA_S = 0.05
+"""Standard deviation of the latencies of drivers, which the filter estimates by itself [s]: they reach 0.1 s."""
+_UNRELATED_ODDS = math.log(1e-5)
+"""Prior odds of a source that measures another motion, or none: another robot's, a frozen sensor, a fault that no row has."""
+
+Choice = tuple[int, ...]
+IntArray = NDArray[np.intp]
+
+
+def clock_row(source: Source, delay_s: float) -> Row:
+    """Stamps that are late by ``delay_s``: a driver's latency or a clock that is off, whichever is more probable of that delay."""
+    name = {"driver": "wheels"}.get(source.kind, source.kind)
+    key = {"wheels": "wheel", "driver": "wheel", "gyro": "gyro", "lidar": "lidar"}.get(source.kind)
+
+    def correct(robot: Robot) -> Robot:
+        field = f"{key}_time_offset_s"
+        return replace(robot, clock=replace(robot.clock, **{field: round(getattr(robot.clock, field) + delay_s, 3)}))
+
+    latency = -0.5 * (delay_s / _LATENCY_SIGMA_S) ** 2
+    clock = _CLOCK_ODDS - 2.0 * math.log(max(abs(delay_s), _CLOCK_S) / _CLOCK_S)
+    text = f"its stamps are {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
+    is_fault = clock > latency
+    return Row(f"clock.{name}", text, max(clock, latency), value=delay_s, correct=correct if key and is_fault else None, is_fault=is_fault)
+
+
+def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> list[Stack]:
+    """All alternatives of each source at each of its delays; the robot file's is the first."""
+    delays = candidate_delays(sources, edges)
+    at_zero = [source.rates(edges) for source in sources]
+    bins = _moving_bins(sources, at_zero)
+    stacks = []
+    for source, of_source in zip(sources, delays, strict=True):
+        found: list[Alternative] = []
+        for delay in of_source:
+            rates = source.rates(edges, delay)[bins]
+            second = source.rates(edges, delay, of_second=True)[bins] if source.second is not None else np.full_like(rates, np.nan)
+            rows = (clock_row(source, delay),) if delay else ()
+            found += [replace(a, rows=(*a.rows, *rows), delay_s=delay) for a in MAKERS[source.kind](source, rates, second, robot)]
+        found.append(_unrelated(source, found[0]))
+        stacks.append(Stack(source.kind, found))
+    return stacks
+
+
+def _moving_bins(sources: Sequence[Source], rates: Sequence[FloatArray]) -> IntArray:
+    """Bins (m,) with the most motion by any source, in order, and a fifth of bins at rest, up to `_MAX_BINS`."""
+    n = len(rates[0])
+    if n <= _MAX_BINS:
+        return np.arange(n)
+    size = np.zeros(n)
+    for values in rates:
+        magnitude = np.linalg.norm(np.nan_to_num(values), axis=1)
+        size = np.maximum(size, magnitude / max(float(np.percentile(magnitude, 95.0)), 1e-9))
+    moving = np.flatnonzero(size > 0.1)
+    still = np.flatnonzero(size <= 0.1)
+    take = np.concatenate([_thinned(moving, _MAX_BINS - min(len(still), _MAX_BINS // 5)), _thinned(still, _MAX_BINS // 5)])
+    return np.sort(take)
+
+
+def _thinned(rows: IntArray, most: int) -> IntArray:
+    return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]
+
+
+def _unrelated(source: Source, by_file: Alternative) -> Alternative:
+    """A source whose channels are of another motion: each has its own size."""
+    row = Row(f"{source.kind}.unrelated", f"{source.name} measures another motion than the others", _UNRELATED_ODDS)
+    channels = {name: getattr(by_file, name) for name in ("way", "turn") if getattr(by_file, name) is not None}
+    own = by_file.own + sum(_own_size_evidence(channel) for channel in channels.values())
+    return replace(by_file, rows=(row,), own=own, **{name: np.full_like(channel, np.nan) for name, channel in channels.items()})
+
+
+def _own_size_evidence(channel: FloatArray) -> float:
+    """Tempered log density of a ``channel`` (n,) as noise of its own size."""
+    known = channel[np.isfinite(channel)]
+    mean_square = float(np.mean(known**2)) + 1e-6 if len(known) else 1.0
+    return -0.5 * TEMPER * len(known) * (1.0 + math.log(math.tau * mean_square))
+
+
+def search(stacks: Sequence[Stack]) -> dict[Choice, float]:
+    """Log posterior by choice, of the best ones, the level of the noise integrated out."""
+    null = tuple(0 for _ in stacks)
+    found: dict[Choice, float] = {}
+    for level in (0.35, 1.0):
+        _search_at(stacks, null, level, found)
+    best = sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED]
+    kept = dict.fromkeys([null, *best])
+    return {choice: _marginal(stacks, choice) for choice in kept}
+
+
+def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[Choice, float]) -> None:
+    at_level: dict[Choice, float] = {}
+    done: set[Choice] = set()
+
+    def expand(choice: Choice) -> None:
+        done.add(choice)
+        for i in range(len(stacks)):
+            for k, value in enumerate(log_posterior(stacks, choice, i, level)):
+                at_level[(*choice[:i], k, *choice[i + 1 :])] = float(value)
+
+    expand(null)
+    for width in _WIDTHS:
+        for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
+            expand(choice)
+    best = sorted(at_level, key=at_level.__getitem__, reverse=True)[:_RESCORED]
+    top = at_level[best[0]]
+    for choice in best:
+        found[choice] = max(found.get(choice, -math.inf), at_level[choice] - top)
+
+
+def _marginal(stacks: Sequence[Stack], choice: Choice) -> float:
+    """Log posterior of one choice, integrated over the level of the noise."""
+    single = [Stack(stack.kind, [stack.alternatives[k]]) for stack, k in zip(stacks, choice, strict=True)]
+    return float(np.logaddexp.reduce([log_posterior(single, [0] * len(single), 0, level)[0] for level in LEVELS]))
+
+
+def rows_of(stacks: Sequence[Stack], choice: Choice) -> tuple[Row, ...]:
+    """Rows of a choice."""
+    return tuple(row for stack, k in zip(stacks, choice, strict=True) for row in stack.alternatives[k].rows)
+
+
+def posterior(stacks: Sequence[Stack], scores: Mapping[Choice, float]) -> list[tuple[float, Choice]]:
+    """Probability by choice, the most probable first; choices that are corrected alike count together.
+
+    Delays that differ by one constant are the same alignment of the sources (only their prior differs): they share its evidence.
+    """
+    scores = _with_shared_evidence(stacks, scores)
+    top = max(scores.values())
+    grouped: dict[tuple[tuple[str, str], ...], list[tuple[float, Choice]]] = {}
+    for choice, score in scores.items():
+        key = tuple(sorted(row.key for row in rows_of(stacks, choice) if row.is_fault))
+        grouped.setdefault(key, []).append((math.exp(score - top), choice))
+    total = sum(p for members in grouped.values() for p, _ in members)
+    return sorted(((sum(p for p, _ in members) / total, max(members)[1]) for members in grouped.values()), reverse=True)
+
+
+def _with_shared_evidence(stacks: Sequence[Stack], scores: Mapping[Choice, float]) -> dict[Choice, float]:
+    alignments: dict[tuple[object, ...], list[tuple[Choice, float]]] = {}
+    for choice in scores:
+        chosen = [stack.alternatives[k] for stack, k in zip(stacks, choice, strict=True)]
+        rows = [row for a in chosen for row in a.rows]
+        relative = tuple(round(a.delay_s - chosen[0].delay_s, 1) for a in chosen)
+        others = tuple(row.key for row in rows if row.source != "clock")
+        alignments.setdefault((relative, others), []).append((choice, sum(row.log_odds for row in rows if row.source == "clock")))
+    found = {}
+    for members in alignments.values():
+        evidence = max(scores[choice] - prior for choice, prior in members)
+        found.update({choice: evidence + prior for choice, prior in members})
+    return found

@@ -1,0 +1,200 @@
+"""From the posterior to an answer: consistent, certain, ambiguous or undecidable; what is corrected, and what the covariance must hold."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from localization.evidence.alternatives import Row
+from localization.evidence.likelihood import Stack
+from localization.evidence.refine import refined_rows
+from localization.evidence.search import Choice, posterior, search
+from localization.evidence.signals import Source
+from motion_models.robot import Robot
+
+CERTAIN = 0.97
+"""Probability from where on an answer is certain: of the answers above, 99 % are right (`tests.studies.set_ups`)."""
+_NAMED = 0.01
+"""Least probability of a set-up that is named beside others."""
+_SIGN_TURN_RAD, _SIGN_WAY_M = np.pi, 10.0
+"""Turn and way after which a wheel noise that grows with the motion has the error of an unknown factor: (2 x)^2 = 4 pi x at x = pi."""
+CORRECTED = "Corrected in this run; write to the robot file:"
+"""Words in sentences about what is certain, before keys of the robot file."""
+
+Verdict = Literal["consistent", "certain", "ambiguous", "undecidable"]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One set-up and its probability."""
+
+    probability: float
+    rows: tuple[Row, ...] = ()
+    """Faults; empty: all is as the robot file says."""
+
+    @property
+    def text(self) -> str:
+        """Its faults in a clause."""
+        return " and ".join(row.text for row in self.rows) or "all is as the robot file says"
+
+
+@dataclass(frozen=True)
+class SetUp:
+    """Which set-up a log's sensors agree with."""
+
+    verdict: Verdict
+    robot: Robot
+    """With what is certain corrected, and a covariance for what is not."""
+    hypotheses: tuple[Hypothesis, ...] = ()
+    sentences: tuple[str, ...] = ()
+    keys: dict[str, str] = field(default_factory=dict)
+    """Entries to write to the robot file, by their key: text of the value in TOML."""
+    is_gyro_used: bool = True
+    """False where the gyro may have another sign or axis, or measures another motion."""
+    reason: str = ""
+    """Why nothing could be compared."""
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether several set-ups remain."""
+        return self.verdict == "ambiguous"
+
+    @property
+    def faults(self) -> tuple[Row, ...]:
+        """Rows of the most probable set-up, where the robot file's is refuted."""
+        return self.hypotheses[0].rows if self.verdict in ("certain", "ambiguous") else ()
+
+
+def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot) -> SetUp:
+    """The answer to `search`."""
+    ranked = posterior(stacks, search(stacks))
+    found = [(p, choice, _faults(refined_rows(stacks, choice, robot))) for p, choice in ranked]
+    hypotheses = tuple(Hypothesis(p, rows) for p, _, rows in found if p >= _NAMED)
+    by_file = sum(p for p, _, rows in found if not rows)
+    if by_file > 1.0 - CERTAIN:
+        return SetUp("consistent", robot, hypotheses)
+    kept = [(p, choice, rows) for p, choice, rows in found if p >= _NAMED]
+    common = _common(kept)
+    is_certain = kept[0][0] >= CERTAIN or all(len(rows) == len(common) for _, _, rows in kept)
+    corrected = _correct(robot, common)
+    rest = [] if is_certain else [tuple(row for row in rows if row not in common) for _, _, rows in kept]
+    is_gyro_used = not any(row.source == "gyro" and row.correct is None for row in common)
+    is_gyro_used &= not any(row.source == "gyro" for rows in rest for row in rows)
+    unresolved = [(p, choice) for p, choice, rows in kept if any(row.correct is None or row not in common for row in rows)]
+    corrected = _with_mixture_noise(corrected, stacks, unresolved)
+    keys = changed_entries(robot, _correct(robot, common))
+    sentences = (*_sentences(sources, common, robot, kept), *_ambiguity(sources, kept, rest))
+    return SetUp("certain" if is_certain else "ambiguous", corrected, hypotheses, sentences, keys, is_gyro_used)
+
+
+def _faults(rows: Sequence[Row]) -> tuple[Row, ...]:
+    return tuple(row for row in rows if row.is_fault)
+
+
+def _common(kept: Sequence[tuple[float, Choice, tuple[Row, ...]]]) -> tuple[Row, ...]:
+    """Faults of the most probable set-up that all named ones share."""
+    shared = set.intersection(*({row.key for row in rows} for _, _, rows in kept))
+    return tuple(row for row in kept[0][2] if row.key in shared)
+
+
+def _correct(robot: Robot, rows: Sequence[Row]) -> Robot:
+    for row in rows:
+        robot = robot if row.correct is None else row.correct(robot)
+    return robot
+
+
+def _with_mixture_noise(robot: Robot, stacks: Sequence[Stack], unresolved: Sequence[tuple[float, Choice]]) -> Robot:
+    """``robot`` whose wheel noise has the spread of the motion between the set-ups that remain: E[(x_h - x)^2] / E[x^2] per unit of x."""
+    shares = {"way": 0.0, "turn": 0.0}
+    total = sum(p for p, _ in unresolved)
+    wheels = next((i for i, stack in enumerate(stacks) if stack.kind in ("wheels", "driver")), None)
+    if not total or wheels is None:
+        return robot
+    for name in shares:
+        by_file = getattr(stacks[wheels].alternatives[0], name)
+        size = float(np.nansum(by_file**2)) or 1.0
+        for p, choice in unresolved:
+            other = getattr(stacks[wheels].alternatives[choice[wheels]], name)
+            shares[name] += p / total * min(float(np.nansum((other - by_file) ** 2)) / size, 4.0)
+    noise = robot.wheel_noise
+    noise = replace(
+        noise,
+        yaw_rad2_per_rad=max(noise.yaw_rad2_per_rad, _SIGN_TURN_RAD * shares["turn"]),
+        longitudinal_m2_per_m=max(noise.longitudinal_m2_per_m, _SIGN_WAY_M * shares["way"]),
+    )
+    return replace(robot, wheel_noise=noise)
+
+
+def _sentences(
+    sources: Sequence[Source], common: Sequence[Row], robot: Robot, kept: Sequence[tuple[float, Choice, tuple[Row, ...]]]
+) -> list[str]:
+    found = []
+    probability = sum(p for p, _, _ in kept)
+    for row in common:
+        after = robot if row.correct is None else row.correct(robot)
+        entries = changed_entries(robot, after)
+        written = "; ".join(f"{key} = {value}" for key, value in entries.items())
+        end = f"{CORRECTED} {written}." if written else row.remedy or "Nothing is corrected: check this sensor."
+        found.append(
+            f"{_topic(sources, row)}: {row.text} (probability {min(probability, 0.999):.3f}, of {_witnesses(sources, row)}). {end}"
+        )
+    return found
+
+
+def _ambiguity(
+    sources: Sequence[Source], kept: Sequence[tuple[float, Choice, tuple[Row, ...]]], rest: Sequence[tuple[Row, ...]]
+) -> list[str]:
+    if not rest:
+        return []
+    ways = [f"{' and '.join(row.text for row in rows) or 'nothing more'} ({p:.2f})" for (p, _, _), rows in zip(kept, rest, strict=True)]
+    names = " and ".join(source.name for source in sources)
+    absent = [text for kind, text in _DECIDERS.items() if all(source.kind != kind for source in sources)]
+    record = f"record {' or '.join(absent)} as well, or " if absent else ""
+    listed = ", ".join(ways[:-1]) + (f", or {ways[-1]}" if len(ways) > 1 else ways[-1])
+    return [
+        f"{names} contradict each other: {listed}. Nothing in the log decides, nothing of it is corrected, and the covariance holds all of"
+        f" them: {record}watch one turn to the left, in which the right wheels' rates and the yaw rate must be positive."
+    ]
+
+
+_DECIDERS = {"gyro": "a gyro", "lidar": "a LiDAR"}
+
+
+def _topic(sources: Sequence[Source], row: Row) -> str:
+    kind = row.id.partition(".")[2] if row.source == "clock" else row.source
+    kinds = {"wheels": ("wheels", "driver"), "driver": ("driver",)}.get(kind, (kind,))
+    return next((source.name for source in sources if source.kind in kinds), kind)
+
+
+def _witnesses(sources: Sequence[Source], row: Row) -> str:
+    topic = _topic(sources, row)
+    return " and ".join(source.name for source in sources if source.name != topic) or "its own messages"
+
+
+def changed_entries(before: Robot, after: Robot) -> dict[str, str]:
+    """Entries of the robot file that differ, by key: text of the value in TOML."""
+    found: dict[str, str] = {}
+    for part in ("geometry", "driver", "joints", "imu", "lidar", "clock", "tf"):
+        _add_changed(found, part, getattr(before, part), getattr(after, part))
+    for frame, mount in after.mounts.items():
+        _add_changed(found, f"mounts.{frame}", before.mounts.get(frame), mount)
+    return found
+
+
+def _add_changed(found: dict[str, str], part: str, before: Any, after: Any) -> None:
+    for entry in dataclasses.fields(after):
+        value = getattr(after, entry.name)
+        if before is None or getattr(before, entry.name) != value:
+            if before is None and value == entry.default:
+                continue
+            found[f"{part}.{entry.name}"] = _toml(value)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f'"{item}"' for item in value) + "]"
+    return f"{value:.6g}" if isinstance(value, float) else f'"{value}"' if isinstance(value, str) else str(value).lower()
