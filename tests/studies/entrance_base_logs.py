@@ -276,6 +276,7 @@ def based(
         ours = {k: error_of(found[k], best.truth[k]) for k in found}
         is_right = is_open or (not refused and all(ours[k] < 1.3 * best.errors[k] + base.tolerance_m for k in ours))
         state = "[" + ", ".join(f"{k} {ours[k]:.3f} ({best.errors[k]:.3f})" for k in ours) + " m]"
+        is_named = is_named or (is_right and bool(warned))  # what is corrected to the true motion is named by whatever sentence says so
         outcome = choose_outcome(is_right, is_named, bool(warned), words)
         checked = "" if outcome == "right" else f" check: {contradictions(folder, log, path)}"
         return Found(outcome, f"{state}{checked}\n{warned}")

@@ -66,7 +66,15 @@ def simulated(seed: int, count: int, sources: Sequence[str], allowed: Callable[[
     rng = np.random.default_rng([seed, 60])
     drawn = drawn_log(rng, sources)
     base = drawn.base
-    setting = Setting({s: TOPICS[s] for s in sources}, base.left, base.right, base.radius, base.track / base.k, base.track * base.driver_k)
+    setting = Setting(
+        {s: TOPICS[s] for s in sources},
+        base.left,
+        base.right,
+        base.radius,
+        base.track / base.k,
+        base.track * base.driver_k,
+        base.fields != "rates",
+    )
     faults = tuple(draw_faults(rng, setting, count, allowed))
     body = Body(base.left, base.right, base.radius, setting.effective_track, setting.driver_track, tuple(sources))
     reference = TOPICS["reference"] if "reference" in sources else None

@@ -34,7 +34,6 @@ class Setting:
     """Track over k [m]."""
     driver_track: float = 0.5
     """By which the driver divides [m]."""
-    is_turning_driver: bool = True
     has_angles: bool = True
 
     @property
@@ -239,6 +238,18 @@ def _wheel_factor(row: str, joints: Callable[[Setting], Sequence[str]]) -> Calla
     return draw
 
 
+def _counts(rng: np.random.Generator, setting: Setting) -> Fault:
+    """Counts of the encoder in place of angles, and no rates."""
+    value = float(rng.choice([360.0, 512.0, 1024.0, 1440.0, 2048.0, 4096.0, 65536.0])) / math.tau
+    scale = scaled_joints(setting, dict.fromkeys(setting.names, value))
+
+    def edit(m: Any) -> Any:
+        m.position, m.velocity = np.round(m.position), np.zeros(0)
+        return m
+
+    return Fault(Truth("wheels.factor", value=value), lambda records: on_topic(setting.topics["wheels"], edit)(scale(records)))
+
+
 def _dead(rng: np.random.Generator, setting: Setting) -> Fault:
     name = str(rng.choice(setting.names))
     return Fault(Truth("wheels.dead", name), scaled_joints(setting, {name: 0.0}))
@@ -398,7 +409,8 @@ def _reference_place(rng: np.random.Generator, setting: Setting) -> Fault:
 
 def _clock(source: str) -> Callable[[np.random.Generator, Setting], Fault]:
     def draw(rng: np.random.Generator, setting: Setting) -> Fault:
-        late = float(rng.choice([-1.0, 1.0]) * rng.choice([0.25, 0.4, 0.7, 1.5, 3.0]))
+        """Queues and drivers, a computer that is not synchronized, GPS time and TAI less UTC."""
+        late = float(rng.choice([-1.0, 1.0]) * rng.choice([0.25, 0.4, 0.7, 1.5, 3.0, 18.0, 37.0], p=[0.2, 0.2, 0.2, 0.2, 0.1, 0.05, 0.05]))
         topic = setting.topics["driver" if source == "wheels" and "wheels" not in setting.topics else source]
         return Fault(Truth(f"clock.{source}", value=late), later(topic, late))
 
@@ -418,6 +430,7 @@ TABLE: tuple[Symptom, ...] = (
     Symptom("wheels.other_side", _other_side, "wiring", fits=_is_four),
     Symptom("wheels.unit", _wheel_unit, "scale", weight=2.0),
     Symptom("wheels.factor", _wheel_factor("wheels.factor", lambda s: s.names), "scale"),
+    Symptom("wheels.factor", _counts, "scale", fits=lambda s: s.has_angles),
     Symptom("wheels.factor", _factor_since, "scale", weight=0.5),
     Symptom("wheels.factor_left", _wheel_factor("wheels.factor_left", lambda s: s.left), "scale", weight=0.5),
     Symptom("wheels.factor_right", _wheel_factor("wheels.factor_right", lambda s: s.right), "scale", weight=0.5),
