@@ -31,7 +31,7 @@ def healthy(seed: int) -> tuple[Drawn, Setting, Body]:
     """Four wheels that do not slip, a driver, a gyro and a reference."""
     rng = np.random.default_rng(seed)
     bases = (draw_base(rng, has_joints=True) for _ in range(1000))
-    base = next(b for b in bases if len(b.left) == 2 and b.counts > 1000)
+    base = next(b for b in bases if len(b.left) == 2 and b.counts > 1000 and b.fields == "both")
     drawn = drawn_log(rng, SOURCES, base, slip=0.0)
     setting = Setting({s: TOPICS[s] for s in SOURCES}, base.left, base.right, base.radius, base.track / base.k, base.track * base.driver_k)
     return drawn, setting, Body(base.left, base.right, base.radius, setting.effective_track, setting.driver_track, SOURCES)
