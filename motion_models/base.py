@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from motion_models.motion import Twist
-from motion_models.param import Param, Traits
+from motion_models.param import Lengths, Param, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -45,6 +45,10 @@ class MotionModel(Protocol):
     def traits(self) -> Traits:
         """What estimators and robot files have to be given about the model beside its parameters."""
 
+    @property
+    def lengths(self) -> Lengths:
+        """Lengths of the robot, in which the scales of the parameters are given."""
+
     def with_correction_params(self) -> MotionModel:
         """The model with the parameters that its corrections need beside its own."""
 
@@ -62,9 +66,12 @@ class MotionModel(Protocol):
         """Wheel rates (..., 2) [rad/s] for a wanted ``command`` (..., 2): vx [m/s] and wz [rad/s]; vy cannot be commanded."""
 
 
+@dataclass(frozen=True)
 class ModelBase:
     """Base of motion models: what follows from the table of parameters, and the defaults of what a model need not have."""
 
+    lengths: Lengths = field(default=Lengths(), kw_only=True)
+    """See `MotionModel.lengths`; `motion_models.registry.make_model` sets those of the robot."""
     params: ClassVar[tuple[Param, ...]]
     """The k parameters."""
     param_names: ClassVar[tuple[str, ...]]
@@ -106,6 +113,11 @@ class ModelWrapper:
         return tuple(p.name for p in self.params)
 
     @property
+    def lengths(self) -> Lengths:
+        """Those of the inner model."""
+        return self.inner.lengths
+
+    @property
     def traits(self) -> Traits:
         """Those of the inner model."""
         return self.inner.traits
@@ -122,6 +134,11 @@ class ModelWrapper:
     def from_robot(cls, robot: Robot) -> MotionModel:
         """Raises `NotImplementedError`: it wraps a model, which a robot file does not name."""
         raise NotImplementedError(f"wrap the model of {robot.name}: {cls.__name__}(make_model(name, robot)).")
+
+
+def scales(model: MotionModel) -> FloatArray:
+    """(k,) change of each parameter that matters, in its unit (`motion_models.param.Param.scale`); positive."""
+    return np.array([p.scale.of(model.lengths) for p in model.params])
 
 
 def prior_sigmas(model: MotionModel) -> FloatArray:

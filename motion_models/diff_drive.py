@@ -10,7 +10,7 @@ import numpy as np
 from motion_models.base import ModelBase
 from motion_models.compiled import kernel
 from motion_models.motion import Twist
-from motion_models.param import TURNING_SIGMA, Free, Param
+from motion_models.param import TURNING_SIGMA, Free, Param, Scale
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -28,10 +28,10 @@ class DiffDrive(ModelBase):
     """(2,) wheel radius [m], wheel separation multiplier [-]."""
     name: ClassVar[str] = "diff_drive"
     params: ClassVar[tuple[Param, ...]] = (
-        Param("wheel_radius", "m", "how far the robot drives per radian of its wheels", free=Free(logs=2)),
+        Param("wheel_radius", "m", "how far the robot drives per radian of its wheels", Scale(0.3, wheel_radius=1), free=Free(logs=2)),
         Param(
             "wheel_separation_multiplier",
-            *("1", "track that the robot turns by, over the real one", TURNING_SIGMA, "wheel_separation_multiplier"),
+            *("1", "track that the robot turns by, over the real one", Scale(0.5), TURNING_SIGMA, "wheel_separation_multiplier"),
             free=Free(logs=1, turns=1, rotations=1),
         ),
     )

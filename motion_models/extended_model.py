@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from motion_models.base import FieldPrior, ModelWrapper, MotionModel, prior_sigmas
 from motion_models.errors import ModelError
 from motion_models.motion import Twist
-from motion_models.param import Free, Param
+from motion_models.param import Free, Param, Scale
 from motion_models.se2 import FloatArray
 from motion_models.terms import COMPONENTS, Term
 
@@ -137,7 +137,7 @@ class ExtendedModel(ModelWrapper):
 def _param(term: Term) -> Param:
     """Entry of the coefficient of ``term`` in the table of parameters."""
     text = f"learned term: {term.component} changes by this times {term.expression}"
-    return Param(term.name, term.unit, text, sigma=term.sigma, free=Free(*(_LAST,) * 4), size=abs(term.value) or term.sigma or 1.0)
+    return Param(term.name, term.unit, text, Scale(term.scale), sigma=term.sigma, free=Free(*(_LAST,) * 4))
 
 
 def terms_of(model: object) -> tuple[Term, ...]:

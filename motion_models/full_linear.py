@@ -18,7 +18,7 @@ from motion_models.base import ModelBase
 from motion_models.compiled import kernel, subroutine
 from motion_models.errors import ModelError
 from motion_models.motion import Twist
-from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, JointCorrection, Param, Traits
+from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, JointCorrection, Param, Scale, Traits
 from motion_models.prior import slip_at_speed
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
@@ -69,18 +69,45 @@ class FullLinear(ModelBase):
     """(12,) standard deviations of terms of which only the size is known, from the robot's geometry (`motion_models.prior`); else 0."""
     name: ClassVar[str] = "full_linear"
     params: ClassVar[tuple[Param, ...]] = (
-        Param("vx_left", "m/rad", "forward motion by the left wheels", free=Free(logs=2, rotations=3)),
-        Param("vx_right", "m/rad", "forward motion by the right wheels", free=Free(logs=6, rotations=5), mirror=("vx_left", 1.0)),
-        Param("vy_left", "m/rad", "sideways motion by the left wheels", free=Free(logs=3, rotations=2)),
-        Param("vy_right", "m/rad", "sideways motion by the right wheels", free=Free(logs=7, rotations=6), mirror=("vy_left", -1.0)),
-        Param("wz_left", "rad/rad", "turning by the left wheels", free=Free(logs=1, turns=1, rotations=1)),
-        Param("wz_right", "rad/rad", "turning by the right wheels", free=Free(logs=5, turns=2, rotations=4), mirror=("wz_left", -1.0)),
-        Param("lateral_slip_speed", "s", "sideways speed v wz times this", _LATERAL_SLIP_S, forms=()),
-        Param("longitudinal_slip_turning", "s", "share of the forward speed lost per yaw rate"),
-        Param("longitudinal_slip_curvature", "1", "forward speed lost to turning, at its most", free=Free(logs=4)),
-        Param("rotation_slip_speed", "s/m", "share of the yaw rate lost per speed", _ROTATION_SLIP_S_PER_M, forms=()),
-        Param("rotation_slip_rate", "s", "share of the yaw rate lost per yaw rate"),
-        Param("rotation_slip_curvature", "1", "share of the yaw rate lost in straight driving, against turning in place"),
+        Param("vx_left", "m/rad", "forward motion by the left wheels", Scale(0.3, wheel_radius=1), free=Free(logs=2, rotations=3)),
+        Param(
+            "vx_right",
+            "m/rad",
+            "forward motion by the right wheels",
+            Scale(0.3, wheel_radius=1),
+            free=Free(logs=6, rotations=5),
+            mirror=("vx_left", 1.0),
+        ),
+        Param("vy_left", "m/rad", "sideways motion by the left wheels", Scale(0.1, wheel_radius=1), free=Free(logs=3, rotations=2)),
+        Param(
+            "vy_right",
+            "m/rad",
+            "sideways motion by the right wheels",
+            Scale(0.1, wheel_radius=1),
+            free=Free(logs=7, rotations=6),
+            mirror=("vy_left", -1.0),
+        ),
+        Param(
+            "wz_left",
+            "rad/rad",
+            "turning by the left wheels",
+            Scale(0.3, wheel_radius=1, track_width=-1),
+            free=Free(logs=1, turns=1, rotations=1),
+        ),
+        Param(
+            "wz_right",
+            "rad/rad",
+            "turning by the right wheels",
+            Scale(0.3, wheel_radius=1, track_width=-1),
+            free=Free(logs=5, turns=2, rotations=4),
+            mirror=("wz_left", -1.0),
+        ),
+        Param("lateral_slip_speed", "s", "sideways speed v wz times this", Scale(0.1), _LATERAL_SLIP_S, forms=()),
+        Param("longitudinal_slip_turning", "s", "share of the forward speed lost per yaw rate", Scale(0.1)),
+        Param("longitudinal_slip_curvature", "1", "forward speed lost to turning, at its most", Scale(0.1), free=Free(logs=4)),
+        Param("rotation_slip_speed", "s/m", "share of the yaw rate lost per speed", Scale(0.1), _ROTATION_SLIP_S_PER_M, forms=()),
+        Param("rotation_slip_rate", "s", "share of the yaw rate lost per yaw rate", Scale(0.1)),
+        Param("rotation_slip_curvature", "1", "share of the yaw rate lost in straight driving, against turning in place", Scale(0.1)),
     )
     traits: ClassVar[Traits] = Traits(directions=_DIRECTIONS)
 

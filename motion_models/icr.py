@@ -16,7 +16,7 @@ import numpy as np
 from motion_models.base import ModelBase
 from motion_models.compiled import kernel
 from motion_models.motion import Twist
-from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, Param, Traits
+from motion_models.param import CENTRE_X_SIGMA_M, TURNING_SIGMA, Free, Param, Scale, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
@@ -44,18 +44,37 @@ class Icr(ModelBase):
     params: ClassVar[tuple[Param, ...]] = (
         Param(
             "y_icr_left",
-            *("m", "where the left treads do not slip lengthwise, left of the middle", TURNING_SIGMA, "y_icr_left"),
+            *(
+                "m",
+                "where the left treads do not slip lengthwise, left of the middle",
+                Scale(0.5, track_width=1),
+                TURNING_SIGMA,
+                "y_icr_left",
+            ),
             free=Free(logs=1, turns=1, rotations=1),
         ),
         Param(
             "y_icr_right",
-            *("m", "where the right treads do not slip lengthwise, left of the middle (negative)", TURNING_SIGMA, "y_icr_left"),
+            *(
+                "m",
+                "where the right treads do not slip lengthwise, left of the middle (negative)",
+                Scale(0.5, track_width=1),
+                TURNING_SIGMA,
+                "y_icr_left",
+            ),
             free=Free(logs=5, turns=2, rotations=3),
             mirror=("y_icr_left", -1.0),
         ),
-        Param("x_icr", "m", "centre of rotation ahead of the middle", CENTRE_X_SIGMA_M, free=Free(logs=2, rotations=2)),
-        Param("alpha_left", "1", "effectiveness: tread speed of the left side over that of its wheels", free=Free(logs=3)),
-        Param("alpha_right", "1", "effectiveness of the right side", free=Free(logs=4), mirror=("alpha_left", 1.0)),
+        Param(
+            "x_icr",
+            "m",
+            "centre of rotation ahead of the middle",
+            Scale(0.1, wheelbase=1),
+            CENTRE_X_SIGMA_M,
+            free=Free(logs=2, rotations=2),
+        ),
+        Param("alpha_left", "1", "effectiveness: tread speed of the left side over that of its wheels", Scale(0.3), free=Free(logs=3)),
+        Param("alpha_right", "1", "effectiveness of the right side", Scale(0.3), free=Free(logs=4), mirror=("alpha_left", 1.0)),
     )
     traits: ClassVar[Traits] = Traits(is_level=True)
 

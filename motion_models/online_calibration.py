@@ -14,7 +14,7 @@ import numpy as np
 from motion_models.base import ModelWrapper, MotionModel, prior_sigmas
 from motion_models.errors import ModelError
 from motion_models.motion import Twist
-from motion_models.param import Free, Param
+from motion_models.param import Free, Param, Scale
 from motion_models.registry import MODELS, params_of, traits_of
 from motion_models.se2 import FloatArray
 
@@ -27,15 +27,14 @@ _LAST = 99  # rank of what is held first
 RADIUS_PARAMS = (
     Param(
         "wheel_radius_scale",
-        *("1", "radius of all wheels over the robot file's, less 1"),
+        *("1", "radius of all wheels over the robot file's, less 1", Scale(0.05)),
         sigma=0.03,  # pneumatic tyres lose 3 % under load
         forms=(),
         free=Free(logs=_LAST, moving_cg=_LAST),
-        size=0.05,
     ),
     Param(
         "wheel_radius_difference",
-        *("1", "radius of the left wheels less the right ones', over the mean"),
+        *("1", "radius of the left wheels less the right ones', over the mean", Scale(0.05)),
         # unequal wheels of up to 1 % are the main systematic odometry error of Borenstein and Feng ("Measurement and correction of
         # systematic odometry errors", IEEE T-RA 12(6), 1996; from memory)
         sigma=0.01,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 TURNING_SIGMA = 0.15
 """Prior sigma of the rotation scaling, relative, for robots of one type on different floors and with other loads: Clearpath's own
@@ -32,6 +34,33 @@ class Free:
     """Tables of rotations in place."""
 
 
+class Lengths(NamedTuple):
+    """Lengths of a robot, in which the scales of parameters are given [m]. The defaults are those of a robot of ordinary size."""
+
+    wheel_radius: float = 0.1
+    track_width: float = 0.4
+    wheelbase: float = 0.4
+
+
+class Scale(NamedTuple):
+    """``value`` times powers of a robot's lengths: a parameter that grows with the robot has the same scale on each."""
+
+    value: float
+    wheel_radius: int = 0
+    track_width: int = 0
+    wheelbase: int = 0
+
+    def of(self, lengths: Lengths) -> float:
+        """Scale on a robot with these ``lengths``, in SI units.
+
+        >>> round(Scale(0.1, wheelbase=1).of(Lengths(wheelbase=0.5)), 3)
+        0.05
+        """
+        return self.value * float(
+            lengths.wheel_radius**self.wheel_radius * lengths.track_width**self.track_width * lengths.wheelbase**self.wheelbase
+        )
+
+
 @dataclass(frozen=True)
 class Param:
     """One parameter of a motion model."""
@@ -40,6 +69,9 @@ class Param:
     unit: str
     """SI unit; 1 for ratios."""
     meaning: str
+    scale: Scale
+    """Change that matters: by so much robots, floors and loads differ. A drive that leaves more open does not reveal the parameter. It does
+    not depend on the nominal value, which may be zero."""
     sigma: float = 0.0
     """Prior standard deviation of its online correction, in its unit or as a share of `relative_to`; 0: it is not corrected. Where the
     model has `sigmas`, by the robot's geometry, these are used instead."""
@@ -50,8 +82,11 @@ class Param:
     free: Free = Free()
     mirror: tuple[str, float] | None = None
     """Parameter of the left side and factor by which this one of the right side follows it where the robot is symmetric."""
-    size: float = 0.0
-    """What counts as large where the nominal value is small only because the robot is symmetric (`FitConfig.sizes`); 0: the nominal."""
+
+    def __post_init__(self) -> None:
+        """Raises `ValueError` for a scale that is not positive."""
+        if not (math.isfinite(self.scale.value) and self.scale.value > 0.0):
+            raise ValueError(f"parameter {self.name}: its scale must be positive, found {self.scale.value}.")
 
     @property
     def text(self) -> str:

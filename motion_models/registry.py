@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import cast
+import dataclasses
+from typing import Any, cast
 
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
@@ -11,7 +12,7 @@ from motion_models.extended_model import ExtendedModel
 from motion_models.friction import FrictionModel
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
-from motion_models.param import Param, Traits
+from motion_models.param import Lengths, Param, Traits
 from motion_models.robot import Robot
 from motion_models.skid_steer import SkidSteer
 
@@ -47,5 +48,7 @@ def make_model(name: str, robot: Robot) -> MotionModel:
     """
     if name not in MODELS:
         raise ModelError(f"no motion model '{name}'; there are {', '.join(MODELS)}.")
-    model = MODELS[name].from_robot(robot)
+    g = robot.geometry
+    lengths = Lengths(g.wheel_radius_m, g.track_width_m, g.wheelbase_m)
+    model = cast(MotionModel, dataclasses.replace(cast(Any, MODELS[name].from_robot(robot)), lengths=lengths))
     return ExtendedModel(model, robot.terms[name]) if robot.terms.get(name) else model

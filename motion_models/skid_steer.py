@@ -10,7 +10,7 @@ import numpy as np
 from motion_models.base import FieldPrior, ModelBase
 from motion_models.compiled import kernel, subroutine
 from motion_models.motion import Twist
-from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, TURNING_SIGMA, Free, Param, Traits
+from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, TURNING_SIGMA, Free, Param, Scale, Traits
 from motion_models.prior import skid_prior
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -63,27 +63,27 @@ class SkidSteer(ModelBase):
     params: ClassVar[tuple[Param, ...]] = (
         Param(
             "k_0",
-            *("1", "k, yaw rate over that of wheels without slip, at CG x = 0", TURNING_SIGMA, "k_0"),
+            *("1", "k, yaw rate over that of wheels without slip, at CG x = 0", Scale(0.3), TURNING_SIGMA, "k_0"),
             free=Free(logs=1, moving_cg=1, turns=1),
         ),
-        Param("k_1", "1/m", "change of k with the CG ahead", free=Free(moving_cg=6), size=1.0),
-        Param("k_2", "1/m^2", "how k grows when the CG leaves the middle", free=Free(moving_cg=5)),
+        Param("k_1", "1/m", "change of k with the CG ahead", Scale(0.5, wheelbase=-1), free=Free(moving_cg=6)),
+        Param("k_2", "1/m^2", "how k grows when the CG leaves the middle", Scale(5.0, wheelbase=-2), free=Free(moving_cg=5)),
         Param(
             "x_cr_0",
-            *("m", "centre of rotation ahead of the middle, at CG x = 0", CENTRE_X_SIGMA_M),
+            *("m", "centre of rotation ahead of the middle, at CG x = 0", Scale(0.1, wheelbase=1), CENTRE_X_SIGMA_M),
             free=Free(logs=2, moving_cg=2),
         ),
-        Param("x_cr_1", "1", "change of the centre of rotation ahead with the CG ahead", free=Free(moving_cg=4)),
+        Param("x_cr_1", "1", "change of the centre of rotation ahead with the CG ahead", Scale(1.0), free=Free(moving_cg=4)),
         Param(
             "y_cr_0",
-            *("m", "centre of rotation left of the middle, at CG (0, 0)", CENTRE_Y_SIGMA_M),
+            *("m", "centre of rotation left of the middle, at CG (0, 0)", Scale(0.05, track_width=1), CENTRE_Y_SIGMA_M),
             free=Free(logs=3, moving_cg=3),
         ),
-        Param("y_cr_1", "1", "change of the centre of rotation to the left with the CG ahead"),
-        Param("y_cr_2", "1/m", "curvature of y_CR over the CG ahead"),
-        Param("y_cr_s0", "1", "change of the centre of rotation to the left with the CG left", free=Free(moving_cg=7)),
-        Param("y_cr_s1", "1/m", "change of y_cr_s0 with the CG ahead"),
-        Param("y_cr_s2", "1/m^2", "curvature of y_cr_s0 over the CG ahead"),
+        Param("y_cr_1", "1", "change of the centre of rotation to the left with the CG ahead", Scale(1.0)),
+        Param("y_cr_2", "1/m", "curvature of y_CR over the CG ahead", Scale(5.0, wheelbase=-1)),
+        Param("y_cr_s0", "1", "change of the centre of rotation to the left with the CG left", Scale(1.0), free=Free(moving_cg=7)),
+        Param("y_cr_s1", "1/m", "change of y_cr_s0 with the CG ahead", Scale(5.0, wheelbase=-1)),
+        Param("y_cr_s2", "1/m^2", "curvature of y_cr_s0 over the CG ahead", Scale(10.0, wheelbase=-2)),
     )
     traits: ClassVar[Traits] = Traits(is_level=True, min_track_over_radius=_IN_PLACE)
 

@@ -45,21 +45,25 @@ class Variable(NamedTuple):
     """Sign that it takes on for a robot seen in a mirror along its x axis; 0 where it becomes another variable."""
     is_motion: bool
     """Whether it is zero at rest."""
+    typical: float
+    """Its size on an ordinary drive, in its unit."""
 
 
 VARIABLES: Mapping[str, Variable] = {
-    "v": Variable("speed ahead by the model without terms [m/s]", 1, -1, 1, True),
-    "wz": Variable("yaw rate by the model without terms [rad/s]", 0, -1, -1, True),
-    "left": Variable("rate of the left wheels [rad/s]", 0, -1, 0, True),
-    "right": Variable("rate of the right wheels [rad/s]", 0, -1, 0, True),
-    "dv": Variable("change of v [m/s^2]", 1, -2, 1, True),
-    "dwz": Variable("change of wz [rad/s^2]", 0, -2, -1, True),
-    "cg_x": Variable("centre of gravity ahead of the middle [m]", 1, 0, 1, False),
-    "cg_y": Variable("centre of gravity left of the middle [m]", 1, 0, -1, False),
-    "t": Variable("time since the drive began [s]", 0, 1, 1, False),
+    "v": Variable("speed ahead by the model without terms [m/s]", 1, -1, 1, True, 0.5),
+    "wz": Variable("yaw rate by the model without terms [rad/s]", 0, -1, -1, True, 0.5),
+    "left": Variable("rate of the left wheels [rad/s]", 0, -1, 0, True, 3.0),
+    "right": Variable("rate of the right wheels [rad/s]", 0, -1, 0, True, 3.0),
+    "dv": Variable("change of v [m/s^2]", 1, -2, 1, True, 0.5),
+    "dwz": Variable("change of wz [rad/s^2]", 0, -2, -1, True, 1.0),
+    "cg_x": Variable("centre of gravity ahead of the middle [m]", 1, 0, 1, False, 0.05),
+    "cg_y": Variable("centre of gravity left of the middle [m]", 1, 0, -1, False, 0.05),
+    "t": Variable("time since the drive began [s]", 0, 1, 1, False, 60.0),
 }
 """Variables of terms. Changes and time need samples in order of time (`in_series`); without, changes and time are 0."""
 
+_MATTERS = 0.05
+"""Change of a component of the twist that matters [m/s, rad/s]: a tenth of an ordinary speed."""
 _NAMES = tuple(VARIABLES)
 _SYNONYMS = {
     **dict.fromkeys(("vx", "speed", "velocity", "linear"), "v"),
@@ -149,6 +153,12 @@ class Expression:
         has_unit = [f for f in self.factors if f.form not in ("sign", "rise")]
         return sum(VARIABLES[f.variable].metres * f.power for f in has_unit), sum(VARIABLES[f.variable].seconds * f.power for f in has_unit)
 
+    @property
+    def typical(self) -> float:
+        """Its size on an ordinary drive, where each variable has its typical size on the side on which it acts."""
+        sides = ((VARIABLES[f.variable].typical * np.array([-1.0, 1.0])) for f in self.factors)
+        return math.prod(float(np.max(np.abs(f.at(x)[0]))) for f, x in zip(self.factors, sides, strict=True))
+
     def evaluate(self, values: Mapping[str, FloatArray]) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Value (n,) at the variables' ``values`` (n,) each, and derivatives (n,) by the variables in it."""
         parts = [f.at(values[f.variable]) for f in self.factors]
@@ -224,6 +234,11 @@ class Term:
     def is_symmetric(self) -> bool:
         """Whether a robot that is the same on both sides may have it: vx is even, vy and wz are odd in a mirror."""
         return self.expression.mirror == (1 if self.component == "vx" else -1)
+
+    @property
+    def scale(self) -> float:
+        """Coefficient that matters: it changes the twist by `_MATTERS` on an ordinary drive."""
+        return _MATTERS / self.expression.typical
 
     @property
     def unit(self) -> str:

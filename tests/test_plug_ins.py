@@ -28,7 +28,7 @@ import numpy as np
 
 from motion_models.base import ModelBase
 from motion_models.motion import Twist
-from motion_models.param import Free, Param
+from motion_models.param import Free, Param, Scale
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,12 @@ class WideTrack(ModelBase):
     nominal: np.ndarray
     name: ClassVar[str] = "wide_track"
     params: ClassVar[tuple[Param, ...]] = (
-        Param("way", "m", "way per radian of the wheels", free=Free(logs=2)),
-        Param("turning_track", "m", "track that the robot turns by", sigma=0.5, relative_to="turning_track", free=Free(1, 1, 1, 1)),
+        Param("way", "m", "way per radian of the wheels", Scale(0.3, wheel_radius=1), free=Free(logs=2)),
+        Param(
+            *("turning_track", "m", "track that the robot turns by", Scale(0.3, track_width=1), 0.5),
+            relative_to="turning_track",
+            free=Free(1, 1, 1, 1),
+        ),
     )
 
     @classmethod

@@ -22,7 +22,7 @@ from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack
 from localization.logs import Log, TopicOverrides
 from localization.trajectory import BoolArray
-from motion_models.base import MotionModel
+from motion_models.base import MotionModel, scales
 from motion_models.calibration.cross_validation import HeldOut, LearnedNoise, cross_validate, learn_noise
 from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.maneuvers import IntArray, Maneuver
@@ -289,8 +289,8 @@ def antenna_config(cuts: Sequence[Cut]) -> FitConfig:
     if known:
         return FitConfig(reference_at=known.pop())
     x, y = np.mean([each.antenna for each in cuts], axis=0)
-    sizes = dict.fromkeys(ANTENNA, _ANTENNA_SIGMA_M)
-    return FitConfig(reference_at=(float(x), float(y)), prior_sigma=sizes, sizes=sizes)
+    sigmas = dict.fromkeys(ANTENNA, _ANTENNA_SIGMA_M)
+    return FitConfig(reference_at=(float(x), float(y)), prior_sigma=sigmas, scales=sigmas)
 
 
 def _significant_clock(found: Fit, cuts: Sequence[Cut]) -> float:
@@ -419,10 +419,10 @@ def turning(found: Calibrated, robot: Robot) -> TurningInPlace:
     value = numbers(result.params)
     everything = list(model.param_names)
     free = [name for name in result.names if name in everything]
-    rows = []
+    rows, scale_of = [], scales(model)
     for name in free:
         step = np.zeros(len(everything))
-        size = 1e-5 * max(abs(result.params[everything.index(name)]), 0.1)
+        size = 1e-5 * float(scale_of[everything.index(name)])
         step[everything.index(name)] = size
         for tied, (master, factor) in result.config.ties.items():
             if master == name:

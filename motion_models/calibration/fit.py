@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 
 from motion_models import se2
-from motion_models.base import MotionModel
-from motion_models.calibration.identifiability import Weakness, weaknesses
+from motion_models.base import MotionModel, scales
+from motion_models.calibration.identifiability import Weakness, candidates, weaknesses
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
-from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES, predict
+from motion_models.calibration.prediction import REFERENCE_PARAM_NAMES, REFERENCE_SCALES, predict
 from motion_models.errors import CalibrationError, ModelError
 from motion_models.extended_model import terms_of
 from motion_models.online_calibration import RADIUS_NAMES
@@ -26,8 +26,8 @@ Loss = Literal["linear", "huber", "cauchy"]
 _STEPS = 60
 """Most steps of Levenberg-Marquardt; fits of real logs take under 20."""
 _LEAST_MOTION = (0.05, 0.05)  # m, rad; below, encoders' resolution and the reference's noise are as large
+_CG_STEP = 0.1  # of wheelbase or track; how far a payload or an arm moves the CG in maneuvers that are recommended
 _UNMEASURED = 1e6  # m^2 or rad^2
-_SMALL = 0.1  # SI; what counts as large for a parameter whose nominal value is 0
 # Median length of vectors of 1, 2 and 3 unit normal numbers. Residual lengths are brought to the last before the knee, beyond
 # which 10 % of them lie with Huber's.
 _MEDIAN_LENGTH = np.array([0.6745, 1.1774, 1.5382])
@@ -47,7 +47,8 @@ class Fit:
     """(5,) as `REFERENCE_PARAM_NAMES`; of an antenna its place in the body frame, `FitConfig.reference_at` included."""
     cov: FloatArray
     """(c, c) of the free parameters. With more than ten groups beyond c, the sandwich over groups (CR1), which holds for residuals that
-    are correlated within a group and for a wrong noise model; with fewer, the inverse information times the weighted mean square."""
+    are correlated within a group and for a wrong noise model, and no sigma below that of independent errors; with fewer, the inverse
+    information times the weighted mean square."""
     is_sandwich: bool
     scale: float
     """Robust size of the whitened residuals: how many times larger than by the noise model the errors are."""
@@ -124,7 +125,8 @@ def fit(
 ) -> Fit:
     """Least squares over the parameters ``free`` (of the model or `REFERENCE_PARAM_NAMES`), from ``start`` (k,) or the nominal.
 
-    Levenberg-Marquardt on the exact derivatives; robust weights by iterative reweighting, one weight per measured pose, after a
+    Levenberg-Marquardt on the exact derivatives, first over the first parameter alone, which brings the others near their minimum; robust
+    weights by iterative reweighting, one weight per measured pose, after a
     plain fit has given the residuals' scale. Raises `CalibrationError` for names that do not exist, for too little motion, and
     (``config.strict``) for parameters that these maneuvers do not reveal, saying what to drive.
 
@@ -138,7 +140,7 @@ def fit(
     config = config or FitConfig()
     batch = make_batch(maneuvers)
     problem = Problem(model, batch, tuple(free), config, model.nominal if start is None else start)
-    x, scale = problem.start, 1.0
+    x, scale = problem.solve(problem.start, np.inf, 1.0, count=1), 1.0
     stages: tuple[Loss, ...] = ("linear",) if config.loss == "linear" and not config.prior_sigma else ("linear", config.loss, config.loss)
     for loss in stages:
         x = problem.solve(x, KNEE[loss] * scale, scale)
@@ -149,11 +151,19 @@ def fit(
     # Residuals smaller than by the noise model are luck or simulation: the noise model then counts.
     information = np.einsum("nri,nrj->ij", J, J) / max(scale, 1.0) ** 2
     rate = float(np.sqrt(np.mean(batch.wheels**2)))
-    unrevealed = weaknesses(problem.names, problem.sizes, information, lambda b: problem.derive(b, x), rate, batch.cg.mean(axis=0))
+    maneuvers_to_try = candidates(
+        rate,
+        batch.cg.mean(axis=0),
+        float(np.median([batch.dt[span].sum() for span in batch.intervals()])),
+        has_headings=not batch.middle.any(),
+        cg_step_m=_CG_STEP * min(model.lengths.wheelbase, model.lengths.track_width),
+    )
+    has_positions = bool(np.isfinite(batch.cov[:, 0, 0]).any())
+    unrevealed = weaknesses(problem.names, problem.scales, information, lambda b: problem.derive(b, x), maneuvers_to_try, has_positions)
     if unrevealed and config.strict:
         raise CalibrationError("\n".join(["this drive does not reveal every parameter:", *(w.text for w in unrevealed)]))
 
-    cov, is_sandwich = _covariance(r, J, weights, problem.components, batch.group, problem.prior)
+    cov, is_sandwich = _covariance(r, J, weights, problem.components, batch.group, problem.prior, problem.scales)
     return Fit(
         model=model,
         names=problem.names,
@@ -170,19 +180,23 @@ def fit(
 
 
 def _covariance(
-    r: FloatArray, J: FloatArray, weights: FloatArray, components: int, group: IntArray, prior: FloatArray
+    r: FloatArray, J: FloatArray, weights: FloatArray, components: int, group: IntArray, prior: FloatArray, scales: FloatArray
 ) -> tuple[FloatArray, bool]:
     """(c, c), and whether it is the sandwich (see `Fit.cov`)."""
     c, groups = J.shape[2], int(group.max()) + 1
     spare = max(components - c, 1)
     dispersion = max(float(np.einsum("n,ni,ni->", weights, r, r)) / spare, 1e-18)
-    bread = np.linalg.pinv(np.einsum("n,nri,nrj->ij", weights, J, J) / dispersion + np.diag(prior), hermitian=True)
+    information = np.einsum("n,nri,nrj->ij", weights, J, J) / dispersion + np.diag(prior)
+    bread = np.linalg.pinv(information * np.outer(scales, scales), hermitian=True) * np.outer(scales, scales)
     if groups <= c + 10:
         return bread, False
     scores = np.zeros((groups, c))
     np.add.at(scores, group, np.einsum("n,nri,nr->ni", weights, J, r) / dispersion)
     correction = groups / (groups - 1) * (components - 1) / spare
-    return correction * bread @ (scores.T @ scores) @ bread, True
+    sandwich = correction * bread @ (scores.T @ scores) @ bread
+    # Where few groups are informative, their scores may be small by luck; errors that are independent are the least that there are.
+    luck = np.sqrt(np.maximum(np.diag(bread) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    return sandwich * np.outer(luck, luck), True
 
 
 @dataclass(frozen=True)
@@ -197,8 +211,8 @@ class FitConfig:
     """Parameters that follow another: name -> (free name, factor), as wz_right -> (wz_left, -1) of a robot that is symmetric."""
     prior_sigma: Mapping[str, float] = field(default_factory=dict)
     """How far free parameters may be from where they start, as one sigma; those not named may be anywhere."""
-    sizes: Mapping[str, float] = field(default_factory=dict)
-    """What counts as large for a parameter, and so as not revealed when its sigma is larger; else its nominal value, or 0.1 (SI)."""
+    scales: Mapping[str, float] = field(default_factory=dict)
+    """Change of a parameter that matters, instead of the one that it declares: it is not revealed where its sigma is larger."""
     reference_at: tuple[float, float] = (0.0, 0.0)
     """Where in the body frame the motion reference measures positions without headings [m]; offsets that are fitted count from there."""
     strict: bool = True
@@ -225,15 +239,15 @@ class Problem:
         masters = [name for name, _ in config.ties.values()]
         if not names or len(set(names)) != len(names) or set(masters) - set(names) or set(tied) & set(names):
             raise CalibrationError("name each free parameter once; what is tied to another must not be free, and that other must be.")
-        indices(model, [*config.prior_sigma, *config.sizes])
+        indices(model, [*config.prior_sigma, *config.scales])
         self.all_columns = np.concatenate([self.columns, indices(model, tied)])
         self.combine = np.eye(len(names), len(names) + len(tied))
         for i, (master, factor) in enumerate(config.ties.values()):
             self.combine[names.index(master), len(names) + i] = factor
         self.everything = np.concatenate([start, [0.0, 0.0, *config.reference_at, 0.0]])
         self.start = self.everything[self.columns]
-        nominal = dict(zip(model.param_names, np.abs(model.nominal), strict=True))
-        self.sizes = np.array([config.sizes.get(name) or nominal.get(name) or _SMALL for name in names])
+        declared = dict(zip((*model.param_names, *REFERENCE_PARAM_NAMES), (*scales(model), *REFERENCE_SCALES), strict=True))
+        self.scales = np.array([config.scales.get(name, declared[name]) for name in names])
         sigmas = np.array([config.prior_sigma.get(name, np.inf) for name in names])
         self.prior = 1.0 / sigmas**2
         measured = np.isfinite(np.diagonal(batch.cov, axis1=1, axis2=2))
@@ -333,8 +347,9 @@ class Problem:
         size = float(np.median(self.lengths(r))) / float(_MEDIAN_LENGTH[2])
         return max(size * math.sqrt(self.components / spare), 1e-9)
 
-    def solve(self, x: FloatArray, knee: float, scale: float) -> FloatArray:
-        """Levenberg-Marquardt with Marquardt's scaling and Nielsen's damping."""
+    def solve(self, x: FloatArray, knee: float, scale: float, count: int | None = None) -> FloatArray:
+        """Levenberg-Marquardt with Marquardt's scaling and Nielsen's damping, over the first ``count`` parameters; by default all."""
+        moved = slice(count)
         r, J = self.residuals(x)
         cost, damping, grow = self.cost(r, x, knee, scale), 1e-4, 2.0
         prior = scale**2 * self.prior
@@ -342,8 +357,10 @@ class Problem:
             w = self.weights(r, knee)
             A = np.einsum("n,nri,nrj->ij", w, J, J) + np.diag(prior)
             g = np.einsum("n,nri,nr->i", w, J, r) + prior * (x - self.start)
-            diagonal = np.maximum(np.diag(A), 1e-12 * np.max(np.diag(A)) + 1e-300)
-            step = -np.linalg.solve(A + np.diag(damping * diagonal), g)
+            # No entry is zero: a parameter without information stays where it is.
+            diagonal = np.maximum(np.diag(A), 1e-12 * np.max(np.diag(A) * self.scales**2) / self.scales**2 + 1e-300)
+            step = np.zeros(len(x))
+            step[moved] = -np.linalg.solve((A + np.diag(damping * diagonal))[moved, moved], g[moved])
             tried = x + step
             try:
                 r_tried, J_tried = self.residuals(tried)

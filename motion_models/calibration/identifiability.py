@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,9 @@ import numpy as np
 from motion_models.calibration.maneuvers import Batch, Maneuver, make_batch
 from motion_models.se2 import FloatArray
 
-_SECONDS = 5.0  # s; duration of the maneuvers that are tried as advice
+_WINDOW_S = 5.0  # s; duration of the maneuvers that are tried as advice, unless the drive was measured over other times
+_STEPS = 50
+_CG_STEP_M = 0.05  # m; how far the centre of gravity is moved in maneuvers for its effects, on a robot of ordinary size
 _MAX_MANEUVER_S = 600.0  # s; a maneuver that must last longer is no advice
 _MIN_SHARE = 0.3  # parameters with less than this part in a direction are not named
 
@@ -20,16 +22,20 @@ Derive = Callable[[Batch], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class Weakness:
-    """One combination of parameters that the drive leaves open by more than the parameters' own size."""
+    """One combination of parameters that the drive leaves open by more than their scale (`motion_models.param.Param`)."""
 
     combination: dict[str, float]
-    """Parameter -> its part in the combination, in units of its size; the largest is 1."""
+    """Parameter -> its part in the combination, in units of its scale; the largest is 1."""
     spread: float
     """Sigma of the combination, in the same units; infinite where the drive has no information on it."""
+    sigma: float
+    """Sigma of its first parameter, in that one's own unit."""
     drive: str
     """The maneuver that would reveal it best; empty where none would."""
     seconds: float
     """Duration that brings the spread below 1."""
+    has_positions: bool = True
+    """Whether the drive's positions were measured, beside headings."""
 
     @property
     def text(self) -> str:
@@ -38,23 +44,31 @@ class Weakness:
         if len(self.combination) > 1:
             what = f"{names} cannot be distinguished"
         elif np.isfinite(self.spread):
-            what = f"{names} is uncertain by {self.spread:.1f} times its size"
+            what = f"{names} stays uncertain by +- {self.sigma:.2g}"
         else:
             what = f"{names} does not show"
         if self.drive:
             return f"{what}: drive about {self.seconds:.0f} s of {self.drive}, or fit fewer parameters."
-        return f"{what}: no short maneuver would change that; hold {'one of them' if len(self.combination) > 1 else 'it'} fixed."
+        held = f"hold {'one of them' if len(self.combination) > 1 else 'it'} fixed"
+        if not self.has_positions:
+            return f"{what} by headings alone: record a LiDAR or a reference with positions, or {held}."
+        return f"{what}: no short maneuver would change that; {held}."
 
 
 def weaknesses(
-    names: tuple[str, ...], sizes: FloatArray, information: FloatArray, derive: Derive, rate: float, cg: FloatArray
+    names: tuple[str, ...],
+    scales: FloatArray,
+    information: FloatArray,
+    derive: Derive,
+    maneuvers: Sequence[tuple[str, Maneuver]],
+    has_positions: bool = True,
 ) -> tuple[Weakness, ...]:
     """Eigenvectors of the scaled ``information`` (c, c) of the parameters ``names`` with a sigma above 1, weakest first.
 
-    Scaled means: in units of ``sizes`` (c,), what counts as large for each. For each weak one, the maneuver with most
-    information on it is chosen of `candidates` at wheel rates around ``rate`` [rad/s] and ``cg`` (2,) [m].
+    Scaled means: in units of ``scales`` (c,), the change that matters of each. For each weak one, that of the ``maneuvers``
+    (`candidates`) with most information on it is chosen.
     """
-    values, vectors = np.linalg.eigh(information * np.outer(sizes, sizes))
+    values, vectors = np.linalg.eigh(information * np.outer(scales, scales))
     # Zero in double precision.
     unobservable = values <= 1e-13 * max(float(values[-1]), 1.0)
     poor = ~unobservable & (values < 1.0)
@@ -65,11 +79,11 @@ def weaknesses(
         parts = vector / vector[np.argmax(np.abs(vector))]
         order = np.argsort(-np.abs(parts), kind="stable")
         combination = {names[i]: float(parts[i]) for i in order if abs(parts[i]) >= _MIN_SHARE}
-        drive, gain = _best(derive, vector / np.linalg.norm(vector) * sizes, rate, cg)
-        seconds = _SECONDS * float(np.ceil((1.0 - spread**-2) / gain)) if drive else np.inf
+        drive, gain = _best(derive, vector / np.linalg.norm(vector) * scales, maneuvers)
+        seconds = float(maneuvers[0][1].dt.sum()) * float(np.ceil((1.0 - spread**-2) / gain)) if drive else np.inf
         if seconds > _MAX_MANEUVER_S:
             drive, seconds = "", np.inf
-        found.append(Weakness(combination, spread, drive, seconds))
+        found.append(Weakness(combination, spread, spread * float(scales[order[0]]), drive, seconds, has_positions))
     return tuple(found)
 
 
@@ -85,9 +99,13 @@ def _sparse(rows: FloatArray) -> FloatArray:
     return rows
 
 
-def candidates(rate: float, cg: FloatArray, dt: float = 0.1) -> list[tuple[str, Maneuver]]:
-    """Maneuvers of 5 s at wheel rates around ``rate`` [rad/s], each with its name. ``cg`` (2,) [m]."""
-    n = round(_SECONDS / dt)
+def candidates(
+    rate: float, cg: FloatArray, window_s: float = _WINDOW_S, has_headings: bool = True, cg_step_m: float = _CG_STEP_M
+) -> list[tuple[str, Maneuver]]:
+    """Maneuvers of ``window_s`` at wheel rates around ``rate`` [rad/s], each with its name, some with the centre of gravity ``cg`` (2,) [m]
+    moved by ``cg_step_m``. Measured are poses, or positions alone at start, middle and end."""
+    dt = window_s / _STEPS
+    n = _STEPS
     steady = np.ones((n, 1))
     wave = np.sin(2.0 * np.pi * np.arange(n) / n)[:, None]
     turn = steady * [-1.0, 1.0]
@@ -102,30 +120,35 @@ def candidates(rate: float, cg: FloatArray, dt: float = 0.1) -> list[tuple[str, 
         ("gentle arcs to the right", steady * [1.2, 0.8]),
         ("fast gentle arcs", steady * [1.6, 2.4]),
         ("turning about one standing side", steady * [0.0, 1.0]),
+        ("straight driving into a turn in place", np.where(np.arange(n)[:, None] < n // 2, steady * [1.0, 1.0], turn)),
         ("a slalom that speeds up and slows down", 1.0 + wave * [0.2, 0.8]),
     ]
-    found = [(text, _candidate(rate * rates, cg, dt)) for text, rates in shapes]
+    found = [(text, _candidate(rate * rates, cg, dt, has_headings)) for text, rates in shapes]
     for text, shift in (
-        ("forward", (0.05, 0.0)),
-        ("backward", (-0.05, 0.0)),
-        ("to the left", (0.0, 0.05)),
-        ("forward and to the left", (0.05, 0.05)),
-        ("backward and to the left", (-0.05, 0.05)),
+        ("forward", (1, 0)),
+        ("backward", (-1, 0)),
+        ("to the left", (0, 1)),
+        ("forward and to the left", (1, 1)),
+        ("backward and to the left", (-1, 1)),
     ):
-        found.append((f"turning in place with the centre of gravity moved 5 cm {text}", _candidate(rate * turn, cg + shift, dt)))
+        moved = f"turning in place with the centre of gravity moved {100.0 * cg_step_m:.2g} cm {text}"
+        found.append((moved, _candidate(rate * turn, cg + cg_step_m * np.array(shift), dt, has_headings)))
     return found
 
 
-def _candidate(wheels: FloatArray, cg: FloatArray, dt: float) -> Maneuver:
-    n, step = len(wheels), round(0.5 / dt)
-    ends = np.arange(step, n + 1, step, dtype=np.int64)
+def _candidate(wheels: FloatArray, cg: FloatArray, dt: float, has_headings: bool) -> Maneuver:
+    if not has_headings:
+        n = len(wheels)
+        return Maneuver(np.full(n, dt), wheels, np.zeros((1, 3)), np.array([n]), np.asarray(cg), middle=n // 2)
+    n = len(wheels)
+    ends = np.arange(n // 10, n + 1, n // 10, dtype=np.int64)
     return Maneuver(np.full(n, dt), np.asarray(wheels, dtype=np.float64), np.zeros((len(ends), 3)), ends, np.asarray(cg))
 
 
-def _best(derive: Derive, direction: FloatArray, rate: float, cg: FloatArray) -> tuple[str, float]:
-    """The candidate with most information on the parameters' ``direction`` (c,), and its information; "" where none has any."""
+def _best(derive: Derive, direction: FloatArray, maneuvers: Sequence[tuple[str, Maneuver]]) -> tuple[str, float]:
+    """The name of the maneuver with most information on the parameters' ``direction`` (c,), and its information; "" where none has any."""
     best, gain = "", 0.0
-    for text, maneuver in candidates(rate, cg):
+    for text, maneuver in maneuvers:
         d, cov = derive(make_batch([maneuver]))
         moved = d @ direction
         # The best single pose: poses of one maneuver share their errors, and a lag shows within it and not at its end.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from motion_models.base import MotionModel, prior_sigmas
+from motion_models.base import MotionModel, prior_sigmas, scales
 from motion_models.calibration.fit import Fit, FitConfig, fit
 from motion_models.calibration.identifiability import Weakness
 from motion_models.calibration.maneuvers import Maneuver
@@ -65,7 +65,8 @@ def calibrate(
 ) -> Calibration:
     """Fit as many of the ``wanted`` parameters as these maneuvers reveal, those named first before the others.
 
-    What an uncalibrated robot has by its geometry (`motion_models.prior`) is the prior of the fit. With ``insist`` all of them or none.
+    What an uncalibrated robot has by its geometry (`motion_models.prior`) is the prior of the fit, else the
+    scale that a parameter declares, by which robots differ. With ``insist`` all of them or none.
     Raises what `fit` raises; `CalibrationError` where nothing is revealed.
     """
     free = list(wanted)
@@ -77,13 +78,11 @@ def calibrate(
 
     if insist:
         return Calibration(fit(model, maneuvers, free, dataclasses.replace(config, ties={**ties(), **config.ties})), ())
-    by_geometry = zip(model.param_names, prior_sigmas(model), strict=True)
-    config = dataclasses.replace(
-        config, prior_sigma={n: float(s) for n, s in by_geometry if s > 0.0 and n in free} | dict(config.prior_sigma)
-    )
+    prior = zip(model.param_names, prior_sigmas(model), scales(model), strict=True)
+    prior_sigma = {name: float(own or declared) for name, own, declared in prior if name in free}
+    config = dataclasses.replace(config, prior_sigma=prior_sigma | dict(config.prior_sigma))
     if CLOCK in free:
         config = dataclasses.replace(config, prior_sigma={CLOCK: CLOCK_SIGMA_S, **config.prior_sigma})
-    config = dataclasses.replace(config, sizes={**{p.name: p.size for p in model.params if p.size}, **config.sizes})
     reasons: list[Weakness] = []
     while free:
         if any(name != CLOCK for name in free):

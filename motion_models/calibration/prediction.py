@@ -28,6 +28,9 @@ wheel_lag [s]: time constant with which the body follows the wheels (first order
 lidar_offset_x, lidar_offset_y [m], lidar_yaw [rad]: pose of the tracked point in the body frame, beyond that of its mount.
 """
 
+REFERENCE_SCALES = (0.1, 0.1, 0.1, 0.1, 0.1)
+"""Change of each that matters [s, s, m, m, rad], as `motion_models.param.Param.scale`."""
+
 
 class Spans(NamedTuple):
     """Which intervals of a batch belong to each measured pose."""

@@ -38,7 +38,7 @@ from motion_models.friction.equilibrium import (
 )
 from motion_models.linear_equations import Matrix3, solve_3x3
 from motion_models.motion import Twist
-from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, Free, Param, Traits
+from motion_models.param import CENTRE_X_SIGMA_M, CENTRE_Y_SIGMA_M, Free, Param, Scale, Traits
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Triple
 from motion_models.slope import GRAVITY, Slope, SlopeTwist
@@ -71,8 +71,8 @@ _WARP_SIGMA = 0.15
 _NOT_STRAIGHT = 0.02
 """`Traits.min_track_over_radius`: on straight motion the two sides differ by noise alone, which would be taken for information."""
 _CG_OFFSETS = (
-    Param("cg_offset_x", "m", "true centre of gravity ahead of the given one", CENTRE_X_SIGMA_M, forms=()),
-    Param("cg_offset_y", "m", "true centre of gravity left of the given one", CENTRE_Y_SIGMA_M, forms=()),
+    Param("cg_offset_x", "m", "true centre of gravity ahead of the given one", Scale(0.1, wheelbase=1), CENTRE_X_SIGMA_M, forms=()),
+    Param("cg_offset_y", "m", "true centre of gravity left of the given one", Scale(0.05, track_width=1), CENTRE_Y_SIGMA_M, forms=()),
 )
 _MIN_MU_RATIO = 0.05  # -; castors and free rollers
 _MAX_CG = 0.98  # -; of half the wheelbase and half the track, where the robot tips over
@@ -114,23 +114,30 @@ class FrictionModel(ModelBase):
     above 2 m/s with the CG almost over a wheel, for commands beyond mu g, and for some in a thousand near the reversal of a wheel."""
     name: ClassVar[str] = "friction"
     params: ClassVar[tuple[Param, ...]] = (
-        Param("wheel_radius", "m", "how far the robot drives per radian of its wheels", free=Free(logs=3)),
-        Param("track_width", "m", "distance of the left and right contacts", free=Free(rotations=3)),
-        Param("wheelbase", "m", "distance of the front and rear contacts"),
-        Param("mu", "1", "friction along the wheels"),
-        Param("mu_ratio", "1", "friction across the wheels over that along them", _MU_RATIO_SIGMA, free=Free(logs=1, turns=1)),
-        Param("slip_stiffness", "1", "slope of the contact law at zero slip"),
-        Param("rolling_resistance", "1", "rolling resistance over load"),
-        Param("scrub", "m", "yaw moment of the contact patches over mu m g", free=Free(rotations=4)),
+        Param("wheel_radius", "m", "how far the robot drives per radian of its wheels", Scale(0.3, wheel_radius=1), free=Free(logs=3)),
+        Param("track_width", "m", "distance of the left and right contacts", Scale(0.3, track_width=1), free=Free(rotations=3)),
+        Param("wheelbase", "m", "distance of the front and rear contacts", Scale(0.3, wheelbase=1)),
+        Param("mu", "1", "friction along the wheels", Scale(0.5)),
+        Param("mu_ratio", "1", "friction across the wheels over that along them", Scale(0.5), _MU_RATIO_SIGMA, free=Free(logs=1, turns=1)),
+        Param("slip_stiffness", "1", "slope of the contact law at zero slip", Scale(5.0)),
+        Param("rolling_resistance", "1", "rolling resistance over load", Scale(0.02)),
+        Param("scrub", "m", "yaw moment of the contact patches over mu m g", Scale(0.1, track_width=1), free=Free(rotations=4)),
         Param(
             "warp",
-            *("1", "load on the front left and rear right wheels by a twisted chassis, over m g / 4", _WARP_SIGMA),
+            *("1", "load on the front left and rear right wheels by a twisted chassis, over m g / 4", Scale(0.15), _WARP_SIGMA),
             *("", ("cg_field",), Free(rotations=2)),
         ),
-        Param("tread", "1", "how much more the wheels grip when they slide to the left than to the right"),
-        Param("tracked_x", "m", "tracked point ahead of the wheelbase's middle", CENTRE_X_SIGMA_M, free=Free(logs=2, rotations=1)),
-        Param("tracked_y", "m", "tracked point left of the wheelbase's middle", CENTRE_Y_SIGMA_M),
-        Param("split_friction", "1", "grip of the left wheels less that of the right ones, over their mean"),
+        Param("tread", "1", "how much more the wheels grip when they slide to the left than to the right", Scale(0.1)),
+        Param(
+            "tracked_x",
+            "m",
+            "tracked point ahead of the wheelbase's middle",
+            Scale(0.1, wheelbase=1),
+            CENTRE_X_SIGMA_M,
+            free=Free(logs=2, rotations=1),
+        ),
+        Param("tracked_y", "m", "tracked point left of the wheelbase's middle", Scale(0.05, track_width=1), CENTRE_Y_SIGMA_M),
+        Param("split_friction", "1", "grip of the left wheels less that of the right ones, over their mean", Scale(0.1)),
     )
     traits: ClassVar[Traits] = Traits(
         options=("contact", "centripetal"), is_level=True, min_track_over_radius=_NOT_STRAIGHT, correction_params=_CG_OFFSETS
