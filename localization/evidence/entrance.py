@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from localization.events import ImuSample, Scan
 from localization.evidence.search import make_stacks
-from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_scans, is_comparable
+from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, from_scans, is_comparable
 from localization.evidence.verdict import CORRECTED, SetUp, decide
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.decode import JointReading, OdometryReading, decode_imu
@@ -25,6 +25,7 @@ from localization.logs.event_decoder import TopicDecoder, late_ns
 from localization.logs.wheel_messages import odometry_decoder, wheel_decoder
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
 
 _MOVING_S, _READ_S, _SCANS_S, _STANDING_S = 120.0, 900.0, 75.0, 5.0
 """Time after the first motion that is read, in all, with scans (registering one takes a millisecond), and kept from before it [s]."""
@@ -62,10 +63,25 @@ def open_log_as_declared(path: Path | str, robot: Robot, topics: TopicOverrides 
     return found.log
 
 
-def infer_set_up(log: Log, reference: Source | None = None) -> SetUp:
+class ReferencePoses(Protocol):
+    """Poses of the robot by a reference system."""
+
+    source: str
+    """Topic or file."""
+    stamps_ns: Any
+    """(N,) strictly increasing."""
+    yaws: Any
+    """(N,) [rad], or None where there are positions only."""
+
+    @property
+    def poses(self) -> FloatArray:
+        """(N, 3)"""
+        ...
+
+
+def infer_set_up(log: Log, reference: ReferencePoses | None = None) -> SetUp:
     """The set-up of ``log``, by its own sources and a ``reference``."""
-    sources = read_sources(log)
-    return infer([*sources, *([] if reference is None else [reference])], log.robot)
+    return infer(read_sources(log, reference), log.robot)
 
 
 def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
@@ -83,8 +99,8 @@ def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
     return decide(used, make_stacks(used, edges, robot), robot)
 
 
-def read_sources(log: Log) -> list[Source]:
-    """Sources of the first two minutes of driving; none where the log has no wheels."""
+def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Source]:
+    """Sources of the first two minutes of driving, and the ``reference`` of all of the log; none where the log has no wheels."""
     if log.sources.wheels is None or log.wheels_error is not None:
         return []
     decoders = _decoders(log)
@@ -107,6 +123,9 @@ def read_sources(log: Log) -> list[Source]:
     lidar = log.sources.lidar
     if lidar is not None and (source := from_scans(lidar.topic, _scans_of(log, begin_ns), log.mounts, begin_ns)) is not None:
         found.append(source)
+    if reference is not None and reference.yaws is not None:
+        of_reference = from_poses(reference.source, reference.stamps_ns, reference.poses, begin_ns)
+        found += [] if of_reference is None else [of_reference]
     return found
 
 

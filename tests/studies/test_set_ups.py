@@ -128,7 +128,7 @@ def _points(scan: Any) -> np.ndarray:
 
 def test_rows_of_other_names_and_the_same_map_are_the_same_answer() -> None:
     _, _, body = healthy(3)
-    assert is_same([Truth("wheels.factor", value=9.549)], [Truth("wheels.unit", "rpm")], body)
+    assert is_same([Truth("wheels.factor", value=1.0 / 9.549)], [Truth("wheels.unit", "rpm")], body)
     assert is_same([Truth("gyro.axis", "-z")], [Truth("gyro.reversed")], body)
     assert is_same([Truth("wheels.all_reversed"), Truth("wheels.left_reversed")], [Truth("wheels.right_reversed")], body)
     assert not is_same([Truth("wheels.left_reversed")], [Truth("wheels.right_reversed")], body)

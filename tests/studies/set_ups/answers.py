@@ -30,6 +30,7 @@ class Truth:
     id: str
     detail: str = ""
     value: float | None = None
+    """Of a factor: by which what is published must be multiplied; of a yaw, place or delay: what is true less what is declared."""
     since_s: float | None = None
 
     def __str__(self) -> str:
@@ -81,6 +82,7 @@ def as_declared(body: Body) -> State:
 
 
 LENGTHS = {"mm": 1000.0, "cm": 100.0, "inch": 1.0 / 0.0254, "ft": 1.0 / 0.3048}
+LENGTHS.update(millimetres=LENGTHS["mm"], centimetres=LENGTHS["cm"], inches=LENGTHS["inch"], feet=LENGTHS["ft"])
 RATES = {"rpm": 60.0 / math.tau, "deg/s": 180.0 / math.pi, "rev/s": 1.0 / math.tau}
 ORDER = (
     "place",
@@ -212,9 +214,9 @@ _CHANGES: Mapping[str, Callable[[Channels, Any, Body], None]] = {
     "wheels.one_reversed": _joints(lambda _, row: (row.detail,), lambda b, _: -1.0),
     "wheels.other_side": _other_side,
     "wheels.unit": _joints(lambda b, _: (*b.left, *b.right), _wheel_unit),
-    "wheels.factor": _joints(lambda b, _: (*b.left, *b.right), lambda _, row: row.value),
-    "wheels.factor_left": _joints(lambda b, _: b.left, lambda _, row: row.value),
-    "wheels.factor_right": _joints(lambda b, _: b.right, lambda _, row: row.value),
+    "wheels.factor": _joints(lambda b, _: (*b.left, *b.right), lambda _, row: 1.0 / row.value),
+    "wheels.factor_left": _joints(lambda b, _: b.left, lambda _, row: 1.0 / row.value),
+    "wheels.factor_right": _joints(lambda b, _: b.right, lambda _, row: 1.0 / row.value),
     "wheels.dead": _joints(lambda _, row: (row.detail,), lambda *_: 0.0),
     "driver.sides_exchanged": _left_multiplied((1, 0, 0, 0), (0, -1, 0, 0), (0, 0, 1, 0), (0, 0, 0, -1)),
     "driver.reversed": _left_multiplied((-1, 0, 0, 0), (0, -1, 0, 0), (0, 0, -1, 0), (0, 0, 0, -1)),

@@ -233,7 +233,7 @@ def _wheel_factor(row: str, joints: Callable[[Setting], Sequence[str]]) -> Calla
     def draw(rng: np.random.Generator, setting: Setting) -> Fault:
         """A gear, a radius typed as diameter, an encoder of half or four times the counts."""
         value = float(rng.choice([0.25, 0.5, 2.0, 3.0, 4.0] if row.endswith("factor") else [0.5, 2.0, 4.0]))
-        return Fault(Truth(row, value=value), scaled_joints(setting, dict.fromkeys(joints(setting), value)))
+        return Fault(Truth(row, value=1.0 / value), scaled_joints(setting, dict.fromkeys(joints(setting), value)))
 
     return draw
 
@@ -247,7 +247,7 @@ def _counts(rng: np.random.Generator, setting: Setting) -> Fault:
         m.position, m.velocity = np.round(m.position), np.zeros(0)
         return m
 
-    return Fault(Truth("wheels.factor", value=value), lambda records: on_topic(setting.topics["wheels"], edit)(scale(records)))
+    return Fault(Truth("wheels.factor", value=1.0 / value), lambda records: on_topic(setting.topics["wheels"], edit)(scale(records)))
 
 
 def _dead(rng: np.random.Generator, setting: Setting) -> Fault:
@@ -277,7 +277,7 @@ def _factor_since(rng: np.random.Generator, setting: Setting) -> Fault:
         kept.clear()
         return on_topic(setting.topics["wheels"], edit)(records)
 
-    return Fault(Truth("wheels.factor", value=value, since_s=at), anew)
+    return Fault(Truth("wheels.factor", value=1.0 / value, since_s=at), anew)
 
 
 # rows: the driver's odometry
