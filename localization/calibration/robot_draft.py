@@ -37,6 +37,8 @@ class Given:
     topics: TopicOverrides = field(default_factory=TopicOverrides)
     controller: Path | None = None
     """YAML with the parameters of the robot's drive controller."""
+    urdf_text: str | None = None
+    """Text of `urdf`, expanded where that is a xacro file."""
 
 
 @dataclass

@@ -51,7 +51,7 @@ _LEAST_DRIVEN_K = 0.8
 def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     """Guess everything that a robot file needs. Raises `RobotError` for a URDF that cannot be used."""
     draft = Draft()
-    text = None if given.urdf is None else _read_urdf(given.urdf)
+    text = None if given.urdf is None else given.urdf_text or _read_urdf(given.urdf)
     _choose_topics(draft, survey, given.topics)
     names = _JointNames(draft, survey, given)
     urdf = None if text is None else names.of_urdf(wheel_geometry(text, str(given.urdf), given.base_link))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.prompt import Confirm, Prompt
 
+from localization.calibration.arms_setup import ArmsDraft, add_arms
 from localization.calibration.log_survey import Survey, survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
 from localization.calibration.robot_setup import draft_robot, finish_checked
@@ -20,6 +22,8 @@ from localization.commands.calibrate import Calibrate
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
+from motion_models.center_of_gravity.urdf import body_link, parse_urdf, read_urdf
+from motion_models.center_of_gravity.xacro_files import expand_xacro, is_xacro
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
 from motion_models.robot import DIFF_DRIVE, DRIVES, Robot
@@ -53,11 +57,15 @@ class Init:
     out: Annotated[Path, tyro.conf.arg(metavar="ROBOT.toml")]
     """Robot file to write; every command takes it as --robot."""
     urdf: Path | None = None
-    """URDF of the robot (expand xacro first): wheels, geometry, mass and mounts."""
+    """URDF or xacro file of the robot: wheels, geometry, masses, arms and mounts."""
+    package: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=FOLDER of a ROS package that the xacro file finds by $(find NAME), again for each; packages beside the file are found."""
+    xacro_arg: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME=VALUE of an argument of the xacro file, again for each."""
     controller: Path | None = None
     """YAML of the robot's drive controller (diff_drive_controller, ros2_control): track, radius, multiplier and joints."""
-    base_link: str = "base_link"
-    """Link of --urdf whose frame is the body frame."""
+    base_link: str = ""
+    """Link of --urdf whose frame is the body frame. Default: base_link, else base_footprint, else the root."""
     like: str | None = None
     """Robot (`skidloc robots`) whose geometry, driver and joints count where log and URDF have none."""
     name: str | None = None
@@ -89,13 +97,14 @@ class Init:
             raise RobotError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         if self.urdf is not None and not self.urdf.is_file():
             raise RobotError(f"--urdf '{self.urdf}': there is no such file.")
+        check_outputs(self._arms_file())
         calibrated = self.out.with_name(f"{self.out.stem}_calibrated.toml")
         if self.calibrate:
             check_outputs(calibrated)
         given = self._given()
         with console.status("reading the log"):
             survey = survey_log(self.log)
-            draft = draft_robot(survey, given, self.log)
+            draft, given = self._draft(console, survey, given)
         is_interactive = console.is_terminal and sys.stdin.isatty()
         if is_interactive:
             answered = _ask(console, survey, draft, given)
@@ -127,16 +136,61 @@ class Init:
             options = ", ".join("--" + name.replace("_", "-") for name in absent)
             raise RobotError(f"{survey.name} and the options have no {', '.join(absent)}; measure and give {options}, or name a --urdf.")
         robot, wiring = finish_checked(draft, given, self.log, self.out.stem)
-        for text in wiring:
+        arms = self._arms(robot, survey)
+        robot = arms.robot
+        for reason in arms.reasons:
+            print_line(console, f"  {reason}")
+        for text in (*wiring, *arms.missing):
             print_line(console, f"! {text}")
-        gaps = [*draft.missing, *wiring]
-        remarks = [f"Written by skidloc init from {survey.name}.", *draft.reasons, *(f"MISSING: {gap}" for gap in gaps)]
+        gaps = [*draft.missing, *wiring, *arms.missing]
+        reasons = [*draft.reasons, *arms.reasons]
+        remarks = [f"Written by skidloc init from {survey.name}.", *reasons, *(f"MISSING: {gap}" for gap in gaps)]
         remarks += [f"CONTRADICTION: {c.quantity} = {c.value} ({c.source}); the log: {c.by_log}" for c in draft.contradictions]
         text = robot_toml(robot, remarks="\n".join(remarks))
         parse_robot(text, str(self.out))  # refuses what no robot can have before it is written
+        if arms.urdf:
+            write_text_file(self._arms_file(), arms.urdf)
+            print_line(console, f"arms: {self._arms_file()}")
         write_text_file(self.out, text)
         print_line(console, f"robot file: {self.out}")
         return robot
+
+    def _arms_file(self) -> Path:
+        return self.out.with_name(f"{self.out.stem}_arms.urdf")
+
+    def _draft(self, console: Console, survey: Survey, given: Given) -> tuple[Draft, Given]:
+        """What log and URDF have; without the URDF where it has no wheels and the options have all lengths."""
+        try:
+            return draft_robot(survey, given, self.log), given
+        except RobotError as error:
+            lengths = (given.wheel_radius_m, given.track_width_m, given.wheelbase_m)
+            if given.urdf is None or (None in lengths and given.like is None):
+                raise
+            print_line(console, f"! {error}")
+            without = replace(given, urdf=None)
+            return draft_robot(survey, without, self.log), without
+
+    def _arms(self, robot: Robot, survey: Survey) -> ArmsDraft:
+        if self.urdf is None:
+            return ArmsDraft(robot)
+        return add_arms(robot, self._text, self._base, survey, self.log, self._arms_file().name, self.mass_kg)
+
+    @cached_property
+    def _text(self) -> str:
+        """The URDF's text, expanded where it is a xacro file."""
+        assert self.urdf is not None
+        if not is_xacro(self.urdf):
+            return read_urdf(self.urdf)
+        packages = {name: Path(folder) for name, folder in _pairs(self.package, "--package").items()}
+        for name, folder in packages.items():
+            if not folder.is_dir():
+                raise RobotError(f"--package {name}={folder}: there is no such folder.")
+        return expand_xacro(self.urdf, packages, _pairs(self.xacro_arg, "--xacro-arg"))
+
+    @cached_property
+    def _base(self) -> str:
+        """Link of the body frame."""
+        return self.base_link or body_link(parse_urdf(self._text, str(self.urdf)))
 
     def _given(self) -> Given:
         left, right = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (self.left, self.right))
@@ -159,10 +213,11 @@ class Init:
             self.mass_kg,
             self.wheel_separation_multiplier,
             self.urdf,
-            self.base_link,
+            "base_link" if self.urdf is None else self._base,
             None if self.like is None else load_robot(self.like),
             self.topic,
             self.controller,
+            None if self.urdf is None else self._text,
         )
 
 
@@ -213,6 +268,14 @@ def _ask_joints(console: Console, side: str, names: Sequence[str]) -> tuple[str,
             return chosen
         print_line(console, f"The log has no joint {', '.join(unknown)}.")
     raise RobotError(f"no usable answer for the {side} wheels' joints; give --left and --right.")
+
+
+def _pairs(texts: Sequence[str], option: str) -> dict[str, str]:
+    """NAME=VALUE by name. Raises `RobotError`."""
+    wrong = next((text for text in texts if "=" not in text), None)
+    if wrong is not None:
+        raise RobotError(f"{option} {wrong}: must be NAME=VALUE.")
+    return {name: value for name, _, value in (text.partition("=") for text in texts)}
 
 
 def _wants_calibration(console: Console, draft: Draft) -> bool:

@@ -16,10 +16,17 @@ from motion_models.errors import CgError, RobotError
 from motion_models.text_files import read_text
 
 
-def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None = None, static: StaticPart | None = None) -> CgModel:
+def arms_model(
+    arms: Arms,
+    folder: Path | None = None,
+    payload: Payload | None = None,
+    static: StaticPart | None = None,
+    urdf: Urdf | None = None,
+) -> CgModel:
     """The model that a robot file's ``arms`` describe. ``folder`` is where that file is; None for a robot that is shipped.
 
-    ``static`` replaces the masses that ``arms`` give to everything else; ``payload`` comes in addition to that of ``arms``.
+    ``static`` replaces the masses that ``arms`` give to everything else; ``payload`` comes in addition to that of ``arms``; ``urdf``
+    replaces the file that ``arms`` name.
 
     A name that is not in the folder may be that of a file that is shipped: robots derived from one can be kept anywhere.
 
@@ -31,7 +38,7 @@ def arms_model(arms: Arms, folder: Path | None = None, payload: Payload | None =
     >>> {name: model.cg(model.chain.posture(postures[name])).round(3).tolist() for name in sorted(postures)[:2]}
     {'back_left': [-0.03, 0.02], 'back_right': [-0.03, -0.02]}
     """
-    urdf = _urdf(arms, folder)
+    urdf = _urdf(arms, folder) if urdf is None else urdf
     if arms.payload_kg > 0.0:
         urdf = urdf.with_mass(arms.payload_link, arms.payload_kg, np.zeros(3))
     if static is None and arms.static_mass_kg > 0.0:

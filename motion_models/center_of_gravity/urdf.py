@@ -21,6 +21,7 @@ from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 from motion_models.text_files import read_text
 
+_WORLDS = ("world", "map", "odom")
 _MOVING = ("revolute", "continuous", "prismatic")
 _OPTENV = re.compile(r"\$\(optenv \S+ ([^$()]*)\)")
 _XACRO = "it is a xacro file, not a URDF; expand it first: xacro FILE.xacro > FILE.urdf"
@@ -94,16 +95,19 @@ class Urdf:
 
 def load_urdf(path: str | Path) -> Urdf:
     """The URDF of a file. Raises `RobotError`."""
-    path = Path(path)
+    return parse_urdf(read_urdf(Path(path)), source=str(path))
+
+
+def read_urdf(path: Path) -> str:
+    """Text of a URDF. Raises `RobotError`."""
     if path.suffix == ".xacro":
         raise RobotError(f"'{path}' cannot be used: {_XACRO}.")
     try:
-        text = read_text(path)
+        return read_text(path)
     except OSError as error:
         raise RobotError(f"URDF '{path}' cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
         raise RobotError(f"URDF '{path}' is not text (byte {error.start} is not UTF-8).") from error
-    return parse_urdf(text, source=str(path))
 
 
 def urdf_root(text: str, source: str) -> ET.Element:
@@ -120,7 +124,10 @@ def urdf_root(text: str, source: str) -> ET.Element:
         raise RobotError(f"{source}: the outermost element is <{root.tag}>; a URDF has <robot>.")
     if any("xacro}" in e.tag for e in root.iter()):
         raise RobotError(f"{source}: {_XACRO}.")
-    left = next((v for e in root.iter() for v in e.attrib.values() if "${" in v or "$(" in v), None)
+    # Meshes and plugins are not read: what is left of xacro in them does not matter.
+    unread = {id(e) for kind in ("mesh", "texture", "plugin", "gazebo") for top in root.iter(kind) for e in top.iter()}
+    read = (e for e in root.iter() if id(e) not in unread)
+    left = next((v for e in read for v in e.attrib.values() if "${" in v or "$(" in v), None)
     if left is not None:
         raise RobotError(f"{source}: {_XACRO} ('{left}' is in it).")
     return root
@@ -289,6 +296,20 @@ def round_shapes(text: str, source: str) -> dict[str, tuple[float, FloatArray]]:
             if radius > found.get(name, (0.0, None))[0]:
                 found[name] = radius, _origin(shape, where)[1]
     return found
+
+
+def body_link(urdf: Urdf) -> str:
+    """Link of the body frame by its name: base_link, base_footprint, or such a name behind a prefix; else the root, or what
+    a world carries.
+
+    A root is whatever link hangs on no joint, whatever its name.
+    """
+    for name in ("base_link", "base_footprint"):
+        found = [link for link in urdf.links if link == name or re.search(rf"[_/\-]{name}$", link)]
+        if name in found or len(found) == 1:
+            return name if name in found else found[0]
+    carried = [joint.child for joint in urdf.joints if joint.parent == urdf.root]
+    return carried[0] if urdf.root in _WORLDS and len(carried) == 1 else urdf.root
 
 
 def _body_link(urdf: Urdf, base_link: str) -> str:
