@@ -1,0 +1,145 @@
+"""`skidloc twin`: what a simulator gets wrong on a drive, which of its numbers, and the file that is better."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from localization.calibration.calibrate import MotionReferenceName
+from localization.calibration.wheel_wiring import open_wired
+from localization.calibration.windows import WindowConfig
+from localization.commands.common import add_row, in_radians, new_folder, plain_table, print_line, print_table, write_json
+from localization.diagnosis.drive import drive_of_log, drive_of_table
+from localization.logs import TopicOverrides
+from localization.output import check_outputs, write_text_file
+from localization.report.twin_page import percent, write_twin_page
+from localization.twin.mjcf import load
+from localization.twin.robot_mjcf import mjcf_of
+from localization.twin.twin import LAW_MODULE, Mended, TwinConfig, TwinResult, examine, provenance
+from motion_models.calibration.maneuvers import Maneuver, read_windows, table_columns, without_foreign_frames
+from motion_models.calibration.regressions import read_rotations, rotations_as_maneuvers
+from motion_models.errors import CalibrationError
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
+
+_NOT_BETTER = "Not written: that is within their scatter."
+FOLDERS = {"numbers": "numbers", "contact law": "contact_law"}
+"""Folder of each repair."""
+
+
+@dataclass(frozen=True)
+class Twin:
+    """Find what a simulator of a robot gets wrong on a drive, and mend it."""
+
+    source: tyro.conf.Positional[tuple[Path, ...]]
+    """Logs (.bag, folder, .mcap), or tables (.csv) of rotations in place (cg_x_m, cg_y_m, rotation_ratio, cor_x_m, cor_y_m) or of windows
+    of wheel motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
+    robot: str
+    """Name of a shipped robot, or path of a robot TOML file."""
+    simulator: Path | None = None
+    """The robot in MuJoCo (MJCF, .xml). Without one it is written from the robot file, with MuJoCo's default contacts."""
+    out: Path | None = None
+    """New folder for twin.json, report.html and, where it is better, the mended simulator."""
+    motion_reference: MotionReferenceName = "auto"
+    """What measured the real motion in logs: the reference if one is named, else the LiDAR, else the gyro (headings alone)."""
+    reference: str | None = None
+    """Topic or file (TUM, EuRoC, KITTI, CSV with a header, g2o) as the motion reference. Never used unless named."""
+    reference_sigma: tuple[float, float] | None = None
+    """Noise of the reference's poses [m, deg], as 0.002 0.1."""
+    window_s: float = 2.0
+    """Length of the windows that logs are cut into [s]."""
+    topic: TopicOverrides = field(default_factory=TopicOverrides)
+    config: TwinConfig = field(default_factory=TwinConfig)
+    json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Write what is printed to this file as well."""
+
+    def run(self, console: Console) -> None:
+        """Run the command, with output on ``console``."""
+        if not self.source:
+            raise CalibrationError("no log was named: skidloc twin LOG --robot ROBOT --simulator FILE.")
+        if not 0.5 <= self.window_s <= 20.0:
+            raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
+        check_outputs(self.out, self.json)
+        robot = load_robot(self.robot)
+        mjcf = mjcf_of(robot) if self.simulator is None else load(self.simulator)
+        with console.status("reading"):
+            maneuvers = [m for path in self.source for m in self._maneuvers(path, robot)]
+        with console.status("simulating"):
+            result = examine(maneuvers, robot, mjcf, self.config)
+        print_twin(console, result)
+        names = ", ".join(path.name for path in self.source)
+        if self.json is not None:
+            write_json(self.json, result.to_dict())
+        if self.out is not None:
+            with new_folder(self.out) as folder:
+                write_json(folder / "twin.json", result.to_dict())
+                write_twin_page(folder / "report.html", result, robot, names)
+                for repair in (m for m in result.repaired if m.is_better):
+                    write_repair(folder / FOLDERS[repair.name], self.out / FOLDERS[repair.name], repair, provenance(result, repair, names))
+            print_line(console, f"report: {self.out / 'report.html'}")
+            for repair in (m for m in result.repaired if m.is_better):
+                is_best = " (the better one)" if repair is result.best and len(result.repaired) > 1 else ""
+                print_line(console, f"simulator with {repair.name}{is_best}: {self.out / FOLDERS[repair.name] / repair.file.name}")
+
+    def _maneuvers(self, path: Path, robot: Robot) -> list[Maneuver]:
+        """Maneuvers of one log or table."""
+        if path.suffix.lower() != ".csv":
+            log = open_wired(path, robot, self.topic.scored_against(self.reference))
+            config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
+            return list(drive_of_log(log, self.motion_reference, self.reference, config, sigmas).maneuvers)
+        if "rotation_ratio" in table_columns(path):
+            maneuvers, kind = rotations_as_maneuvers(read_rotations(path, robot), robot), "rotations"
+        else:
+            maneuvers, kind = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)[0], "windows"
+        return list(drive_of_table(path.name, robot, maneuvers, kind).maneuvers)
+
+
+def write_repair(folder: Path, shown: Path, repair: Mended, comment: str) -> None:
+    """Write the file and those that it includes to ``folder``, which will be ``shown``, and the contact law's module beside it."""
+    folder.mkdir(exist_ok=True)
+    if repair.name == "contact law":
+        module = files("localization.twin").joinpath(LAW_MODULE).read_text(encoding="utf-8")
+        write_text_file(folder / LAW_MODULE, module)
+    for name, data in repair.file.with_folders_of(shown).with_comment(comment).files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+
+
+def print_twin(console: Console, result: TwinResult) -> None:
+    """Sentence, what is wrong, table before and after, causes, and the gate."""
+    print_line(console, result.sentence)
+    for text in result.words[1:]:
+        print_line(console, f"wrong: {text}.")
+    table = plain_table("held out", "windows", "turn", "way", "centre of rotation", "position", "heading", "wheels")
+    for name, judged in (("", result.before), *((f"{m.name}: ", m.judged) for m in result.repaired)):
+        for row in judged.rows:
+            cor = "" if math.isnan(row.cor_error[0]) else f"{1e3 * row.cor_error[0]:+.0f}, {1e3 * row.cor_error[1]:+.0f} mm"
+            add_row(
+                table,
+                name + row.kind,
+                str(row.windows),
+                percent(row.turn_error),
+                percent(row.way_error),
+                cor,
+                f"{row.position_rms_m:.3f} m" if math.isfinite(row.position_rms_m) else "",
+                f"{row.heading_rms_rad:.3f} rad",
+                percent(row.rate_error),
+            )
+    print_table(console, table)
+    print_line(console, f"wheels: {result.before.touch}")
+    for finding in result.findings:
+        print_line(console, f"cause: {finding.describe()}")
+    for repair in result.repaired:
+        gain = f"root mean square error on windows held out smaller by {repair.gain} m; {repair.judged.touch}"
+        print_line(console, f"{repair.name}: {gain}{'' if repair.is_better else '. ' + _NOT_BETTER}")
+        for meaning, attribute, old, new in repair.changes:
+            print_line(console, f"  {attribute}: {'none' if math.isnan(old) else f'{old:.4g}'} -> {new:.4g} ({meaning})")
+    for note in result.notes:
+        print_line(console, f"! {note}")

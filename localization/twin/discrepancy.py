@@ -1,0 +1,170 @@
+"""What a simulator gets wrong, by kind of motion: turns, ways and centres of rotation of its windows beside the measured ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from localization.twin.engine import Played
+from localization.twin.windows import Window
+from motion_models import se2
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_IN_PLACE, _STRAIGHT = 0.3, 0.1
+"""Speed over that of the rims' turning below which a robot turns in place, and turning over speed below which it drives straight."""
+_FEWEST = 4
+"""Windows from which a kind is split into slow and fast."""
+_SHOWN_SIGMAS = 2.0
+_SHOWN_SHARE, _SHOWN_M = 0.02, 0.005
+"""Differences below which nothing is said: how well radius and track of a robot are known."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Motion of one kind of windows in the simulator against the measured one. NaN where it was not measured, or there is none."""
+
+    kind: str
+    windows: int
+    turn_error: float
+    """Relative error of the turn."""
+    turn_sigma: float
+    """Its standard error, by the scatter from window to window."""
+    way_error: float
+    """Relative error of the distance."""
+    way_sigma: float
+    cor_error: tuple[float, float]
+    """Centre of rotation less the measured one, ahead and to the left [m]."""
+    cor_sigma: tuple[float, float]
+    position_rms_m: float
+    heading_rms_rad: float
+    rate_error: float
+    """Relative error of the wheels' rates against those that they had."""
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def compare(windows: Sequence[Window], played: Played, robot: Robot, frame: FloatArray) -> list[Row]:
+    """Rows by kind of motion, and by speed within a kind; the last is of all windows. ``frame`` (2,): the point that was measured [m]."""
+    kinds = kinds_of(windows, robot)
+    rims = np.array([np.abs(w.mean_rates).max() for w in windows]) * robot.geometry.wheel_radius_m
+    rows = []
+    for kind in ("in place", "on arcs", "straight"):
+        chosen = kinds == kind
+        if not chosen.any():
+            continue
+        rows.append(_row(kind, chosen, windows, played, robot, frame))
+        middle = float(np.median(rims[chosen]))
+        slow, fast = chosen & (rims <= middle), chosen & (rims > middle)
+        if min(slow.sum(), fast.sum()) >= _FEWEST and rims[fast].mean() > 1.3 * rims[slow].mean():
+            for name, part in (("slow", slow), ("fast", fast)):
+                rows.append(_row(f"{kind}, {name} ({rims[part].mean():.2f} m/s at the rim)", part, windows, played, robot, frame))
+    return [*rows, _row("all", np.ones(len(windows), dtype=bool), windows, played, robot, frame)]
+
+
+def kinds_of(windows: Sequence[Window], robot: Robot) -> NDArray[np.str_]:
+    """(W,) in place, on arcs, straight."""
+    rates = np.array([w.mean_rates for w in windows])
+    speed, turning = np.abs(rates.sum(axis=1)) / 2.0, np.abs(rates[:, 1] - rates[:, 0]) / 2.0
+    return np.where(speed < _IN_PLACE * turning, "in place", np.where(turning < _STRAIGHT * speed, "straight", "on arcs"))
+
+
+def turns(windows: Sequence[Window], poses: FloatArray, robot: Robot) -> FloatArray:
+    """(W,) headings of ``poses`` (W, 3) as turns that may exceed a half [rad]: those nearest to half of what the wheels' turn would be."""
+    g = robot.geometry
+    rates = np.array([w.mean_rates for w in windows])
+    duration = np.array([w.duration_s for w in windows])
+    guess = 0.5 * (rates[:, 1] - rates[:, 0]) * g.wheel_radius_m / g.track_width_m * duration
+    return np.asarray(poses[:, 2] + math.tau * np.round((guess - poses[:, 2]) / math.tau))
+
+
+def _row(kind: str, chosen: NDArray[np.bool_], windows: Sequence[Window], played: Played, robot: Robot, frame: FloatArray) -> Row:
+    used = [w for w, is_chosen in zip(windows, chosen, strict=True) if is_chosen]
+    body_T_point = np.array([*frame, 0.0])
+    moved = se2.compose(se2.compose(se2.inverse(body_T_point), played.poses[chosen]), body_T_point)
+    measured = np.array([w.measured for w in used])
+    known = np.isfinite(np.array([np.diagonal(w.cov) for w in used]))
+    turn, true_turn = turns(used, moved, robot), turns(used, measured, robot)
+    way, true_way = (np.hypot(*p[:, :2].T) for p in (moved, measured))
+    off = se2.between(measured, moved)
+    has_position = known[:, 0]
+    rates = np.array([w.mean_rates for w in used])
+    cor, cor_sigma = (math.nan, math.nan), (math.nan, math.nan)
+    if kind.startswith("in place") and has_position.any():
+        error = (centres(moved, turn) - centres(measured, true_turn))[has_position]
+        error = error[np.isfinite(error).all(axis=1)]
+        if len(error):
+            cor, spread = _pair(np.median(error, axis=0)), error.std(axis=0) * 1.25 / math.sqrt(max(len(error), 2))
+            cor_sigma = _pair(spread)
+    is_turning = kind != "straight"
+    is_going = has_position.any() and not kind.startswith("in place")
+    turn_error, turn_sigma = _relative(turn * np.sign(true_turn), np.abs(true_turn)) if is_turning else (math.nan, math.nan)
+    way_error, way_sigma = _relative(way[has_position], true_way[has_position]) if is_going else (math.nan, math.nan)
+    return Row(
+        kind,
+        len(used),
+        turn_error,
+        turn_sigma,
+        way_error,
+        way_sigma,
+        cor,
+        cor_sigma,
+        float(np.sqrt((off[has_position, :2] ** 2).sum(axis=1).mean())) if has_position.any() else math.nan,
+        float(np.sqrt((off[:, 2] ** 2).mean())),
+        float(np.abs(played.rates[chosen]).sum() / max(np.abs(rates).sum(), 1e-9) - 1.0),
+    )
+
+
+def _relative(found: FloatArray, true: FloatArray) -> tuple[float, float]:
+    """Relative error of the sum of ``found`` against that of ``true``, and its standard error."""
+    total = float(true.sum())
+    if total <= 0.0:
+        return math.nan, math.nan
+    error = float(found.sum()) / total - 1.0
+    left = found - (1.0 + error) * true
+    return error, float(math.sqrt((left**2).sum() * len(left) / max(len(left) - 1, 1)) / total)
+
+
+def centres(poses: FloatArray, turned: FloatArray) -> FloatArray:
+    """(W, 2) centres of rotation in the body frame [m]; NaN where the robot hardly turned."""
+    half = 0.5 * turned
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cot = np.where(np.abs(turned) > 0.1, np.cos(half) / np.sin(half), np.nan)
+    x, y = poses[:, 0], poses[:, 1]
+    return np.column_stack([0.5 * (x - cot * y), 0.5 * (y + cot * x)])
+
+
+def _pair(values: FloatArray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def words(rows: Sequence[Row]) -> list[str]:
+    """What is wrong, a sentence for each kind of motion; empty where nothing is beyond its scatter.
+
+    >>> row = Row("in place", 68, -0.62, 0.01, math.nan, math.nan, (0.13, 0.0), (0.01, 0.01), 0.1, 0.4, -0.13)
+    >>> words([row])
+    ['in place it turns 62 % too little; its centre of rotation is 130 mm too far ahead; its wheels turn 13 % too slowly']
+    """
+    found = []
+    for row in rows:
+        if row.kind == "all" or "," in row.kind:
+            continue
+        parts = []
+        if abs(row.turn_error) > max(_SHOWN_SHARE, _SHOWN_SIGMAS * row.turn_sigma):
+            parts.append(f"it turns {100 * abs(row.turn_error):.0f} % too {'much' if row.turn_error > 0.0 else 'little'}")
+        if abs(row.way_error) > max(_SHOWN_SHARE, _SHOWN_SIGMAS * row.way_sigma):
+            parts.append(f"it drives {100 * abs(row.way_error):.0f} % too {'far' if row.way_error > 0.0 else 'short a way'}")
+        for error, sigma, names in zip(row.cor_error, row.cor_sigma, (("ahead", "back"), ("to the left", "to the right")), strict=True):
+            if abs(error) > max(_SHOWN_M, _SHOWN_SIGMAS * sigma):
+                parts.append(f"its centre of rotation is {1e3 * abs(error):.0f} mm too far {names[0] if error > 0.0 else names[1]}")
+        if abs(row.rate_error) > _SHOWN_SHARE:
+            parts.append(f"its wheels turn {100 * abs(row.rate_error):.0f} % too {'fast' if row.rate_error > 0.0 else 'slowly'}")
+        if parts:
+            found.append(f"{row.kind} " + "; ".join(parts))
+    return found

@@ -1,0 +1,226 @@
+"""Maximum a posteriori of an engine's numbers: Gauss-Newton with steps that are damped (Levenberg 1944, Marquardt 1963).
+
+    x = argmin  sum_w |L_w^-1 r_w(x)|^2 + sum_i ((x_i - m_i) / sigma_i)^2
+
+r_w is the motion that the engine makes of a window relative to the measured one, and its wheels' rates relative to the measured ones; L_w
+the root of their covariance. Engines are not smooth where wheels hop, so that derivatives are secants over a share of the prior's sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from localization.errors import SimulationError
+from localization.twin.engine import Played
+from localization.twin.numbers import Numbers, Simulator
+from localization.twin.parameters import Hypotheses
+from localization.twin.windows import Window
+from motion_models import se2
+from motion_models.se2 import FloatArray
+
+SECANT = 0.15
+"""Length of a secant over the prior's sigma."""
+RATE_SIGMA = (0.02, 0.02)
+"""Sigma of a wheel's mean rate in a window: absolute [rad/s], the smallest step of encoders and servos, and relative, that of a servo."""
+AIRBORNE_SIGMA = 0.1
+"""Share of the time that a wheel of a robot on a floor is in the air: none, but for rough ground."""
+_MAX_STEP = 1.5
+"""Longest step of a parameter in an iteration, over its prior sigma."""
+_DAMPING, _DAMPINGS = 1e-2, 5
+_SMALL = 0.3
+"""Change over the prior's sigma that is small."""
+_STARTS = 2
+_CONVERGED = 0.2
+"""Gain of an iteration [nats] below which the search ends."""
+NOISE_BOUNDS = (0.01, 10.0)
+"""Bounds of the factor of a component's covariance that residuals show."""
+CHI_SQUARE_MEDIAN = 0.455
+"""Median of chi squared with one degree of freedom."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A simulator as it was tried."""
+
+    x: FloatArray
+    """(p,) as searched."""
+    base: Numbers
+    """Numbers of the file with switches applied."""
+    residuals: FloatArray
+    """(W, 6) motion relative to the measured one [m, m, rad], rates less the measured ones [rad/s], share of the time in the air."""
+    cost: float
+    """Negative logarithm of the posterior, without constants [nats]."""
+
+
+@dataclass
+class Problem:
+    """Windows, a simulator, and what of it may be wrong; counts the time."""
+
+    simulator: Simulator
+    hypotheses: Hypotheses
+    windows: Sequence[Window]
+    budget_steps: int
+    """Time steps after which no new iteration is begun: steps, as seconds would make the result depend on the load of the machine."""
+    noise: FloatArray = field(default_factory=lambda: np.ones(6))
+    """(6,) factors of the covariances of the components."""
+    steps: int = 0
+    """Time steps that were computed."""
+
+    def point(self, base: Numbers, x: FloatArray) -> Point | None:
+        """``x`` tried on ``base``; None where the robot does not stand or drive with it."""
+        numbers = self.hypotheses.applied(base, x)
+        try:
+            engine = self.simulator.compiled(numbers)
+            played = engine.play(self.windows)
+        except SimulationError:
+            return None
+        self.steps += played.steps
+        return self.scored(base, x, residuals_of(self.windows, played, self.frame(x)))
+
+    def frame(self, x: FloatArray) -> FloatArray:
+        """(2,) point of the body whose motion was measured [m]."""
+        return np.array([x[i] for i, p in enumerate(self.hypotheses.parameters) if p.area == "reference"])
+
+    def scored(self, base: Numbers, x: FloatArray, residuals: FloatArray) -> Point:
+        """A `Point` of these residuals under the present noise."""
+        z = (x - self.hypotheses.priors) / self.hypotheses.sigmas
+        return Point(x, base, residuals, 0.5 * float((self.whitened(residuals) ** 2).sum() + (z**2).sum()))
+
+    def whitened(self, residuals: FloatArray) -> FloatArray:
+        """Residuals (..., W, 6) over their sigmas; 0 where nothing was measured."""
+        return np.asarray(residuals / self.sigmas())
+
+    def sigmas(self) -> FloatArray:
+        """(W, 6) of the components; inf for what was not measured."""
+        return sigmas_of(self.windows) * np.sqrt(self.noise)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the budget is spent."""
+        return self.steps > self.budget_steps
+
+    def jacobian(self, at: Point, columns: Sequence[int]) -> FloatArray:
+        """(W, 6, c) secants of the whitened residuals; NaN-free: 0 where the robot does not stand."""
+        J = np.zeros((*at.residuals.shape, len(columns)))
+        low, high = self.hypotheses.bounds(at.base)
+        for c, i in enumerate(columns):
+            step = SECANT * self.hypotheses.sigmas[i]
+            step = -step if at.x[i] + step > high[i] else step
+            x = at.x.copy()
+            x[i] += step
+            if self.hypotheses.parameters[i].area == "reference":
+                other = residuals_moved(self.windows, at.residuals, self.frame(at.x), self.frame(x))
+            else:
+                found = self.point(at.base, x) if x[i] >= low[i] else None
+                if found is None:
+                    continue
+                other = found.residuals
+            J[..., c] = self.whitened(other - at.residuals) / step
+        return J
+
+    def minimize(self, at: Point, columns: Sequence[int], iterations: int) -> Point:
+        """Gauss-Newton from ``at`` in the parameters ``columns``."""
+        damping = _DAMPING
+        low, high = self.hypotheses.bounds(at.base)
+        sigmas, priors = self.hypotheses.sigmas[list(columns)], self.hypotheses.priors[list(columns)]
+        for _ in range(iterations):
+            if self.is_late:
+                break
+            J = self.jacobian(at, columns).reshape(-1, len(columns)) * sigmas
+            r = self.whitened(at.residuals).ravel()
+            z = (at.x[list(columns)] - priors) / sigmas
+            A, b = J.T @ J + np.eye(len(columns)), J.T @ r + z
+            better = None
+            for _ in range(_DAMPINGS):
+                step = -np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
+                step *= min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-12))
+                x = at.x.copy()
+                x[list(columns)] = np.clip(x[list(columns)] + step * sigmas, low[list(columns)], high[list(columns)])
+                tried = self.point(at.base, x)
+                if tried is not None and tried.cost < at.cost:
+                    better, damping = tried, damping * 0.2
+                    break
+                damping *= 8.0
+            if better is None:
+                break
+            gained = at.cost - better.cost
+            at = better
+            if gained < _CONVERGED:
+                break
+        return at
+
+    def estimate_noise(self, at: Point) -> Point:
+        """Scale the components' covariances to the scatter of the residuals ``at`` a point, and return it under them."""
+        squares = (at.residuals / sigmas_of(self.windows)) ** 2
+        known = np.isfinite(sigmas_of(self.windows))
+        factors = [float(np.median(squares[known[:, c], c])) / CHI_SQUARE_MEDIAN if known[:, c].any() else 1.0 for c in range(5)]
+        self.noise = np.append(np.clip(factors, *NOISE_BOUNDS), 1.0)
+        return self.scored(at.base, at.x, at.residuals)
+
+
+def residuals_of(windows: Sequence[Window], played: Played, frame: FloatArray) -> FloatArray:
+    """(W, 6) motion of the point ``frame`` (2,) of the body relative to the measured one, rates less the measured ones, and air."""
+    measured = np.array([w.measured for w in windows])
+    body_T_point = np.array([*frame, 0.0])
+    moved = se2.compose(se2.compose(se2.inverse(body_T_point), played.poses), body_T_point)
+    return np.column_stack([se2.between(measured, moved), played.rates - np.array([w.mean_rates for w in windows]), played.touch.airborne])
+
+
+def residuals_moved(windows: Sequence[Window], residuals: FloatArray, old: FloatArray, new: FloatArray) -> FloatArray:
+    """``residuals`` (W, 6) by the point ``old`` as they are by the point ``new`` of the body."""
+    measured = np.array([w.measured for w in windows])
+    moved = se2.compose(measured, residuals[:, :3])
+    old_T_new = np.array([*(new - old), 0.0])
+    moved = se2.compose(se2.compose(se2.inverse(old_T_new), moved), old_T_new)
+    return np.column_stack([se2.between(measured, moved), residuals[:, 3:]])
+
+
+def sigmas_of(windows: Sequence[Window]) -> FloatArray:
+    """(W, 6) sigmas of the residuals' components before the drive's own scatter is known."""
+    poses = np.sqrt(np.array([np.diagonal(w.cov) for w in windows]))
+    rates = np.array([w.mean_rates for w in windows])
+    largest = np.abs(rates).max(axis=1, keepdims=True)
+    of_rates = np.broadcast_to(RATE_SIGMA[0] + RATE_SIGMA[1] * largest, rates.shape)
+    return np.column_stack([poses, of_rates, np.full(len(windows), AIRBORNE_SIGMA)])
+
+
+def start(problem: Problem) -> Point:
+    """The file as it is. Raises `SimulationError`."""
+    numbers = problem.simulator.numbers
+    x = np.zeros(len(problem.hypotheses.parameters))
+    played = problem.simulator.engine.play(problem.windows)
+    problem.steps += played.steps
+    return problem.scored(numbers, x, residuals_of(problem.windows, played, problem.frame(x)))
+
+
+def fit_all(problem: Problem, iterations: int = 12) -> Point:
+    """All numbers together, from the file as it is and with each of its switches; then again under the noise that is left."""
+    columns = list(range(len(problem.hypotheses.parameters)))
+    first = start(problem)
+    switched = [replace(first.base, **{s.field: s.value}) for s in problem.hypotheses.switches]
+    starts = [first, *(p for base in switched if (p := problem.point(base, first.x)) is not None)]
+    for base in (first.base, *switched):
+        at = problem.point(base, problem.hypotheses.grounded(base))
+        starts += [] if at is None else [at]
+    tried = [problem.minimize(s, columns, 2) for s in sorted(starts, key=lambda point: point.cost)[:_STARTS]]
+    best = min(tried, key=lambda point: point.cost)
+    best = problem.minimize(best, columns, iterations)
+    best = problem.estimate_noise(best)
+    return problem.minimize(best, columns, iterations)
+
+
+def fit_law(problem: Problem, base: Numbers, iterations: int = 4) -> Point | None:
+    """The few numbers of a simulator with the contact law, from ``base``; None where the robot does not stand with it."""
+    first = problem.point(base, np.zeros(len(problem.hypotheses.parameters)))
+    return None if first is None else problem.minimize(first, list(range(len(first.x))), iterations)
+
+
+def pruned(problem: Problem, at: Point) -> Point:
+    """``at`` without the changes that are small against their priors, where all of them together bring less than half a nat each."""
+    small = (at.x != 0.0) & (np.abs(at.x) < _SMALL * problem.hypotheses.sigmas)
+    small &= np.array([p.area != "reference" for p in problem.hypotheses.parameters])
+    without = problem.point(at.base, np.where(small, 0.0, at.x)) if small.any() else None
+    return at if without is None or without.cost > at.cost + 0.5 * small.sum() else without

@@ -1,0 +1,244 @@
+"""The twin of a drive: the user's simulator is compared with it, its wrong numbers are found on one half and judged on the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from localization.twin import fit
+from localization.twin.discrepancy import Row, compare, words
+from localization.twin.engine import Played
+from localization.twin.mjcf import Mjcf
+from localization.twin.naming import Finding, changed_numbers, name_causes
+from localization.twin.numbers import Numbers, Simulator, read_simulator
+from localization.twin.parameters import SLIP, hypotheses_of, law_hypotheses
+from localization.twin.windows import Window, halves, spread, windows_of
+from motion_models.calibration.cross_validation import Interval, root_mean_gain
+from motion_models.calibration.maneuvers import IntArray, Maneuver
+from motion_models.friction.model import FrictionModel
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+LAW_MODULE = "skidloc_contact.py"
+"""Module that is written beside a file with the contact law."""
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """Settings of the search."""
+
+    windows: int = 10
+    """Windows that numbers are fitted to, those that differ most among one half of the drive."""
+    budget_steps: int = 6_000_000
+    """Time steps of the engine that the search may take: 3 to 4 minutes on two cores."""
+    held_windows: int = 150
+    """Windows of the other half on which the simulator is judged, those that differ most."""
+    threads: int = 2
+    """Threads of the engine. The result does not depend on them."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A simulator on the windows that are held out."""
+
+    rows: tuple[Row, ...]
+    touch: str
+    """How its wheels stand on the ground."""
+    errors: FloatArray
+    """(W,) squared error of each window, headings times half the track width [m^2]."""
+    played: Played
+    frame: FloatArray
+    """(2,) point of the body whose motion was measured, as estimated with it [m]."""
+
+
+@dataclass(frozen=True)
+class Mended:
+    """The simulator with the numbers that explain the motion."""
+
+    name: str
+    """numbers, or contact law."""
+    numbers: Numbers
+    file: Mjcf
+    changes: tuple[tuple[str, str, float, float], ...]
+    """Of each number: meaning, attribute, the file's value, and its own."""
+    judged: Judged
+    gain: Interval
+    """Root mean square error of the file less that of this one, on the windows held out [m]."""
+
+    @property
+    def is_better(self) -> bool:
+        """The gate: better on windows that it was not fitted to, beyond their scatter."""
+        return self.gain.low > 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "name": self.name,
+            "rows": [row.to_dict() for row in self.judged.rows],
+            "touch": self.judged.touch,
+            "frame_m": self.judged.frame.tolist(),
+            "changes": [{"meaning": a, "attribute": b, "file": c, "value": d} for a, b, c, d in self.changes],
+            "gain_m": [self.gain.value, self.gain.low, self.gain.high],
+            "is_better": self.is_better,
+        }
+
+
+@dataclass(frozen=True)
+class TwinResult:
+    """What `examine` finds."""
+
+    simulator: Simulator
+    windows: tuple[Window, ...]
+    """Those that are held out."""
+    fitted: int
+    """Number of windows that numbers were fitted to."""
+    before: Judged
+    findings: tuple[Finding, ...]
+    mended: Mended
+    """With other numbers of the engine."""
+    extended: Mended | None
+    """With the friction model's contact law; None where the robot does not stand with it."""
+    notes: tuple[str, ...]
+    steps: int
+    """Time steps that the search took."""
+    words: tuple[str, ...] = field(default=())
+
+    @property
+    def repaired(self) -> tuple[Mended, ...]:
+        """Both repairs, or one."""
+        return (self.mended,) if self.extended is None else (self.mended, self.extended)
+
+    @property
+    def best(self) -> Mended:
+        """The repair with the smallest errors on the windows held out."""
+        return max(self.repaired, key=lambda m: m.gain.value)
+
+    @property
+    def sentence(self) -> str:
+        """The result in one sentence."""
+        best = self.best
+        row, after = self.before.rows[-1], best.judged.rows[-1]
+        if not self.words:
+            return "The simulator moves as the robot did, within the scatter of these windows."
+        first = f"The simulator is wrong: {self.words[0]}."
+        if not best.is_better:
+            return f"{first} Neither numbers of its engine nor the contact law make it better on windows held out."
+        means = "other numbers" if best.name == "numbers" else "the contact law"
+        return (
+            f"{first} With {means}, errors on windows held out fall from {row.position_rms_m:.3f} m and"
+            f" {row.heading_rms_rad:.3f} rad to {after.position_rms_m:.3f} m and {after.heading_rms_rad:.3f} rad."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "sentence": self.sentence,
+            "wrong": list(self.words),
+            "windows": {"fitted": self.fitted, "held_out": len(self.windows)},
+            "findings": [{**f.best.__dict__, "rivals": [r.__dict__ for r in f.rivals]} for f in self.findings],
+            "before": {"rows": [r.to_dict() for r in self.before.rows], "touch": self.before.touch},
+            "repairs": [m.to_dict() for m in self.repaired],
+            "notes": list(self.notes),
+        }
+
+
+def examine(maneuvers: Sequence[Maneuver], robot: Robot, mjcf: Mjcf, config: TwinConfig | None = None) -> TwinResult:
+    """Compare the simulator ``mjcf`` of ``robot`` with measured ``maneuvers``, find its wrong numbers and judge them on the other half.
+
+    Raises `SimulationError` for a file without a robot on wheels, `CalibrationError` for a drive that shows nothing.
+    """
+    config = config or TwinConfig()
+    windows = windows_of(maneuvers, robot)
+    simulator = read_simulator(mjcf, robot, config.threads)
+    first, second = halves(windows)
+    fitted = [windows[i] for i in first[spread([windows[i] for i in first], robot, config.windows)]]
+    held = [windows[i] for i in second[spread([windows[i] for i in second], robot, config.held_windows)]]
+    hypotheses = hypotheses_of(simulator, robot)
+    problem = fit.Problem(simulator, hypotheses, fitted, config.budget_steps)
+    whole = fit.fit_all(problem)
+    start = fit.start(problem)
+    findings, sparse = name_causes(problem, start, whole.cost)
+    best = whole if whole.cost < sparse.cost - _occam(problem, whole, sparse) else sparse
+    before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
+    mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)
+    extended = extend(problem, held, robot, before)
+    notes = (*simulator.engine.robot.notes, *simulator.missing)
+    return TwinResult(
+        simulator, tuple(held), len(fitted), before, tuple(findings), mended, extended, notes, problem.steps, tuple(words(before.rows))
+    )
+
+
+def _frame_alone(problem: fit.Problem, start: fit.Point) -> FloatArray:
+    """The point that was measured, by the file's own numbers: errors of the reference's frame are no errors of the simulator."""
+    columns = [i for i, p in enumerate(problem.hypotheses.parameters) if p.area == "reference"]
+    return problem.frame(problem.minimize(start, columns, 3).x)
+
+
+def _occam(problem: fit.Problem, whole: fit.Point, sparse: fit.Point) -> float:
+    """What the numbers that only the ``whole`` fit changes gain by chance [nats]: half the logarithm of the shrinking of each prior."""
+    columns = [i for i in range(len(whole.x)) if whole.x[i] != 0.0 and sparse.x[i] == 0.0]
+    if not columns:
+        return 0.0
+    J = problem.jacobian(whole, columns).reshape(-1, len(columns)) * problem.hypotheses.sigmas[columns]
+    return 0.5 * float(np.linalg.slogdet(np.eye(len(columns)) + J.T @ J)[1])
+
+
+def judge(simulator: Simulator, numbers: Numbers, windows: Sequence[Window], robot: Robot, frame: FloatArray) -> Judged:
+    """The simulator with ``numbers`` on ``windows``."""
+    engine = simulator.engine if numbers == simulator.numbers else simulator.compiled(numbers)
+    played = engine.play(windows)
+    return judged(played, windows, robot, frame)
+
+
+def judged(played: Played, windows: Sequence[Window], robot: Robot, frame: FloatArray) -> Judged:
+    """What an engine played of ``windows``, compared with the measured motion."""
+    off = fit.residuals_of(windows, played, frame)[:, :3] * np.array([1.0, 1.0, 0.5 * robot.geometry.track_width_m])
+    errors = np.where(np.isfinite(np.array([np.diagonal(w.cov) for w in windows])), off, 0.0)
+    rows = compare(windows, played, robot, frame)
+    return Judged(tuple(rows), played.touch.describe(), np.asarray((errors**2).sum(axis=1)), played, frame)
+
+
+def extend(problem: fit.Problem, windows: Sequence[Window], robot: Robot, before: Judged) -> Mended | None:
+    """The simulator with the contact law in place of its friction, with the stiffness of the robot's friction model, judged as `mend`."""
+    model = FrictionModel.from_robot(robot)
+    mu, stiffness = (float(model.nominal[model.param_names.index(name)]) for name in ("mu", "slip_stiffness"))
+    of_law = fit.Problem(problem.simulator, law_hypotheses(problem.hypotheses), problem.windows, problem.budget_steps)
+    of_law.noise = problem.noise
+    at = fit.fit_law(of_law, replace(problem.simulator.numbers, mu=mu, slip_stiffness=stiffness))
+    problem.steps += of_law.steps
+    return None if at is None else mend("contact law", of_law, fit.pruned(of_law, at), windows, robot, before)
+
+
+def mend(name: str, problem: fit.Problem, at: fit.Point, windows: Sequence[Window], robot: Robot, before: Judged) -> Mended:
+    """The simulator ``at`` a point, judged on ``windows`` against ``before``."""
+    simulator = problem.simulator
+    numbers = problem.hypotheses.applied(at.base, at.x)
+    after = judge(simulator, numbers, windows, robot, problem.frame(at.x))
+    changes = [(p.meaning, p.attribute, old, new) for p, old, new in changed_numbers(problem, at) if p.area != "reference" and p != SLIP]
+    if not math.isnan(numbers.slip_stiffness):
+        changes += [(SLIP.meaning, SLIP.attribute, math.nan, numbers.slip_stiffness)]
+    for switch in problem.hypotheses.switches:
+        old, new = (float(getattr(n, switch.field)) for n in (simulator.numbers, numbers))
+        changes += [] if old == new else [(switch.meaning, switch.attribute, old, new)]
+    gain = root_mean_gain(before.errors, after.errors, _blocks(windows), np.random.default_rng(0))
+    return Mended(name, numbers, simulator.with_numbers(numbers), tuple(changes), after, gain)
+
+
+def _blocks(windows: Sequence[Window]) -> IntArray:
+    """(W,) index of the group of each window, whose errors are alike."""
+    names = {name: i for i, name in enumerate(dict.fromkeys(w.group for w in windows))}
+    return np.array([names[w.group] for w in windows], dtype=np.int64)
+
+
+def provenance(result: TwinResult, m: Mended, source: str) -> str:
+    """Comment of a written file: where its numbers are from, and how well they do."""
+    lines = [f"Numbers found by skidloc twin on {source}: {result.fitted} windows fitted, {len(result.windows)} held out."]
+    lines += [f"{attribute}: {old:.4g} -> {new:.4g} ({meaning})" for meaning, attribute, old, new in m.changes]
+    if m.name == "contact law":
+        lines.append(f"The wheels' friction is that of {LAW_MODULE} beside this file: without it they have none.")
+    lines.append(f"Held out: root mean square error smaller by {m.gain} m; {m.judged.touch}.")
+    return "\n     ".join(lines)
