@@ -35,7 +35,7 @@ FOLDERS = {"numbers": "numbers", "contact law": "contact_law"}
 
 @dataclass(frozen=True)
 class Twin:
-    """Find what a simulator of a robot gets wrong on a drive, and mend it."""
+    """Find what a simulator of the robot (MuJoCo) gets wrong on a log, and mend it."""
 
     source: tyro.conf.Positional[tuple[Path, ...]]
     """Logs (.bag, folder, .mcap), or tables (.csv) of rotations in place (cg_x_m, cg_y_m, rotation_ratio, cor_x_m, cor_y_m) or of windows

@@ -29,6 +29,7 @@ class Touch:
     def describe(self) -> str:
         """One sentence.
 
+        >>> import numpy as np
         >>> Touch(np.zeros(1), np.array([0.0, 0.0, 0.1, 0.5, 0.4]), 0.8).describe()
         'all four wheels touch in 40 % of the time steps; their loads scatter by 80 %'
         """

@@ -80,7 +80,7 @@ class Mjcf:
         return next((e for e in self.elements(tag) if e.attributes.get("name") == name), None)
 
     def changed(self, changes: Sequence[Change]) -> Mjcf:
-        """The same files with ``changes``; all other bytes are the same."""
+        """These files with ``changes``; all other bytes are the same."""
         merged: dict[tuple[Element, str], dict[str, str | None]] = {}
         for change in (c for c in changes if not c.text):
             merged.setdefault((change.element, change.new_tag), {}).update(change.attributes)
@@ -113,14 +113,14 @@ class Mjcf:
         return element.start, element.end, tag
 
     def with_comment(self, comment: str) -> Mjcf:
-        """The same with ``comment`` before the end of its first line, or first element."""
+        """These files with ``comment`` before the end of its first line, or first element."""
         text = f"\n<!-- {comment.replace('--', '- -')} -->\n".encode()
         at = self.root.start
         data = self.files[self.name]
         return parse({**self.files, self.name: data[:at] + text.lstrip() + data[at:]}, self.path)
 
     def with_folders_of(self, folder: Path) -> Mjcf:
-        """The same for a file in another ``folder``: paths of meshes and textures start there."""
+        """These files for one in another ``folder``: paths of meshes and textures start there."""
         if not any("file" in e.attributes for e in self.elements("mesh", "texture", "hfield", "skin", "flexcomp")):
             return self
         compiler = next(iter(self.root.own("compiler")), None)

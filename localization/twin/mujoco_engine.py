@@ -382,7 +382,7 @@ class MujocoEngine:
         return np.asarray(data.xmat[base].reshape(3, 3).T @ (data.subtree_com[base] - data.xpos[base]))
 
     def center_of_mass(self) -> tuple[float, float, float]:
-        """Of the whole robot: ahead and left of the middle of the wheels, and above their lowest points [m]."""
+        """Centre of mass of the whole robot: ahead and left of the middle of the wheels, above their lowest points [m]."""
         mujoco.mj_kinematics(self.robot.model, self._data)
         mujoco.mj_comPos(self.robot.model, self._data)
         w, position = self.robot.wheels, self.center_of_mass_in_base()
@@ -409,7 +409,7 @@ class MujocoEngine:
         return max((int(p) for g, p in enumerate(self.robot.model.geom_priority) if g not in wheels), default=0)
 
     def radius(self, geom: int) -> float:
-        """Of a wheel's geom [m]."""
+        """Radius of a wheel's geom [m]."""
         return _radius(self.robot.model, geom)
 
     def geom_kind(self, geom: int) -> str:

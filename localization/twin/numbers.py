@@ -56,7 +56,7 @@ class Numbers:
     rotor_inertia: float
     """Inertia of a wheel about its axle with its motor's armature, mean over the wheels [kg m^2]."""
     mass_kg: float
-    """Of the whole robot."""
+    """Mass of the whole robot."""
     cg_x_m: float
     """Ahead of the middle of the wheels [m]."""
     cg_y_m: float
@@ -69,12 +69,12 @@ class Numbers:
     slip_stiffness: float = math.nan
     """K of the contact law that takes the place of the engine's friction [-]; NaN where friction is the engine's own."""
     inertia_scale: float = 1.0
-    """Of the body's moments of inertia."""
+    """Factor of the body's moments of inertia."""
     radius_scale: float = 1.0
     radius_difference: float = 0.0
     """Radius of the left wheels over that of the right ones, less 1."""
     width_scale: float = 1.0
-    """Of cylinders."""
+    """Factor of the width of cylinders."""
     track_scale: float = 1.0
     wheelbase_scale: float = 1.0
 
@@ -99,11 +99,6 @@ class Simulator:
     base: Element
     missing: tuple[str, ...] = ()
     """What of it no attribute of the file changes, and why."""
-
-    @property
-    def engine_name(self) -> str:
-        """Of the engine, for messages."""
-        return "MuJoCo"
 
     def with_numbers(self, numbers: Numbers) -> Mjcf:
         """The file with these ``numbers``; all bytes that do not hold one of them are the same."""

@@ -64,7 +64,7 @@ class Mended:
     numbers: Numbers
     file: Mjcf
     changes: tuple[tuple[str, str, float, float], ...]
-    """Of each number: meaning, attribute, the file's value, and its own."""
+    """What changed of each number: meaning, attribute, the file's value, and its own."""
     judged: Judged
     gain: Interval
     """Root mean square error of the file less that of this one, on the windows held out [m]."""
