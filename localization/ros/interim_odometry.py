@@ -1,48 +1,71 @@
-"""Odometry by wheels alone while the estimator compiles: a robot that is driven at once has its transforms after seconds, not a minute."""
+"""Odometry by wheels alone while no estimator gives any: it compiles, takes up the messages that have waited, or begins anew."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 from localization.estimators import Estimate
-from localization.events import CgSample, WheelSample
+from localization.events import CgSample, Event, WheelSample
 from localization.ros.discovery import MAX_BACKLOG
 from localization.ros.live_stream import LiveStream
 from localization.ros.predictor import Predictor
 from localization.ros.transports.transport import Received
 from localization.wheel_buffer import WheelBuffer
-from motion_models.se2 import FloatArray
 
 
 class InterimOdometry:
-    """`add` each message. `messages` holds them all for the estimator, which begins with the first of them.
+    """`insert` each event. The pose begins at the predictor's last estimate, or at the origin of `odom`, as an estimator's does."""
 
-    The pose starts at the origin of `odom`, as the estimator's does. A gap of the wheels ends it.
-    """
+    def __init__(self, predictor: Predictor, wheels: WheelBuffer) -> None:
+        """``predictor`` and ``wheels`` are its own: the pipeline has others."""
+        self._predictor, self._wheels = predictor, wheels
 
-    def __init__(self, stream: LiveStream, predictor: Predictor, cg: FloatArray, is_over: Callable[[], bool]) -> None:
-        """``stream`` and ``predictor`` are its own: those of the node begin when the estimator does, which is when ``is_over``. ``cg``: the
-        robot's centre of gravity (2,), while none comes [m]."""
-        self._stream, self._predictor, self.is_over = stream, predictor, is_over
-        self._wheels = WheelBuffer(cg)
-        self._has_begun = False
-        self.messages: deque[Received] = deque(maxlen=MAX_BACKLOG)
+    @property
+    def newest(self) -> Estimate | None:
+        """The pose at the newest wheel sample; None before the first."""
+        return self._predictor.predict(self._wheels) or self._predictor.last
 
-    def add(self, received: Received) -> tuple[Estimate, int] | None:
-        """Keep a message. Returns the pose at the newest wheel sample and its stamp in the sender's clock [ns], where one is due."""
-        self.messages.append(received)
-        newest = None
-        for event in self._stream.events(received):
-            if isinstance(event, CgSample):
-                self._wheels.set_cg(event)
-            if not isinstance(event, WheelSample):
-                continue
-            self._wheels.insert(event)
-            if not self._has_begun:
-                self._has_begun = True
-                self._predictor.begin(event.stamp_ns)
-            elif self._predictor.is_due(event.stamp_ns) and (estimate := self._predictor.predict(self._wheels)) is not None:
-                self._predictor.reset(estimate, None, 0.0)
-                newest = estimate, self._stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False)
-        return newest
+    def restart(self, start: Estimate) -> None:
+        """Go on from ``start``."""
+        self._predictor.advance(start)
+
+    def insert(self, event: Event) -> Estimate | None:
+        """Take the next event. Returns the pose at the newest wheel sample, where one is due."""
+        if isinstance(event, CgSample):
+            self._wheels.set_cg(event)
+        if not isinstance(event, WheelSample):
+            return None
+        if self._wheels.newest_ns is None:
+            self._predictor.begin(event.stamp_ns)
+        self._wheels.insert(event)
+        if not self._predictor.is_due(event.stamp_ns):
+            return None
+        estimate = self._predictor.predict(self._wheels)
+        if estimate is not None:
+            self._predictor.advance(estimate)
+        return estimate
+
+
+@dataclass
+class WaitingMessages:
+    """Messages for an estimator that is not ready, or has not taken them up yet. Interim odometry reads them by ``stream`` as they come."""
+
+    stream: LiveStream
+    is_ready: Callable[[], bool]
+    queue: deque[Received]
+    past: int = 0
+    """So many of the queue were processed before, by another reading of the sensors: their estimates are not published again."""
+
+    @classmethod
+    def of(cls, stream: LiveStream, past: Iterable[Received] = (), is_ready: Callable[[], bool] = lambda: True) -> WaitingMessages:
+        """``past`` messages first."""
+        queue = deque(past, maxlen=MAX_BACKLOG)
+        return cls(stream, is_ready, queue, len(queue))
+
+    def take(self) -> tuple[Received, bool]:
+        """The next message, and whether it is a past one."""
+        is_past = self.past > 0
+        self.past -= is_past
+        return self.queue.popleft(), is_past

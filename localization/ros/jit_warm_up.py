@@ -74,7 +74,7 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
     if run.robot.arms is not None:
         model = arms_model(run.robot.arms, run.robot.folder)
         model.estimate(np.zeros_like(model.chain.lower))
-    predictor = Predictor(trial.model, run.robot, run.config.step.max_hold_s)
+    predictor = Predictor(trial.model, run.robot, run.config.step)
     _predict_alone(predictor, WheelBuffer(run.robot.center_of_gravity))
     for event in synthetic_drive(is_planar):
         for estimate in pipeline.process(event):
@@ -96,7 +96,6 @@ def _predict_alone(predictor: Predictor, wheels: WheelBuffer) -> None:
             predictor.predict(wheels)
         else:
             predictor.begin(event.stamp_ns)
-    predictor.stop()
 
 
 def synthetic_drive(is_planar: bool) -> Iterator[Event]:

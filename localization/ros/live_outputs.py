@@ -8,14 +8,18 @@ import numpy as np
 from localization.estimators import Estimate, GraphFusion
 from localization.events import Event, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
+from localization.ros.continuous_odometry import ContinuousOdometry
 from localization.ros.gnss import utm_pose
+from localization.ros.interim_odometry import InterimOdometry
 from localization.ros.live_inputs import LiveInputs
+from localization.ros.live_stream import LiveStream
 from localization.ros.predictor import Predictor
 from localization.ros.publisher import EstimatePublisher
 from localization.ros.session import Session
 from localization.ros.settings import LiveRun
+from localization.ros.start_pose import StartPose
+from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
-from motion_models.robot import Robot
 
 
 class LiveOutputs:
@@ -23,9 +27,17 @@ class LiveOutputs:
 
     def __init__(self, publisher: EstimatePublisher, inputs: LiveInputs, trial: Trial, run: LiveRun) -> None:
         self.publisher, self._inputs, self._trial, self._run = publisher, inputs, trial, run
-        self.predictor = make_predictor(trial, run, inputs.robot) if run.node.predict else None
+        self._predictor = self._make_predictor() if run.node.predict else None
         """None where predictions are not wanted."""
+        self._interim: InterimOdometry | None = None
+        """None where an estimator gives estimates."""
+        self.continuous = ContinuousOdometry()
+        """What is published in order of stamps."""
         self._next_path = self._next_map = -float("inf")
+
+    def _make_predictor(self) -> Predictor:
+        """One without an estimate yet, for the robot as its messages are read now."""
+        return Predictor(self._trial.model, self._inputs.robot, self._run.config.step, self._run.node.predict_hz)
 
     def advertise(self, *, has_map_frame: bool) -> None:
         """Open the topics that not every node fills."""
@@ -37,42 +49,86 @@ class LiveOutputs:
             has_map=bool(config.map_period_s) and self._inputs.has_lidar,
         )
 
-    def restart(self) -> None:
-        """The robot was set to another place: begin a new path, and predict nothing until the next estimate."""
+    def begin_interim(self, wheels: WheelBuffer, start: Estimate | None = None) -> None:
+        """Until another estimator gives estimates, odometry is by ``wheels`` alone: from ``start`` on, or from the present pose."""
+        if self._predictor is None:
+            return
+        if self._interim is None:
+            self._interim = InterimOdometry(self._predictor, wheels)
+        if start is not None:
+            self._interim.restart(start)
+        self._predictor = self._make_predictor()
+
+    def end_interim(self, pipeline: Pipeline) -> None:
+        """The estimator of ``pipeline`` has taken up all messages: what is published continues by its estimates, if there are any yet."""
+        if self._interim is None or self._predictor is None or (after := self._predictor.last) is None:
+            return
+        before, self._interim = self._interim.newest, None
+        if before is not None:
+            self.continuous.correct(before, self._newest(pipeline) or after)
+
+    def restart(self, start: StartPose, pipeline: Pipeline, *, is_moved: bool) -> None:
+        """An estimator begins at ``start`` instead of that of ``pipeline``; ``is_moved``: `odom` jumps to there."""
         self.publisher.restart()
-        self.stop_predictions()
+        if is_moved:
+            self.continuous.forget()
+        if (present := self._newest(pipeline) or self.continuous.last) is not None:
+            in_odom = Estimate(present.stamp_ns, start.odom_T_start, start.odom_cov, present.twist, present.twist_covariance)
+            self.begin_interim(pipeline.synchronizer.wheels.buffer, in_odom)
 
-    def stop_predictions(self) -> None:
-        """Predict nothing until the next estimate."""
-        if self.predictor is not None:
-            self.predictor.stop()
+    def present(self, pipeline: Pipeline, estimate: Estimate) -> Estimate:
+        """``estimate``, the last one, moved to the newest wheel sample."""
+        return self._newest(pipeline) or estimate
 
-    def renew_predictor(self) -> None:
-        """Predict nothing until the next estimate, and from there on by the robot as its messages are read now."""
-        if self.predictor is not None:
-            self.predictor = make_predictor(self._trial, self._run, self._inputs.robot)
+    def _newest(self, pipeline: Pipeline) -> Estimate | None:
+        """By the last estimate, the pose at the newest wheel sample."""
+        if self._interim is not None:
+            return self._interim.newest
+        synchronizer = pipeline.synchronizer
+        return None if self._predictor is None else self._predictor.predict(synchronizer.wheels.buffer, synchronizer.turn)
+
+    def reckon(self, event: Event, stream: LiveStream) -> None:
+        """Publish interim odometry, where ``event`` of ``stream`` makes it due and no estimator gives any."""
+        if self._interim is not None and (estimate := self._interim.insert(event)) is not None:
+            self._publish_in_order(estimate, stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False))
 
     def is_prediction_due(self, event: Event) -> bool:
         """Whether ``event`` makes a prediction possible that is due and received by somebody."""
-        if self.predictor is None or not isinstance(event, WheelSample):
+        if self._predictor is None or self._interim is not None or not isinstance(event, WheelSample):
             return False
-        return self.publisher.are_predictions_read and self.predictor.is_due(event.stamp_ns)
+        return self.publisher.are_predictions_read and self._predictor.is_due(event.stamp_ns)
 
-    def publish_estimate(self, event: Event, estimate: Estimate, pipeline: Pipeline) -> None:
-        """Publish ``estimate``, which ``event`` has completed; predictions go on from it."""
+    def publish_estimate(self, event: Event, estimate: Estimate, pipeline: Pipeline, *, is_current: bool) -> None:
+        """Publish ``estimate``, which ``event`` has completed; predictions go on from it, if it ``is_current``: no messages wait."""
         by_lidar = estimate.nis is not None or isinstance(event, Scan)
-        self.publisher.publish_estimate(estimate, self._inputs.stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar))
-        if self.predictor is not None:
-            estimator = pipeline.estimator
-            self.predictor.reset(estimate, estimator.params, estimator.clock_offset_s, estimator.gyro_calibration)
+        stamp_ns = self._inputs.stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar)
+        self.publisher.publish_estimate(estimate, stamp_ns)
+        self.go_on_from(estimate, pipeline, is_current=is_current)
+        if self._interim is None:
+            self._publish_in_order(estimate, stamp_ns)
+
+    def go_on_from(self, estimate: Estimate, pipeline: Pipeline, *, is_current: bool) -> None:
+        """Predict from ``estimate`` on; what is published continues there, if it ``is_current``."""
+        if self._predictor is None:
+            return
+        before = self._newest(pipeline) if is_current and self._interim is None and self.publisher.are_predictions_read else None
+        estimator = pipeline.estimator
+        self._predictor.reset(estimate, estimator.params, estimator.clock_offset_s, estimator.gyro_calibration)
+        if before is not None:
+            self.continuous.correct(before, self._newest(pipeline) or estimate)
+        if is_current:
+            self.end_interim(pipeline)
 
     def publish_prediction(self, pipeline: Pipeline) -> None:
         """Publish the pose at the newest wheel sample, if it can be predicted."""
-        synchronizer = pipeline.synchronizer
-        prediction = None if self.predictor is None else self.predictor.predict(synchronizer.wheels.buffer, synchronizer.turn)
-        if prediction is not None:
+        if (prediction := self._newest(pipeline)) is not None:
             by_lidar = self._inputs.has_lidar
-            self.publisher.publish_prediction(prediction, self._inputs.stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=by_lidar))
+            self._publish_in_order(prediction, self._inputs.stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=by_lidar))
+
+    def _publish_in_order(self, estimate: Estimate, stamp_ns: int) -> None:
+        last = self.continuous.last
+        if last is None or estimate.stamp_ns > last.stamp_ns:
+            self.publisher.publish_continuous(self.continuous.place(estimate), stamp_ns)
 
     def publish_overview(self, now: float, session: Session, stamp_ns: int) -> None:
         """Path and map, where they are due at ``now`` [s] of the monotonic clock."""
@@ -98,8 +154,3 @@ class LiveOutputs:
         if (enu_T_map := estimator.enu_T_map) is not None:
             enu_T_published = se2.compose(enu_T_map, se2.inverse(session.state.start.map_T_start))
             self.publisher.publish_map_frame(frame, np.asarray(se2.compose(utm_pose(gnss.datum), enu_T_published)), stamp_ns)
-
-
-def make_predictor(trial: Trial, run: LiveRun, robot: Robot) -> Predictor:
-    """One for ``robot`` that has no estimate yet."""
-    return Predictor(trial.model, robot, run.config.step.max_hold_s, run.node.predict_hz)

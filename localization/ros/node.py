@@ -11,7 +11,7 @@ import math
 import queue
 import signal
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -28,24 +28,28 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import read_head
 from localization.ros.diagnostics import Doctor, Health, Status
 from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
-from localization.ros.interim_odometry import InterimOdometry
+from localization.ros.interim_odometry import WaitingMessages
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.live_entrance import EntranceChecks, LiveEntrance
 from localization.ros.live_inputs import LiveInputs
-from localization.ros.live_outputs import LiveOutputs, make_predictor
+from localization.ros.live_outputs import LiveOutputs
 from localization.ros.live_stream import WheelAngles, check_age
 from localization.ros.node_status import NodeStatus
 from localization.ros.operator_commands import OperatorCommands
 from localization.ros.payloads import Payloads
 from localization.ros.publisher import EstimatePublisher
-from localization.ros.session import LiveRobot, Session, SessionState, StartPose, View, made_by, shared_of
+from localization.ros.session import LiveRobot, Session, SessionState, View, made_by, shared_of
 from localization.ros.settings import LiveRun
+from localization.ros.start_pose import StartPose
 from localization.ros.transports.transport import Received, Transport
+from localization.wheel_buffer import WheelBuffer
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
 from motion_models.robot import Clock, Mount
 
 _POLL_S = 0.2
+_CATCH_UP_S = 0.02
+"""For so long messages that have waited are processed at a time: a period of `predict_hz` [s]."""
 _COMPILING_S = 3.0
 """After the first message of wheels or LiDAR, odometry does not wait longer for the estimator to compile."""
 _MAX_PREDICTED_AGE_NS = 200_000_000
@@ -92,7 +96,8 @@ class Node:
         self.status = NodeStatus(self.inputs, publisher, doctor, report)
         self._checks = EntranceChecks(self.inputs)
         self.commands = OperatorCommands(self, transport, run.node.names, report)
-        self._interim: InterimOdometry | None = None
+        self._waiting: WaitingMessages | None = None
+        """None where messages are processed as they come."""
         self._times = DriveTimes()
         self.is_paused = False
 
@@ -106,7 +111,7 @@ class Node:
         view: View | None = None,
     ) -> Node:
         """Compile and discover the topics side by side, then begin, or continue from the state on disk. Where compiling takes longer,
-        odometry is by wheels alone until then; a state on disk is waited for.
+        odometry is by wheels alone until then.
 
         ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`). Raises `TransportError`, `TopicError`,
         `EstimatorError`, `CheckpointError` and `OutputError`.
@@ -123,7 +128,7 @@ class Node:
         def is_compiled() -> bool:
             return warming.is_done(with_clouds=discovery.has_clouds)
 
-        patience_s = math.inf if is_resumed or not config.predict else _COMPILING_S
+        patience_s = _COMPILING_S if config.predict else math.inf
         discovered = discovery.discover(config.wait_s, needed, report, is_over, is_compiled, patience_s)
         run = replace(run, robot=discovered.parts.robot)
         sources = discovered.parts.sources
@@ -149,6 +154,7 @@ class Node:
         shared = {"stats": self.inputs.stats, **shared_of(self._trial)}
         self.session = Session.start(self._run.files, state, name, made, shared, self._report)
         self.session.health = Health(config.max_latency_s)
+        self.outputs.continuous = self.session.state.odometry
         with ExitStack() as failing:
             failing.callback(self.session.close)
             if view is not None:
@@ -160,30 +166,17 @@ class Node:
                 self._checks.begin(self.session.pipeline.mounts)
             if not is_compiled():
                 self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
-                robot = self.inputs.robot
-                predictor = make_predictor(self._trial, self._run, robot)
-                stream = self.inputs.open_stream(MessageStats())
-                self._interim = InterimOdometry(stream, predictor, robot.center_of_gravity, is_compiled)
-            self._take_up(discovered.backlog)
+                self._waiting = WaitingMessages.of(self.inputs.open_stream(MessageStats()), is_ready=is_compiled)
+            if not is_compiled() or self.session.head:
+                self.outputs.begin_interim(WheelBuffer(self.inputs.robot.center_of_gravity), self.outputs.continuous.resume())
+            for received in discovered.backlog:
+                self._receive(received)
+            if self._waiting is None:
+                self._times.caught_up_ns = self._transport.now_ns()
             failing.pop_all()
 
     def _make_pipeline(self, mounts: Mapping[str, Mount]) -> Pipeline:
         return Pipeline(self._trial, self.inputs.robot, mounts, self.inputs.has_lidar, self._run.config)
-
-    def _take_up(self, backlog: Iterable[Received]) -> None:
-        """Messages that have waited: their latencies do not count."""
-        for received in backlog:
-            self._receive(received)
-        self._times.caught_up_ns = self._transport.now_ns()
-
-    def _reckon(self, interim: InterimOdometry, received: Received) -> None:
-        """Odometry by wheels, until the estimator is compiled: then it takes up what has waited."""
-        if (found := interim.add(received)) is not None:
-            self.outputs.publisher.publish_prediction(*found)
-        if interim.is_over():
-            self._interim = None
-            self._report("compiled: the estimator begins.")
-            self._take_up(interim.messages)
 
     def _continue_from(self, head: Mapping[str, Any], start_ns: int) -> None:
         """Raises `CheckpointError` for a checkpoint of a log or of another time."""
@@ -202,8 +195,10 @@ class Node:
         next_poll = 0.0
         while not is_over():
             has_estimate = False
-            for received in self._transport.take(_POLL_S, self.batch_s()):
+            is_behind = self._waiting is not None and self._waiting.is_ready()
+            for received in self._transport.take(0.0 if is_behind else _POLL_S, self.batch_s()):
                 has_estimate |= self._receive(received)
+            has_estimate |= self._catch_up(time.monotonic() + _CATCH_UP_S)
             now = time.monotonic()
             if self.status.is_due(now, has_estimate):
                 self.publish_status(now)
@@ -212,6 +207,7 @@ class Node:
                 self.commands.take_loaded_map()
                 self.outputs.publisher.find_readers()
                 on_poll(self)
+        self._catch_up(math.inf)
         self.publish_status(math.inf)  # what stays latched is the last map
 
     def batch_s(self) -> float:
@@ -243,17 +239,17 @@ class Node:
         """Publish the transforms from now on, or no more."""
         self.outputs.publisher.publish_tf(is_on)
 
-    def restart(self, start: StartPose) -> None:
-        """Begin anew at ``start``: with a new map, and nothing learned of the motion model."""
+    def restart(self, start: StartPose, *, is_moved: bool = False) -> None:
+        """Begin anew at ``start``: with a new map, and nothing learned of the motion model. ``is_moved``: `odom` jumps to there."""
         pipeline = self._make_pipeline(self.session.pipeline.mounts)
         if self._checks.running is not None:  # of the motion from here on
             self._checks.begin(self.session.pipeline.mounts, lidar=False)
             self.session.start_error_m = 0.0
         if self._trial.prior is not None:  # the saved map stays where it is
             start = replace(start, map_T_start=np.zeros(3), map_cov=np.zeros((3, 3)))
+        self.outputs.restart(start, self.session.pipeline, is_moved=is_moved)
         self.session.restart(pipeline, start)
         self.insert_present_cg()
-        self.outputs.restart()
 
     def replace_map(self, prior: PriorMap) -> None:
         """Localize in another saved map from now on: by what the estimator has learned, and without a jump of odometry. Raises
@@ -305,10 +301,30 @@ class Node:
         return 0.0 if self._times.begin_ns is None else (self._times.newest_ns - self._times.begin_ns) * 1e-9
 
     def _receive(self, received: Received) -> bool:
-        """Process a message; True if it made an estimate."""
-        if self._interim is not None:
-            self._reckon(self._interim, received)
-        elif received.topic == self.inputs.tf:
+        """Process a message, or keep it while others wait; True if it made an estimate."""
+        if self._waiting is None:
+            return self._execute(received)
+        self._waiting.queue.append(received)
+        for event in self._waiting.stream.events(received):
+            self.outputs.reckon(event, self._waiting.stream)
+        return False
+
+    def _catch_up(self, until_s: float) -> bool:
+        """Process messages that have waited, ``until_s`` of the monotonic clock at most; True if one made an estimate."""
+        has_estimate = False
+        while (waiting := self._waiting) is not None and waiting.is_ready() and time.monotonic() < until_s:
+            if waiting.queue:
+                received, is_past = waiting.take()
+                has_estimate |= self._receive_again(received) if is_past else self._execute(received)
+            else:
+                self._waiting, self._times.caught_up_ns = None, self._transport.now_ns()
+                self.outputs.end_interim(self.session.pipeline)
+                self._report("the estimator has begun, and has taken up what waited for it.")
+        return has_estimate
+
+    def _execute(self, received: Received) -> bool:
+        """Process a message now; True if it made an estimate."""
+        if received.topic == self.inputs.tf:
             if (conflict := self.inputs.conflicts.check(received.data, self.outputs.publisher.recent_transforms)) is not None:
                 self._report(conflict)
         elif received.topic == self.inputs.tf_static:
@@ -342,10 +358,12 @@ class Node:
         is_predictable = self.outputs.is_prediction_due(event)
 
         def publish(estimate: Estimate) -> None:
-            self.outputs.publish_estimate(event, estimate, self.session.pipeline)
+            self.outputs.publish_estimate(event, estimate, self.session.pipeline, is_current=self._waiting is None)
             if isinstance(event, Scan) and not self._times.is_backlog(received):
                 self.session.health.add_latency((self._transport.now_ns() - received.received_ns) * 1e-9)
 
+        if self._waiting is None:
+            self.outputs.reckon(event, self.inputs.stream)
         estimates = self.session.process(event, publish)
         if is_predictable and self._transport.now_ns() - received.received_ns < _MAX_PREDICTED_AGE_NS:
             self.outputs.publish_prediction(self.session.pipeline)
@@ -364,7 +382,8 @@ class Node:
     def _pass_entrance(self, entrance: LiveEntrance) -> None:
         """Go on as robot file and transforms have it, or, from the start of the drive on, with what was found."""
         self._checks.end(self._report)
-        wiring, lidar = entrance.wiring, entrance.lidar
+        wiring, lidar, reading = entrance.wiring, entrance.lidar, self.inputs.open_stream(MessageStats())
+        reading.restore(self.inputs.stream.wheel_angles)
         if wiring is not None:
             uses_gyro = wiring.has_lost_signs or not wiring.is_ambiguous
             self.inputs.rewire(self._keep_wiring(LiveRobot(wiring.robot, uses_gyro)), self.session.pipeline.mounts)
@@ -392,8 +411,10 @@ class Node:
             )
         else:
             return
-        for received in entrance.messages:
-            self._receive_again(received)
+        rest = () if self._waiting is None else self._waiting.queue
+        waiting = WaitingMessages.of(reading, entrance.messages)
+        waiting.queue.extend(rest)
+        self._waiting = waiting
 
     @property
     def _uses_gyro(self) -> bool:
@@ -406,25 +427,29 @@ class Node:
 
     def _begin_anew(self, mounts: Mapping[str, Mount]) -> None:
         """Estimate with ``mounts`` from the start of the drive on, of which the messages come again."""
-        pipeline = self._make_pipeline(mounts)
+        wheels, pipeline = self.session.pipeline.synchronizer.wheels.buffer, self._make_pipeline(mounts)
         self.inputs.reopen(pipeline.mounts)
         self.session.state.angles = self.inputs.stream.wheel_angles
         self.session.restart(pipeline, self.session.state.start)
         self.session.start_error_m = 0.0
         self.status.doctor.add_mounts(pipeline.mounts)
         self.insert_present_cg()
-        self.outputs.renew_predictor()
+        self.outputs.begin_interim(wheels)
         if self.session.view is not None:
             self.session.view.begin(self.inputs.robot, pipeline.mounts)
 
-    def _receive_again(self, received: Received) -> None:
+    def _receive_again(self, received: Received) -> bool:
         """Without publishing: its estimates are past."""
         if (entrance := self._checks.running) is not None:
             entrance.keep(received)
+        found: list[Estimate] = []
         for event in self.inputs.stream.events(received):
-            self.session.pipeline.process(event)
+            found += self.session.pipeline.process(event)
             if (entrance := self._checks.running) is not None:
                 self._add_to_entrance(entrance, event)
+        for estimate in found[-1:]:
+            self.outputs.go_on_from(self.session.state.start.apply(estimate), self.session.pipeline, is_current=False)
+        return False
 
     def _add_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Frames that become known only now have their mounts from here on, and so has the state."""

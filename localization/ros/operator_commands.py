@@ -24,8 +24,8 @@ from localization.maps import KeyframeMap, SavedMap, SpaceMap, load_map, save_ma
 from localization.maps.space_places import Places, make_places
 from localization.output import versions
 from localization.ros.payloads import Load, Payloads
-from localization.ros.session import StartPose
 from localization.ros.settings import Names
+from localization.ros.start_pose import StartPose
 from localization.ros.transports.transport import Received, ServiceReply, Transport
 from motion_models.errors import CgError, RobotError
 from motion_models.se2 import FloatArray
@@ -75,8 +75,12 @@ class CommandedNode(Protocol):
     def payloads(self) -> Payloads:
         """Loads that the robot holds."""
 
-    def restart(self, start: StartPose) -> None:
-        """Begin anew at ``start``."""
+    def restart(self, start: StartPose, *, is_moved: bool = False) -> None:
+        """Begin anew at ``start``. ``is_moved``: `odom` jumps to there."""
+
+    @property
+    def outputs(self) -> Any:
+        """The `LiveOutputs`."""
 
     def replace_map(self, prior: PriorMap) -> None:
         """Localize in another saved map from now on. Raises `MapError` for one in space instead of one in the plane, and the reverse."""
@@ -164,14 +168,14 @@ class OperatorCommands:
         else:
             known = [frames.map_frame, frames.odom_frame] if has_map else [frames.odom_frame]
             return ServiceReply(False, f"the pose is ignored: its frame is '{frame}', and this estimator has {' and '.join(known)}.")
-        self._node.restart(start)
+        self._node.restart(start, is_moved=frame == frames.odom_frame)
         return ServiceReply(True, f"begins anew at x {pose[0]:.3f} m, y {pose[1]:.3f} m, yaw {math.degrees(pose[2]):.1f} deg in '{frame}'.")
 
     def reset(self, _: bool = True) -> ServiceReply:
-        """Begin anew at the origin, with a new map and nothing learned (as ~/reset of robot_localization)."""
-        self._node.restart(StartPose())
-        self._report("reset: begins anew at the origin.")
-        return ServiceReply(True, "begins anew at the origin")
+        """Begin anew, with a new map and nothing learned; at the origin of `map`, and in `odom` where the robot is (REP-105)."""
+        self._node.restart(StartPose(*self._present_odometry()))
+        self._report("reset: begins anew; odom goes on without a jump. To move it, publish /set_pose.")
+        return ServiceReply(True, "begins anew; odom goes on without a jump")
 
     def relocalize(self, _: Any = True) -> ServiceReply:
         """Forget the place in the saved map, and search all of it; odometry goes on."""
@@ -271,6 +275,7 @@ class OperatorCommands:
         if estimate is None:
             start = self._node.session.state.start
             return start.odom_T_start, start.odom_cov
+        estimate = self._node.outputs.present(self._node.session.pipeline, estimate)
         pose, cov = estimate.odometry or (estimate.pose, estimate.covariance)
         return pose, _known(cov)
 

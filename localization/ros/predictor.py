@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,9 @@ from localization.core.twist import CHANGE_SHARE, SLIP_LASTS_S, TWIST_FLOOR
 from localization.estimators import Estimate
 from localization.estimators.estimator import GyroCalibration
 from localization.events import Turn
+from localization.synchronizer import StepConfig
 from localization.wheel_buffer import WheelBuffer
+from localization.wheel_gaps import UnknownVelocity
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import assign
@@ -22,6 +25,7 @@ from motion_models.se2 import (
     FloatArray,
     fill_inverse_adjoint,
     fill_right_jacobian_inverse,
+    retract,
     scalar_compose,
     scalar_exp,
     scalar_log,
@@ -31,8 +35,9 @@ from motion_models.se2 import (
 _NS = 1e-9
 _JITTER = 0.25
 """Share of the period by which a wheel message may come early and still be predicted to."""
-_MAX_HORIZON_S = 1.0
-"""No prediction is published farther ahead of the last estimate [s]: without LiDAR one comes every 0.05 s, with a lost one every 0.3 s."""
+_MAX_HORIZON_NS = 5_000_000_000
+"""From the last estimate to predictions that begin there, half of what a `WheelBuffer` keeps; later ones begin at the one before [ns].
+Without LiDAR an estimate comes every 0.05 s, with a lost one every 0.3 s: it is a processor without time for the estimator."""
 
 _NO_TURN = [math.nan] * 4
 _NO_PARAMS, _NO_CG, _UNUSED_COV = np.zeros((3, 0)), np.zeros((3, 2)), np.zeros((3, 3))
@@ -46,19 +51,21 @@ class Predictor:
     predicted pose changes by that estimate's correction and by nothing else, for the same motion of wheels and gyro is applied to both.
     """
 
-    def __init__(self, model: MotionModel, robot: Robot, max_hold_s: float, max_rate_hz: float = math.inf) -> None:
-        """``max_hold_s``: gaps between wheel samples that are longer end the prediction [s]. ``max_rate_hz``: more are not made [Hz]."""
-        self._model, self._noise, self._max_hold_s = model, noise_vector(robot.wheel_noise), max_hold_s
+    def __init__(self, model: MotionModel, robot: Robot, config: StepConfig, max_rate_hz: float = math.inf) -> None:
+        """``config``: for how long the rates of the last wheel sample hold, and the unknown velocity after that. ``max_rate_hz``: more
+        predictions are not made [Hz]."""
+        self._model, self._noise, self._config = model, noise_vector(robot.wheel_noise), config
         self._period_ns, self._due_ns = 1.0 / (max_rate_hz * _NS), -math.inf
         self._params = model.nominal
-        self._last: Estimate | None = None
+        self.last: Estimate | None = None
+        """What predictions begin at; None before the first estimate."""
         self._gyro: GyroCalibration | None = None
         self._clock_offset_ns = 0
 
     def is_due(self, stamp_ns: int) -> bool:
         """Whether a wheel sample can be predicted to, and a period has passed since the last one that was due, but for the jitter of its
         stamps; the mean rate is kept."""
-        if self._last is None or stamp_ns < self._due_ns - _JITTER * self._period_ns:
+        if self.last is None or stamp_ns < self._due_ns - _JITTER * self._period_ns:
             return False
         self._due_ns = (self._due_ns if stamp_ns - self._due_ns < self._period_ns else stamp_ns) + self._period_ns
         return True
@@ -68,35 +75,42 @@ class Predictor:
 
         ``clock_offset_s``: the wheels' stamps are late by this much [s]. ``gyro``: None where it is not used.
         """
-        self._last, self._gyro = estimate, gyro
+        self.last, self._gyro = estimate, gyro
         self._params = self._model.nominal if params is None else params
         self._clock_offset_ns = round(clock_offset_s / _NS)
 
     def begin(self, stamp_ns: int) -> None:
-        """Predict from the origin on, where the robot is at ``stamp_ns``, with the nominal parameters."""
-        self.reset(Estimate(stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
+        """The first wheel sample is of ``stamp_ns``: predict from the origin on, with the nominal parameters; or from the last estimate,
+        moved by its twist until then, for at most as long as rates of the wheels hold."""
+        if self.last is None:
+            self.reset(Estimate(stamp_ns, np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))), None, 0.0)
+            return
+        held_ns = min(max(stamp_ns - self.last.stamp_ns, 0), round(self._config.max_hold_s / _NS))
+        pose = retract(self.last.pose, held_ns * _NS * self.last.twist)
+        self.advance(replace(self.last, stamp_ns=self.last.stamp_ns + held_ns, pose=pose))
 
-    def stop(self) -> None:
-        """Predict nothing until the next estimate."""
-        self._last = None
+    def advance(self, estimate: Estimate) -> None:
+        """Predict from ``estimate`` on, with parameters and clocks as they are."""
+        self.last = estimate
 
     def predict(
         self, wheels: WheelBuffer, measure_turn: Callable[[int, int], Turn | None] = lambda start_ns, end_ns: None
     ) -> Estimate | None:
-        """The estimate at the newest sample of ``wheels``; None where that is not newer than the last estimate, or they have a gap since.
+        """The estimate at the newest sample of ``wheels``; None where that is not newer than the last estimate. A gap of the wheels since
+        has the covariance of an unknown velocity.
 
         ``measure_turn``: the gyro's turn between two stamps [ns].
         """
-        if self._last is None or wheels.rates_known_until_ns is None:
+        if self.last is None or wheels.rates_known_until_ns is None:
             return None
-        begin_ns, end_ns = self._last.stamp_ns + self._clock_offset_ns, wheels.rates_known_until_ns
-        if not 0 < end_ns - begin_ns <= _MAX_HORIZON_S / _NS:
+        begin_ns, end_ns = self.last.stamp_ns + self._clock_offset_ns, wheels.rates_known_until_ns
+        if end_ns <= begin_ns:
             return None
-        dt, rates, cg, missing = wheels.window(begin_ns, end_ns, self._max_hold_s)
-        if missing or not len(dt):
+        dt, rates, cg, missing = wheels.window(begin_ns, end_ns, self._config.max_hold_s)
+        if not len(dt):
             return None
         by_model = self._model.twist(rates, cg, self._params)
-        turn = None if self._gyro is None or not rates.any() else measure_turn(self._last.stamp_ns, end_ns - self._clock_offset_ns)
+        turn = None if self._gyro is None or not rates.any() else measure_turn(self.last.stamp_ns, end_ns - self._clock_offset_ns)
         by_gyro = _NO_TURN
         if turn is not None and self._gyro is not None:
             by_gyro = [*self._gyro.correct_angle(turn), *_NO_TURN[2:]]
@@ -104,7 +118,14 @@ class Predictor:
                 change, variance = _change_of_rate(dt, by_model.value[:, 2], turn.rate_age_s)
                 by_gyro[2:] = rate[0] + change, rate[1] + variance
         motion, twist, twist_cov = predicted_motion(dt, by_model.value, self._noise, np.array(by_gyro))
-        return _propagated(self._last, motion, twist, twist_cov, end_ns - self._clock_offset_ns)
+        if missing:
+            unknown = UnknownVelocity(self._config.unknown_sigma)
+            unknown.measured = self.last.twist
+            motion = replace(motion, cov=motion.cov + unknown.increment(missing, has_turn=turn is not None))
+        predicted = _propagated(self.last, motion, twist, twist_cov, end_ns - self._clock_offset_ns)
+        if end_ns - begin_ns > _MAX_HORIZON_NS:
+            self.advance(predicted)
+        return predicted
 
 
 def predicted_motion(dt: FloatArray, twists: FloatArray, noise: FloatArray, turn: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:

@@ -48,8 +48,8 @@ class EstimatePublisher:
     """Publishes on a transport.
 
     Each estimate has the stamp of its scan, which came some 10 ms ago; predictions have those of the wheels' newest messages. Transforms
-    and predicted odometry are one stream of both in order of stamps: an estimate that a prediction has overtaken is left out there, and
-    the next prediction starts from it.
+    and predicted odometry are one continuous stream of both in order of stamps: an estimate that a prediction has overtaken is left out
+    there, and the next prediction starts from it.
     """
 
     def __init__(self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool) -> None:
@@ -59,7 +59,6 @@ class EstimatePublisher:
         self.recent_transforms: deque[bytes] = deque(maxlen=_NEW_KEYFRAMES)
         """Transforms of the body, as they were published."""
         self._topics = {topic: names.resolve(topic) for topic in _TYPES}
-        self._last_ns = -(1 << 63)
         self._has_predictions = False
         self._unread: frozenset[str] = frozenset()  # topics of predictions that nobody receives
         self._path = Path()
@@ -84,13 +83,11 @@ class EstimatePublisher:
         self._path = Path()
 
     def publish_estimate(self, estimate: Estimate, stamp_ns: int) -> None:
-        """nav_msgs/Odometry with true vy at ``stamp_ns``, and the transforms; of a graph the pose in `map` too.
+        """nav_msgs/Odometry with true vy at ``stamp_ns``; of a graph the pose in `map` too.
 
         ``stamp_ns`` is the stamp of the estimate in the clock of its sender, which may have been set since the start.
         """
-        data = self._odometry.odometry(_fused(estimate, stamp_ns))
-        self._transport.publish(self._topics[ODOMETRY], data)
-        self._publish_in_order(estimate, stamp_ns, data)
+        self._transport.publish(self._topics[ODOMETRY], self._odometry.odometry(_fused(estimate, stamp_ns)))
         self._path.insert(estimate)
         if estimate.map_T_odom is not None:
             self._publish_pose(estimate, stamp_ns)
@@ -105,21 +102,16 @@ class EstimatePublisher:
         """Whether somebody receives predicted odometry or transforms."""
         return (self._has_predictions and PREDICTED_ODOMETRY not in self._unread) or (self._with_tf and TF not in self._unread)
 
-    def publish_prediction(self, prediction: Estimate, stamp_ns: int) -> None:
-        """Publish a prediction between estimates: odometry on a topic of its own, and the transforms."""
-        self._publish_in_order(prediction, stamp_ns)
-
-    def _publish_in_order(self, estimate: Estimate, stamp_ns: int, odometry: bytes | None = None) -> None:
-        if estimate.stamp_ns <= self._last_ns:
-            return
-        self._last_ns, fused = estimate.stamp_ns, _fused(estimate, stamp_ns)
+    def publish_continuous(self, estimate: Estimate, stamp_ns: int) -> None:
+        """Publish an estimate or prediction that is the newest: predicted odometry, and the transforms."""
+        fused = _fused(estimate, stamp_ns)
         if self._with_tf:
             self.recent_transforms.append(self._odometry.transform(fused))
             self._transport.publish(self._topics[TF], self.recent_transforms[-1])
             if estimate.map_T_odom is not None:
                 self._transport.publish(self._topics[TF], self._map_correction.transform(_correction(estimate, stamp_ns)))
         if self._has_predictions and PREDICTED_ODOMETRY not in self._unread:
-            self._transport.publish(self._topics[PREDICTED_ODOMETRY], odometry or self._odometry.odometry(fused))
+            self._transport.publish(self._topics[PREDICTED_ODOMETRY], self._odometry.odometry(fused))
 
     def publish_map_frame(self, parent: str, parent_T_map: FloatArray, stamp_ns: int) -> None:
         """Publish the transform ``parent`` -> `map`, (3,)."""

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from localization.estimators import Estimate
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.lidar import LidarConfig
-from localization.ros.session import StartPose
+from localization.ros.start_pose import StartPose
 from motion_models import se2
 from motion_models.se2 import FloatArray
 from tests.helpers.synthetic_steps import PoseSensor, make_filter, make_world, weave

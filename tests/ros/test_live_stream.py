@@ -612,8 +612,10 @@ def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
     in_odom, map_T_odom = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.25, -0.1])
     cov, cov_in_map = 0.01 * np.eye(3), 0.04 * np.eye(3)
     pose = se2.compose(map_T_odom, in_odom)
-    publisher.publish_estimate(Estimate(5 * S, in_odom, None, np.zeros(3), None), 5 * S)
-    publisher.publish_estimate(Estimate(6 * S, pose, cov_in_map, np.zeros(3), None, None, (in_odom, cov), map_T_odom), 6 * S)
+    of_graph = Estimate(6 * S, pose, cov_in_map, np.zeros(3), None, None, (in_odom, cov), map_T_odom)
+    for estimate in (Estimate(5 * S, in_odom, None, np.zeros(3), None), of_graph):
+        publisher.publish_estimate(estimate, estimate.stamp_ns)
+        publisher.publish_continuous(estimate, estimate.stamp_ns)
     odometry, tf = published(transport, ODOMETRY)[-1], [m.transforms[0] for m in published(transport, TF)]
     assert odometry.header.frame_id == frames.odom_frame
     assert (odometry.pose.pose.position.x, odometry.pose.pose.position.y) == (1.0, 2.0)

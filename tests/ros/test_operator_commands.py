@@ -85,7 +85,7 @@ def test_set_pose_with_wrong_content_is_ignored_with_a_reason(calm):
     assert track(transport).keys() == calm.keys()
 
 
-def serviced(name, *requests):
+def serviced(name, *requests, estimator="ekf"):
     """A node that drives for 8 s, is asked, and drives on; the replies."""
     transport = LogTransport(drive_log())
     calls = {8.0 + 4.0 * i: request for i, request in enumerate(requests)}
@@ -102,18 +102,29 @@ def serviced(name, *requests):
 
     transport.take = take_and_call
     transport.first_ns, transport.counts_at_calls = transport.left[0].received_ns, []
-    node, reports = run_node(transport, config=NodeConfig(wait_s=0.0))
+    node, reports = run_node(transport, estimator, config=NodeConfig(wait_s=0.0))
     return transport, node, replies, reports
 
 
-def test_reset_starts_a_new_estimate_at_the_origin(calm):
-    transport, _, replies, reports = serviced("/skidloc/reset", True)
+def test_reset_begins_anew_and_odom_goes_on_without_a_jump(calm):
+    """REP-105; with nothing learned and a new map."""
+    transport, node, replies, reports = serviced("/skidloc/reset", True)
     assert replies[0].is_success
-    assert "reset: begins anew at the origin." in reports
-    poses = np.array([pose for pose, _ in track(transport).values()])
-    jump = int(np.argmax(np.hypot(*np.diff(poses[:, :2], axis=0).T))) + 1
-    assert np.hypot(*poses[jump, :2]) < 0.05
-    assert np.hypot(*poses[jump - 1, :2]) > 0.5
+    assert "reset: begins anew; odom goes on without a jump. To move it, publish /set_pose." in reports
+    found = track(transport)
+    poses = np.array([pose for pose, _ in found.values()])
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).max() < 0.05
+    last = list(calm)[-1]
+    assert np.all(np.abs(found[last][0] - calm[last][0])[:2] < 5.0 * found[last][1][:2] + 0.02)
+    assert np.hypot(*node.session.state.start.odom_T_start[:2]) > 0.5
+
+
+@pytest.mark.extended
+def test_reset_of_a_graph_sets_the_map_frame_to_the_robot():
+    _, node, _, _ = serviced("/skidloc/reset", True, estimator="graph")
+    start, estimate = node.session.state.start, node.session.health.estimate
+    assert not start.map_T_start.any()
+    np.testing.assert_allclose(se2.compose(estimate.map_T_odom, estimate.odometry[0]), estimate.pose, atol=1e-9)
 
 
 def test_tare_payload_discards_corrections_and_keeps_the_pose(calm):
@@ -203,7 +214,7 @@ def test_commands_by_topics_do_what_the_services_do():
         (make("std_msgs/msg/Bool", data=d) for d in (0, 1)),
     )
     _, node, reports = commanded("odometry", "/skidloc/reset", encode(empty))
-    assert "reset: begins anew at the origin." in reports
+    assert any(text.startswith("reset: begins anew") for text in reports)
     _, node, reports = commanded("odometry", "/skidloc/pause", encode(on))
     assert node.is_paused
     assert node.commands.execute(Received("/skidloc/pause", 0, encode(off)))

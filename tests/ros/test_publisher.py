@@ -17,6 +17,7 @@ from localization.ros.predictor import Predictor, predicted_motion
 from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files
 from localization.ros.settings import NodeConfig
+from localization.synchronizer import StepConfig
 from localization.trajectory import read_tum
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
@@ -158,7 +159,7 @@ def test_prediction_with_the_gyro_turns_as_the_robot_does(driven):
 
 def predictor_at(stamp_ns, clock_offset_s=0.0):
     model = make_model("skid_steer", ROBOT)
-    predictor = Predictor(model, ROBOT, 0.5)
+    predictor = Predictor(model, ROBOT, StepConfig())
     cov = np.diag([1e-4, 2e-4, 3e-4])
     predictor.reset(Estimate(stamp_ns, np.array([1.0, 2.0, 0.5]), cov, np.zeros(3), None), None, clock_offset_s)
     return predictor
@@ -187,16 +188,28 @@ def test_predict_uses_the_offset_of_the_wheels_clock():
     assert predictor.predict(wheels_from(S, 6)).stamp_ns == S + S // 10 - 3 * S // 100
 
 
-@pytest.mark.parametrize(("begin_ns", "count", "period_ns"), [(0, 2, S // 50), (S, 4, S), (S, 200, S // 50)])
-def test_predict_without_recent_wheels_or_estimate_gives_none(begin_ns, count, period_ns):
-    predictor = predictor_at(S)
-    assert predictor.predict(wheels_from(begin_ns, count, period_ns=period_ns)) is None
+def test_predict_without_wheels_since_the_estimate_gives_none():
+    assert predictor_at(S).predict(wheels_from(0, 2)) is None
 
 
-def test_predict_after_stop_gives_none():
-    predictor = predictor_at(S)
-    predictor.stop()
-    assert predictor.predict(wheels_from(S, 6)) is None
+def test_predict_over_a_gap_of_the_wheels_has_the_covariance_of_an_unknown_velocity():
+    """Of 3 s, the rates hold for .5 s in each second; .5 m/s is unknown otherwise."""
+    found = predictor_at(S).predict(wheels_from(S, 4, period_ns=S))
+    assert found.stamp_ns == 4 * S
+    assert found.covariance[0, 0] == pytest.approx((1.5 * StepConfig().lost_speed_m_s) ** 2, rel=0.1)
+    speed = 5.0 * ROBOT.geometry.wheel_radius_m
+    assert se2.between(np.array([1.0, 2.0, 0.5]), found.pose)[0] == pytest.approx(3.0 * speed)  # angles give all of the way
+
+
+def test_predict_long_after_the_last_estimate_goes_on_at_the_rate_of_the_wheels():
+    """An estimator without processor time: the buffer of the wheels is shorter than that may last."""
+    predictor, wheels, found = predictor_at(0), WheelBuffer(ROBOT.center_of_gravity), []
+    for i in range(1500):
+        wheels.insert(WheelSample(i * S // 50, np.full(2, 5.0), np.full(2, i * 0.1)))
+        found.append(predictor.predict(wheels))
+    assert all(found[1:])
+    way = se2.between(np.array([1.0, 2.0, 0.5]), found[-1].pose)[0]
+    assert way == pytest.approx(1499 / 50 * 5.0 * ROBOT.geometry.wheel_radius_m, rel=0.01)
 
 
 def test_predictions_that_nobody_receives_are_not_written():
@@ -224,7 +237,7 @@ def test_predicted_odometry_without_readers_is_left_out_beside_transforms(driven
 def test_predictions_of_fast_wheels_come_at_the_set_rate(wheels_hz, predicted_hz):
     """With stamps that jitter by 2 ms: the mean rate is that of the setting, or of slower wheels."""
     rng = np.random.default_rng(0)
-    predictor = Predictor(make_model("diff_drive", ROBOT), ROBOT, 0.5, 50.0)
+    predictor = Predictor(make_model("diff_drive", ROBOT), ROBOT, StepConfig(), 50.0)
     predictor.reset(Estimate(0, np.zeros(3), np.zeros(3), None, None), None, 0.0)
     stamps = np.sort(np.arange(0.0, 10.0, 1.0 / wheels_hz) + rng.uniform(0.0, 0.002, round(10.0 * wheels_hz)))
     due = [predictor.is_due(round(t * S)) for t in stamps]
