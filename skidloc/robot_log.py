@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from localization.calibration.wheel_wiring import open_checked
 from localization.errors import EvaluationError
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result, score
 from localization.events import Event
+from localization.evidence import open_log_with_set_up
 from localization.log_replay import replay
 from localization.logs import Log, TopicOverrides
 from localization.pipeline import ReplayConfig
@@ -44,7 +44,7 @@ def open(path: str | Path, robot: str | Path | Robot, topics: TopicOverrides | N
     `LogError` for a log that cannot be read, `RobotError` for a robot that does not exist.
     """
     described = robot if isinstance(robot, Robot) else load_robot(str(robot))
-    log, _ = open_checked(path, described, topics or TopicOverrides())
+    log = open_log_with_set_up(path, described, topics or TopicOverrides()).log
     return RobotLog(log, log.robot)
 
 

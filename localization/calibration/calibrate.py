@@ -15,11 +15,11 @@ from localization.calibration.dead_reckoning import check_reference
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
 from localization.calibration.position_reference import PositionMotionReference
 from localization.calibration.wheel_signals import read_signals
-from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig, cut
 from localization.errors import EvaluationError
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack
+from localization.evidence import open_log_as_declared
 from localization.logs import Log, TopicOverrides
 from localization.trajectory import BoolArray
 from motion_models.base import MotionModel, scales
@@ -134,7 +134,7 @@ def cut_log(
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
     """
     config = config or WindowConfig()
-    log = open_wired(path, robot, topics.scored_against(reference))
+    log = open_log_as_declared(path, robot, topics.scored_against(reference))
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(
             f"{log.path.name} has {log.no_wheels or 'no wheels by these options.'} Name them with --topic.joint-states or --topic.odometry."

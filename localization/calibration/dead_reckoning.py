@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from localization.calibration.wheel_signals import STEP_S, WheelSignals
-from localization.calibration.wheel_units import expected_scaling
 from localization.errors import EvaluationError
 from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, no_overlap_message
 from localization.logs import Log
 from localization.trajectory import Trajectory
 from motion_models import se2
+from motion_models.prior import expected_scaling
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9

@@ -1,4 +1,8 @@
-"""Is a robot wired and described right? Each quantity of a robot file with its second source in a log, and a verdict."""
+"""Is a robot wired and described right? Each quantity of a robot file with its second source in a log, and a verdict.
+
+Signs, sides, units, mounts and axes have the answer of `localization.evidence`: a quantity is ok where the drive refutes its faults,
+cannot be seen where it does not, and is contradicted where a fault is more probable than the robot file.
+"""
 
 from __future__ import annotations
 
@@ -9,61 +13,59 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
-from localization.calibration.dead_reckoning import dead_reckon, disjoint_message, forward_rate
-from localization.calibration.lidar_check import CheckedLog, open_log_checked
+from localization.calibration.dead_reckoning import dead_reckon, disjoint_message
 from localization.calibration.log_survey import survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
 from localization.calibration.robot_setup import draft_robot, finish_robot
-from localization.calibration.wheel_signals import LidarMotion, WheelSignals, lidar_motion, read_signals
-from localization.calibration.wheel_units import CORRECTED, expected_scaling
-from localization.calibration.wheel_wiring import WiringReport
+from localization.calibration.wheel_signals import read_signals
 from localization.errors import LogError
 from localization.evaluation.reference_check import compare_reference
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
 from localization.events import Event
-from localization.gyro import is_gravity
+from localization.evidence import CORRECTED, SetUp, open_log_with_set_up
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
-from localization.logs.info import LogInfo, first_force
+from localization.logs.info import LogInfo
 from localization.logs.topic_roles import CHOSEN_BY
 from localization.pipeline import Trial
 from motion_models.errors import RobotError
-from motion_models.prior import scaling_sigma
+from motion_models.prior import expected_scaling, scaling_sigma
 from motion_models.registry import make_model
-from motion_models.robot import DIFF_DRIVE, Mount, Robot
-from motion_models.se2 import FloatArray
+from motion_models.robot import DIFF_DRIVE, Robot
 
 CheckVerdict = Literal["ok", "contradiction", "cannot be seen", "note"]
 
-_STANDING_S = 3.0
-"""Before the first motion, for the gyro's bias [s]."""
-_REPLAYED_S = 75.0
+_REPLAYED_S = 80.0
 """Length of the drive that the filter is run on [s]: a minute of driving and what stands before it."""
 _REFERENCE_S = 600.0
 """Length of the drive that a reference is compared with where the first minute is too even [s]."""
 _SAME_SCALE = 0.15
 """Relative difference of a radius from the measured one: tyres under load and slip straight ahead change it by up to 7 %, and motion from
 scan to scan errs by some percent."""
-_MIN_SCALE_INTERVALS, _MIN_LIKENESS = 12, 0.97
-"""Intervals of 0.5 s, and cosine between the ways, from which on a scale is measured: of scans that slide along a corridor it is lower."""
-_LEAST_CORRELATION = 0.6
-"""Below, a source contradicts the wheels, as in `wheel_wiring`."""
-_MAX_YAW_DEG = 5.0
-"""Largest yaw of a LiDAR against the direction of travel [deg]; robots slide by a few degrees."""
-_MAX_TILT_RAD = math.radians(10.0)
-"""Largest tilt of gravity against the IMU's mount [rad]: floors and ramps."""
+_REFUTED = 4.6
+"""Logarithm of the Bayes factor (100 to 1) by which the drive speaks against a fault, from where on its quantity is ok."""
 _MAX_CLOCK_S, _MAX_CLOCK_SIGMA_S = 0.1, 0.1
 """Offset that is named, and sigma at which none can be seen [s]; drivers and radios have latencies of up to 0.1 s."""
 _SIGMAS = 3.0
-_MIN_TURNING_RAD_S = 0.05
-_MIN_SPEED_M_S, _MAX_TURN_RAD_S, _MIN_TRAVEL_INTERVALS, _MIN_COHERENCE = 0.05, 0.1, 6, 0.9
 _MAX_ODD_SHARE = 0.02
 """Largest share of a topic's messages or time that may be out of order or missing."""
-_TURN_AND_STRAIGHT = "drive straight on for 10 s and turn in place both ways for 10 s each"
 _DRIVE_WITH_REFERENCE = "drive for 20 s or more within the reference's time and beyond its noise, at changing speeds."
+_TURN_AND_STRAIGHT = "drive straight on for 10 s and turn in place both ways for 10 s each"
+_QUANTITIES: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "signs and sides of wheels": (
+        "wheels",
+        ("sides_exchanged", "left_reversed", "right_reversed", "all_reversed", "other_side", "one_reversed"),
+    ),
+    "units of wheels": ("wheels", ("unit", "factor_left", "factor_right")),
+    "sides of the driver": ("driver", ("sides_exchanged", "reversed", "backwards", "left_reversed", "right_reversed")),
+    "units of the driver": ("driver", ("unit",)),
+    "axis and sign of gyro": ("gyro", ("axis", "reversed")),
+    "unit of gyro": ("gyro", ("unit",)),
+    "mount of LiDAR": ("lidar", ("yaw", "upside_down")),
+    "unit of LiDAR": ("lidar", ("unit",)),
+}
+"""Faults by quantity: source, and names of its rows in `localization.evidence.alternatives`."""
 
 
 @dataclass(frozen=True)
@@ -125,33 +127,23 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     if robot is None:
         assert draft is not None
         robot = _drafted(draft, given, path)
-    checked_log = open_log_checked(path, robot, given.topics)
-    log, wiring = checked_log.log, checked_log.wiring
+    found = open_log_with_set_up(path, robot, given.topics)
+    log, set_up = found.log, found.set_up
     if log.sources.wheels is None:
         raise log.wheels_error or LogError(f"{path.name} has {log.no_wheels or 'no wheels by these options.'} Record one of them.")
     info = inspect_log(log)
-    signals = read_signals(log)
-    rows = [*_topic_rows(info), *_stamp_rows(info)]
-    motion = None if signals is None else lidar_motion(log, signals)
-    by_lidar = {} if signals is None or checked_log.lidar else _by_lidar(log, signals, motion)
-    rows += _wiring_rows(wiring, by_lidar)
-    measured_robot = log.robot
-    if signals is not None:
-        radius_row, measured_robot = _radius(log, wiring, signals, motion)
-        rows += [radius_row, *_lidar_rows(checked_log, signals, motion)]
-    run = _replayed(log, measured_robot, checked_log.mounts, "ekf", signals)
-    rows += [
-        *_filter_rows(log, run),
-        *_imu_rows(log),
-        _reference_row(log, signals, reference),
-    ]
-    rows[:0] = [CheckRow("log file", "damaged, incomplete or corrected", "", "note", text) for text in log.damage()]
+    rows = [CheckRow("log file", "damaged, incomplete or corrected", "", "note", text) for text in log.damage()]
+    rows += [*_topic_rows(info), *_stamp_rows(info), *_set_up_rows(set_up)]
+    radius_row, measured_robot = _radius(log.robot, set_up)
+    rows += [] if radius_row is None else [radius_row]
+    run = _replayed(log, measured_robot)
+    rows += [*_filter_rows(log, run), _reference_row(log, reference)]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
     model = make_model(model_of(measured_robot), measured_robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
     params = tuple(measured[name][0] if name in measured else float(v) for name, v in zip(model.param_names, model.nominal, strict=True))
     sigmas = {name: sigma for name, (_, sigma) in measured.items()}
-    checked = _with_scaling(measured_robot, params, sigmas) if not wiring.is_ambiguous else robot
+    checked = robot if set_up.is_ambiguous else _with_scaling(measured_robot, params, sigmas)
     topic = log.sources.lidar.topic if log.sources.lidar is not None and log.sources.lidar.kind == "scan" else ""
     return RobotCheck(path.name, checked, log.duration_s, tuple(rows), params, sigmas, topic)
 
@@ -172,23 +164,20 @@ def _with_scaling(robot: Robot, params: Sequence[float], sigmas: dict[str, float
     return replace(robot, models={**robot.models, "skid_steer": {**robot.models.get("skid_steer", {}), "k_0": float(f"{params[0]:.4g}")}})
 
 
-def _replayed(
-    log: Log, robot: Robot, mounts: Mapping[str, Mount], estimator: str, signals: WheelSignals | None, duration_s: float = _REPLAYED_S
-) -> Run | None:
-    """Result of ``estimator`` for ``robot`` on the first ``duration_s`` of driving; None where nothing corrects the wheels."""
-    if signals is None or (log.sources.lidar is None and log.sources.imu is None):
+def _replayed(log: Log, robot: Robot, estimator: str = "ekf", duration_s: float = _REPLAYED_S) -> Run | None:
+    """Result of ``estimator`` for ``robot`` on the first ``duration_s``; None where nothing corrects the wheels."""
+    if log.sources.lidar is None and log.sources.imu is None:
         return None
-    start_ns = signals.first_ns + int((signals.start_s - _STANDING_S) * 1e9)
     trial = Trial(make_model(model_of(robot), robot), estimator)
     try:
-        return replay(_first(log, start_ns, duration_s), [trial], robot, mounts, log.sources.lidar is not None)[0]
+        return replay(_first(log, duration_s), [trial], robot, log.mounts, log.sources.lidar is not None)[0]
     except LogError:
         return None
 
 
-def _first(log: Log, start_ns: int, duration_s: float) -> Iterator[Event]:
-    end_ns = start_ns + int(duration_s * 1e9)
-    return (event for event in takewhile(lambda event: event.stamp_ns <= end_ns, log.events()) if event.stamp_ns >= start_ns)
+def _first(log: Log, duration_s: float) -> Iterator[Event]:
+    end_ns = log.start_ns + int(duration_s * 1e9)
+    return takewhile(lambda event: event.stamp_ns <= end_ns, log.events())
 
 
 def _topic_rows(info: LogInfo) -> list[CheckRow]:
@@ -230,121 +219,49 @@ def _stamp_rows(info: LogInfo) -> list[CheckRow]:
     return [CheckRow("stamps", text.split(":")[0], "time of recording", "contradiction", text) for text in dict.fromkeys(wrong)]
 
 
-def _by_lidar(log: Log, signals: WheelSignals, motion: LidarMotion | None) -> dict[str, float]:
-    """Correlation of the wheels' turn with that by scans."""
-    if motion is None:
-        return {}
-    if signals.joints:
-        rates, left = signals.joint_rates, signals.left
-        turn = rates[:, left:].mean(axis=1) - rates[:, :left].mean(axis=1)
-    else:
-        assert log.sources.wheels is not None
-        turn = signals.turns[log.sources.wheels.topic]
-    both = np.isfinite(turn) & np.isfinite(motion.turn)
-    is_turning = both.sum() >= _MIN_SCALE_INTERVALS and float(np.sqrt(np.mean(motion.turn[both] ** 2))) > _MIN_TURNING_RAD_S
-    return {"turn by the LiDAR": _cosine(turn[both], motion.turn[both])} if is_turning else {}
+def _set_up_rows(set_up: SetUp) -> list[CheckRow]:
+    """Each quantity that the set-up's faults are about."""
+    if set_up.verdict == "undecidable":
+        advice = f"{set_up.reason} {_TURN_AND_STRAIGHT[0].upper()}{_TURN_AND_STRAIGHT[1:]}, with gyro or LiDAR."
+        return [CheckRow("signs, units and mounts", "as in the robot file", "", "cannot be seen", advice)]
+    if set_up.sentences:
+        return [_contradiction("sensors", text) for text in set_up.sentences]
+    rows = []
+    for quantity, (source, names) in _QUANTITIES.items():
+        against = [value for key, value in set_up.against.items() if key in {f"{source}.{name}" for name in names}]
+        if not against:
+            continue
+        second = f"the other sources: {_odds(min(against))} against each fault"
+        is_seen = min(against) > _REFUTED
+        advice = "" if is_seen else f"{_TURN_AND_STRAIGHT}."
+        rows.append(CheckRow(quantity, "as in the robot file", second, "ok" if is_seen else "cannot be seen", advice))
+    return rows
 
 
-def _cosine(a: FloatArray, b: FloatArray) -> float:
-    return float(a @ b) / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-12)
+def _odds(log_factor: float) -> str:
+    return "over 1000 to 1" if log_factor > math.log(1000.0) else f"{math.exp(max(log_factor, 0.0)):.0f} to 1"
 
 
-_IN_FILE = "In the robot file:"
+def _contradiction(quantity: str, text: str) -> CheckRow:
+    advice = text.replace(CORRECTED, "In the robot file:")
+    return CheckRow(quantity, "as in the robot file", "all sources beside each other", "contradiction", advice)
 
 
-def _wiring_rows(wiring: WiringReport, by_lidar: Mapping[str, float]) -> list[CheckRow]:
-    rows = [
-        CheckRow(
-            "wheels and gyro",
-            "as in the robot file",
-            "wheels, gyro and driver beside each other",
-            "contradiction",
-            text.replace(CORRECTED, _IN_FILE),
-        )
-        for text in wiring.findings
-    ]
-    if rows:
-        return rows
-    found = [_sign_row(name, value) for name, value in {**by_lidar, **wiring.correlations}.items()]
-    found += [CheckRow("units", "as in the robot file", f"{name}: factor {value:.2f}", "ok") for name, value in wiring.ratios.items()]
-    missing = CheckRow("signs and sides", "as in the robot file", "", "cannot be seen", f"{_TURN_AND_STRAIGHT}, with gyro or LiDAR.")
-    return found or [missing]
-
-
-def _sign_row(name: str, value: float) -> CheckRow:
-    measured = f"{name}: correlation {value:+.2f}"
-    if value > _LEAST_CORRELATION:
-        return CheckRow("signs and sides", "as in the robot file", measured, "ok")
-    advice = "it is another motion than the wheels', and no sign, side or clock explains it: check that sensor's unit and messages."
-    return CheckRow("signs and sides", "as in the robot file", measured, "contradiction", f"{name}: {advice}")
-
-
-def _radius(log: Log, wiring: WiringReport, signals: WheelSignals, motion: LidarMotion | None) -> tuple[CheckRow, Robot]:
-    """Radius by measured speeds, and the robot with it, as k and what sensors contradict follow from it."""
-    radius = log.robot.geometry.wheel_radius_m if signals.joints else log.robot.driver.wheel_radius_m
-    ratios = {name: value for name, value in wiring.ratios.items() if " by the speed of " in name}
-    if motion is not None and not ratios:
-        wheels = np.abs(forward_rate(log, signals)) * (radius if signals.joints else 1.0)
-        way = np.hypot(motion.speed, motion.side)
-        both = np.isfinite(wheels) & (way > _MIN_SPEED_M_S) & (wheels > _MIN_SPEED_M_S) & (np.abs(motion.turn) < _MAX_TURN_RAD_S)
-        if both.sum() >= _MIN_SCALE_INTERVALS and _cosine(way[both], wheels[both]) >= _MIN_LIKENESS:
-            ratios = {"way by the LiDAR": float(np.median(way[both] / wheels[both]))}
-    if not ratios:
-        advice = "drive straight on for 10 s with a LiDAR, or record the driver's odometry."
-        return CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice), log.robot
-    name, ratio = next(iter(ratios.items()))
-    second = f"{radius * ratio:.4g} m, {name}"
-    if abs(math.log(ratio)) <= _SAME_SCALE or wiring.findings:
-        return CheckRow("wheel radius", f"{radius:.4g} m", second, "ok"), log.robot
-    part = "geometry" if signals.joints else "driver"
-    others = "units, gear and the LiDAR's ranges" if "LiDAR" in name else "units and gear"
-    advice = f"write {part}.wheel_radius_m = {radius * ratio:.4g}, or check {others}."
-    row, robot = CheckRow("wheel radius", f"{radius:.4g} m", second, "contradiction", advice), log.robot
-    if signals.joints:
-        robot = replace(robot, geometry=replace(robot.geometry, wheel_radius_m=float(f"{radius * ratio:.4g}")))
-        row = replace(row, advice=f"{advice} All below, and robot.toml, are with this radius.")
-    return row, robot
-
-
-def _lidar_rows(checked: CheckedLog, signals: WheelSignals, motion: LidarMotion | None) -> list[CheckRow]:
-    """Mount of the LiDAR by the direction of travel and the turns, and its clock."""
-    log = checked.log
-    if log.sources.lidar is None:
-        return []
-    name, frame = "mount of LiDAR", log.frames.get(log.sources.lidar.topic, "")
-    source = f"turns by LiDAR{', wheels and gyro' if log.sources.imu is not None else ' and wheels'}"
-    rows = [
-        CheckRow("clocks", "as in the robot file", source, "contradiction", found.text.replace(CORRECTED, _IN_FILE))
-        for found in checked.lidar
-        if found.clock is not None
-    ]
-    mount = log.mounts.get(frame)
-    if mount is None:
-        unknown = CheckRow(name, f"frame '{frame}' unknown", "", "cannot be seen", f"publish it on /tf_static, or write [mounts.{frame}].")
-        return [*rows, unknown]
-    value = f"{frame}: yaw {math.degrees(mount.yaw):.0f} deg"
-    forward = forward_rate(log, signals)
-    direction = None if motion is None else _direction(motion, forward)
-    wrong = next((found for found in checked.lidar if found.clock is None), None)
-    if direction is None and wrong is None:
-        return [*rows, CheckRow(name, value, "", "cannot be seen", "drive straight on for 10 s where walls are in reach.")]
-    degrees = 0.0 if direction is None else math.degrees(direction)
-    side = "left" if degrees > 0.0 else "right"
-    second = f"travel is {abs(degrees):.0f} deg to the {side} of it" if abs(degrees) >= 1.0 else "travel agrees"
-    if wrong is not None:
-        return [*rows, CheckRow(name, value, second, "contradiction", wrong.text)]
-    advice = "" if abs(degrees) <= _MAX_YAW_DEG else f"if the robot did not slide, turn its yaw by {-degrees:+.0f} deg."
-    return [*rows, CheckRow(name, value, second, "contradiction" if advice else "ok", advice)]
-
-
-def _direction(motion: LidarMotion, forward: FloatArray) -> float | None:
-    """Direction of the LiDAR's travel against the wheels' [rad]; None where the drive is too short or directions differ."""
-    travel = (motion.speed + 1j * motion.side) * np.sign(forward)
-    use = np.isfinite(travel) & (np.abs(travel) > _MIN_SPEED_M_S) & (np.abs(motion.turn) < _MAX_TURN_RAD_S) & (forward != 0.0)
-    if use.sum() < _MIN_TRAVEL_INTERVALS:
-        return None
-    unit = travel[use] / np.abs(travel[use])
-    return float(np.angle(travel[use].sum())) if abs(unit.mean()) >= _MIN_COHERENCE else None
+def _radius(robot: Robot, set_up: SetUp) -> tuple[CheckRow | None, Robot]:
+    """Radius by the ways of another source, and the robot with it; None where none measures a way."""
+    way = set_up.scales.get(("wheels", "way")) or set_up.scales.get(("driver", "way"))
+    part = "geometry" if ("wheels", "way") in set_up.scales else "driver"
+    radius = getattr(robot, part).wheel_radius_m
+    if way is None:
+        advice = "drive straight on for 10 s with a LiDAR, or record a reference."
+        return CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice), robot
+    measured, sigma = radius * math.exp(-way[0]), radius * way[1]
+    second = f"{measured:.4g} +- {sigma:.2g} m by the ways of the other sources"
+    if abs(way[0]) <= _SAME_SCALE + _SIGMAS * way[1] or set_up.sentences:
+        return CheckRow("wheel radius", f"{radius:.4g} m", second, "ok"), robot
+    advice = f"write {part}.wheel_radius_m = {measured:.4g}, or check units, gear and the LiDAR's ranges."
+    changed = replace(getattr(robot, part), wheel_radius_m=float(f"{measured:.4g}"))
+    return CheckRow("wheel radius", f"{radius:.4g} m", second, "contradiction", advice), replace(robot, **{part: changed})
 
 
 def _filter_rows(log: Log, run: Run | None) -> list[CheckRow]:
@@ -383,29 +300,7 @@ def _scaling_row(robot: Robot, run: Run, source: str) -> CheckRow:
     return CheckRow("track and multiplier", value, measured, "ok" if is_same else "contradiction", advice)
 
 
-def _imu_rows(log: Log) -> list[CheckRow]:
-    if log.sources.imu is None:
-        return []
-    frame = log.frames.get(log.sources.imu.topic, "")
-    mount = log.mounts.get(frame, Mount())
-    published = first_force(log, log.sources.imu.topic)
-    if published is None:
-        return []
-    force = mount.rotation @ published
-    size = float(np.linalg.norm(force))
-    value = f"{frame}: roll {math.degrees(mount.roll):.0f}, pitch {math.degrees(mount.pitch):.0f} deg"
-    if not is_gravity(size):
-        advice = "the driver publishes no gravity in m/s^2: its axes show only in turns."
-        return [CheckRow("axes of IMU", value, f"{size:.1f} m/s^2 at the start", "cannot be seen", advice)]
-    tilt = math.acos(max(-1.0, min(1.0, float(force[2]) / size)))
-    second = f"gravity is {math.degrees(tilt):.0f} deg off its z axis"
-    if tilt <= _MAX_TILT_RAD:
-        return [CheckRow("axes of IMU", value, second, "ok")]
-    what = "it is upside down, or publishes gravity with the opposite sign" if tilt > math.pi - _MAX_TILT_RAD else "it is mounted otherwise"
-    return [CheckRow("axes of IMU", value, second, "contradiction", f"{what}: correct roll and pitch of '{frame}' in /tf_static.")]
-
-
-def _reference_row(log: Log, signals: WheelSignals | None, given: str | None) -> CheckRow:
+def _reference_row(log: Log, given: str | None) -> CheckRow:
     """Clock, scale and axes of the reference by the motion of the sensors: of the first minute, or of more where that is too even."""
     topic = given or log.reference_topic
     if topic is None:
@@ -413,12 +308,13 @@ def _reference_row(log: Log, signals: WheelSignals | None, given: str | None) ->
     found = load_reference(log, topic)
     if isinstance(found, Relations):
         return CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")
+    signals = read_signals(log)
     path = None if signals is None else dead_reckon(log, signals)
     if path is not None and (apart := disjoint_message(log, path, found)):
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", apart)
     compared = None if path is None else compare_reference([path], found)
     if compared is None and signals is not None:
-        run = _replayed(log, log.robot, log.mounts, "odometry", signals, _REFERENCE_S)
+        run = _replayed(log, log.robot, "odometry", _REFERENCE_S)
         compared = None if run is None else compare_reference([run.trajectory], found)
     if compared is None:
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)

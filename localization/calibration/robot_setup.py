@@ -27,8 +27,7 @@ from localization.calibration.wheel_fit import (
     read_motion,
     wheel_sides,
 )
-from localization.calibration.wheel_units import CORRECTED
-from localization.calibration.wheel_wiring import check_wiring
+from localization.evidence import CORRECTED, infer_set_up
 from localization.logs import open_log
 from localization.logs.topic_names import is_measured_outside, is_other_estimate, match_joints
 from localization.logs.topic_roles import TYPES, TopicOverrides
@@ -42,8 +41,6 @@ from motion_models.text_files import read_text
 
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _OPEN_SIDES = "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."
-_SURE_CORRELATION = 0.9
-"""Correlation of the wheels' turns with those of gyro or LiDAR, as in `wheel_wiring`."""
 _LEAST_DRIVEN_K = 0.8
 """k = track / effective track of two driven wheels and a caster is 1 within 2 %; of four wheels 0.43 to 0.77."""
 
@@ -317,9 +314,8 @@ def _decide_sides(draft: Draft, given: Given, path: Path) -> None:
     has_lengths = {"wheel_radius_m", "track_width_m", "wheelbase_m"} <= draft.values.keys()
     if draft.joints is None or not has_lengths or not {"imu", "scan", "points"} & draft.topics.keys():
         return
-    found = check_wiring(open_log(path, finish_robot(draft, given, "new")))
-    turns = {name: r for name, r in found.correlations.items() if name.startswith("turn")}
-    if found.is_ambiguous or not turns or not (found.findings or min(turns.values()) > _SURE_CORRELATION):
+    found = infer_set_up(open_log(path, finish_robot(draft, given, "new")))
+    if found.verdict not in ("consistent", "certain"):
         return
     draft.missing.remove(_OPEN_SIDES)
     left = ", ".join(found.robot.joints.left)
@@ -375,8 +371,8 @@ def finish_checked(draft: Draft, given: Given, path: Path, default_name: str) ->
     Where nothing in the log decides, the sentence names all causes and the robot stays as drafted. Raises what `open_log` does.
     """
     robot = finish_robot(draft, given, default_name)
-    found = check_wiring(open_log(path, robot))
-    texts = tuple(text.replace(CORRECTED, "Written to the robot file:") for text in found.findings)
+    found = infer_set_up(open_log(path, robot))
+    texts = tuple(text.replace(CORRECTED, "Written to the robot file:") for text in found.sentences)
     return (robot if found.is_ambiguous else found.robot), texts
 
 

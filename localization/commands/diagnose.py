@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
-from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import in_radians, new_folder, write_json
 from localization.diagnosis.baseline import estimate_baseline
@@ -39,6 +38,7 @@ from localization.diagnosis.handover import Reader, check_findings
 from localization.diagnosis.linearization import default_model
 from localization.diagnosis.result import DiagnosisResult
 from localization.diagnosis.suited_model import examine_beside_suited
+from localization.evidence import open_log_as_declared
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -166,7 +166,7 @@ class Diagnose:
         return dataclasses.replace(found, warnings=(*notes, *found.warnings))
 
     def _open(self, path: Path, robot: Robot) -> Log:
-        return open_wired(path, robot, self.topic.scored_against(self.reference))
+        return open_log_as_declared(path, robot, self.topic.scored_against(self.reference))
 
     def _cut(self, log: Log) -> Drive:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)

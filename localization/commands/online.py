@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,10 +19,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from localization.calibration.lidar_check import open_log_checked
 from localization.errors import CheckpointError, OutputError
 from localization.estimators import check_estimator
 from localization.events import Event
+from localization.evidence import open_log_with_set_up
 from localization.output import fingerprint
 from localization.pipeline import Pipeline
 from localization.ros.diagnostics import ERROR, OK, WARN, Status
@@ -82,8 +83,8 @@ class OnlineCommand(OnlineSettings):
                 view.close()
 
     def _play(self, console: Console, path: Path, rate: float, run: LiveRun, stop: StopSignal, view: View | None) -> None:
-        files, checked = run.files, open_log_checked(path, run.robot, self.topic)
-        log, robot, mounts = checked.log, checked.log.robot, checked.mounts
+        files, log = run.files, open_log_with_set_up(path, run.robot, self.topic).log
+        robot, mounts = log.robot, log.mounts
         has_lidar = log.sources.lidar is not None
         check_estimator(self.estimator, has_lidar, self.map is not None, log.no_wheels)
         trial = self.make_trial(has_lidar, robot)
@@ -155,14 +156,16 @@ class OnlineCommand(OnlineSettings):
         if run.node.use_sim_time:
             transport = SimTimeTransport(transport)
         console.print(f"listening in {transport.place}, compiling meanwhile", markup=False, soft_wrap=True)
+        answers = ThreadPoolExecutor(1, "set-up")
         try:
-            node = Node.start(transport, run, report, stop.is_set, view)
+            node = Node.start(transport, run, report, stop.is_set, view, answers)
             text = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
             console.print(text, markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 node.spin(stop.is_set, lambda n: self._show(console, live, n))
             count = node.finish()
         finally:
+            answers.shutdown(wait=False, cancel_futures=True)
             transport.close()
         for note in node.warnings():
             report(note)

@@ -18,7 +18,6 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from localization.calibration.lidar_check import open_log_checked
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError, MapError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
@@ -33,6 +32,7 @@ from localization.evaluation.references import (
 )
 from localization.evaluation.scores import Result, score
 from localization.events import Event, PositionSample
+from localization.evidence import open_log_with_set_up
 from localization.lifting import write_tum3
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
@@ -112,8 +112,8 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json, self.save_map, self.extend_map)
-        checked = open_log_checked(self.log, robot, self.topic.scored_against(self.reference))
-        log, robot, mounts = checked.log, checked.log.robot, checked.mounts
+        log = open_log_with_set_up(self.log, robot, self.topic.scored_against(self.reference)).log
+        robot, mounts = log.robot, log.mounts
         has_lidar = log.sources.lidar is not None
         models = [make_model(name, robot) for name in names(self.model, "--model")]
         forms = names(self.corrections, "--corrections")

@@ -20,7 +20,6 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from localization.blas_threads import ONE_BLAS_THREAD
-from localization.calibration.lidar_check import open_log_checked
 from localization.comparison.remote import AccessError, is_url, local_copy, url_fingerprint
 from localization.comparison.turning import MeanCg, turning
 from localization.errors import EvaluationError, LogError, OutputError, TransportError
@@ -28,6 +27,7 @@ from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, check_estimator
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations, describe_instant
 from localization.evaluation.scores import score
+from localization.evidence import open_log_with_set_up
 from localization.log_replay import Run, replay
 from localization.logs import Log, TopicOverrides
 from localization.output import fingerprint, output_errors, versions
@@ -149,8 +149,7 @@ def _failed(job: Job, trial: TrialSpec, reason: str, cause: str = INPUT) -> Row:
 
 
 def _run(job: Job, path: Path) -> list[Row]:
-    checked = open_log_checked(path, job.robot, job.topics.scored_against(job.reference))
-    log = checked.log
+    log = open_log_with_set_up(path, job.robot, job.topics.scored_against(job.reference)).log
     has_lidar = log.sources.lidar is not None
     rows, able = [], []
     for trial in job.trials:
@@ -164,7 +163,7 @@ def _run(job: Job, path: Path) -> list[Row]:
     reference = _reference(log, job)
     named = [Trial(make_model(trial.model, log.robot), trial.estimator, trial.corrections) for trial in able]
     cg = MeanCg(log.robot.center_of_gravity)
-    runs = replay(cg.watch(log.events()), named, log.robot, checked.mounts, has_lidar, job.config)
+    runs = replay(cg.watch(log.events()), named, log.robot, log.mounts, has_lidar, job.config)
     problems = {"notes": " ".join(log.warnings()), "damage": " ".join(log.damage())}
     date, has_time, _ = describe_instant(log.start_ns).partition("T")
     day = {"day": job.place.day or (date if has_time else "")}

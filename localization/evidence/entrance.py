@@ -16,6 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from localization.events import ImuSample, Scan
+from localization.evidence.alternatives import Row
+from localization.evidence.fields import own_faults
 from localization.evidence.search import make_stacks
 from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, from_scans, is_comparable
 from localization.evidence.verdict import CORRECTED, SetUp, decide
@@ -66,12 +68,20 @@ def open_log_as_declared(path: Path | str, robot: Robot, topics: TopicOverrides 
 class ReferencePoses(Protocol):
     """Poses of the robot by a reference system."""
 
-    source: str
-    """Topic or file."""
-    stamps_ns: Any
-    """(N,) strictly increasing."""
-    yaws: Any
-    """(N,) [rad], or None where there are positions only."""
+    @property
+    def source(self) -> str:
+        """Topic or file."""
+        ...
+
+    @property
+    def stamps_ns(self) -> Any:
+        """(N,) strictly increasing."""
+        ...
+
+    @property
+    def yaws(self) -> Any:
+        """(N,) [rad], or None where there are positions only."""
+        ...
 
     @property
     def poses(self) -> FloatArray:
@@ -86,7 +96,11 @@ def infer_set_up(log: Log, reference: ReferencePoses | None = None) -> SetUp:
 
 def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
     """The set-up with which ``sources`` are most probable."""
-    used = [source for source in sources if is_comparable(source)]
+    own: tuple[Row, ...] = ()
+    used: list[Source] = []
+    for source in sources:
+        alive, rows = own_faults(source, robot)
+        used, own = [*used, *([alive] if is_comparable(alive) else [])], (*own, *rows)
     if len(used) < 2:
         there = used[0].name if used else "no source"
         return SetUp("undecidable", robot, reason=f"{there} alone measures the motion often enough: nothing can be compared.")
@@ -96,7 +110,7 @@ def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
         return SetUp("undecidable", robot, reason=f"the sources overlap by {max(end - start, 0.0):.1f} s: too short to be compared.")
     if all(float(np.nanmax(np.abs(source.rates(edges)), initial=0.0)) < 1e-3 for source in used):
         return SetUp("undecidable", robot, reason="nothing moves: drive straight on for 10 s and turn in place both ways.")
-    return decide(used, make_stacks(used, edges, robot), robot)
+    return decide(used, make_stacks(used, edges, robot), robot, own)
 
 
 def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Source]:

@@ -41,8 +41,8 @@ class Noise:
 
 
 NOISE: Mapping[Kind, Noise] = {
-    "wheels": Noise(0.15, 0.03, 0.02, 0.35, 0.08),
-    "driver": Noise(0.15, 0.03, 0.02, 0.45, 0.08),
+    "wheels": Noise(0.15, 0.03, 0.02, 0.25, 0.08),
+    "driver": Noise(0.15, 0.03, 0.02, 0.05, 0.08),
     "gyro": Noise(0.04, 0.01, 0.0, 0.03, 0.0, bias=0.03),
     "lidar": Noise(0.06, 0.02, 0.02, 0.01, 0.04),
     "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),
@@ -156,7 +156,7 @@ def _profile(
     """Channels less bias (A, k, n), scales (A, k, n) and variances (A, k, n); logarithms of the scales, biases (A, k), information (A, k)
     on the scales: the maximum of the posterior by alternation with the motion."""
     count = z.shape[1]
-    c, b = np.zeros(z.shape[:2]), np.zeros(z.shape[:2])
+    c, b = _first_scales(z, known, tau), np.zeros(z.shape[:2])
     info = np.zeros(z.shape[:2])
     for _ in range(_ITERATIONS):
         scale, less = np.exp(c)[..., None], z - b[..., None]
@@ -177,6 +177,16 @@ def _profile(
     scale = np.exp(c)[..., None]
     variance = np.where(known, floor**2 + (relative * scale * x) ** 2, 1.0)
     return z - b[..., None] * known, np.where(known, scale, 0.0), variance, c, b, info
+
+
+def _first_scales(z: FloatArray, known: FloatArray, tau: FloatArray) -> FloatArray:
+    """Logarithms of the scales (A, k) by the source whose own is known best: from there the alternation with the motion converges."""
+    best = tau.argmin(axis=1)
+    rows = np.arange(len(z))
+    reference = z[rows, best][:, None]
+    both = known & known[rows, best][:, None]
+    ratio = np.where(both, z * reference, 0.0).sum(2) / (np.where(both, reference**2, 0.0).sum(2) + 1e-12)
+    return np.where(ratio > 0.0, np.log(np.clip(ratio, 1e-4, 1e4)), 0.0)
 
 
 def _size_of_motion(z: FloatArray, a: FloatArray, variance: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:

@@ -29,15 +29,28 @@ def refined_rows(stacks: Sequence[Stack], choice: Choice, robot: Robot) -> tuple
     return tuple(found)
 
 
+def measured_scales(stacks: Sequence[Stack], choice: Choice) -> dict[tuple[str, str], tuple[float, float]]:
+    """Logarithm of the scale of wheels or driver by the other sources, and its sigma, by source and channel."""
+    single = [Stack(stack.kind, [stack.alternatives[k]]) for stack, k in zip(stacks, choice, strict=True)]
+    found: dict[tuple[str, str], tuple[float, float]] = {}
+    for i, stack in enumerate(single):
+        for name in ("way", "turn") if stack.kind in ("wheels", "driver") else ():
+            if sum(other.channel(name) is not None for other in single) > 1:
+                found[stack.kind, name] = scales(_freed(single, i), name)[i]
+    return found
+
+
+def _freed(single: Sequence[Stack], index: int) -> list[Stack]:
+    """``single`` with the scale of one source free."""
+    free = replace(single[index].alternatives[0], way_sigma=_FREE, turn_sigma=_FREE)
+    return [Stack(stack.kind, [free]) if i == index else stack for i, stack in enumerate(single)]
+
+
 def _with_factor(row: Row, single: Sequence[Stack]) -> Row:
     """The factor is that of the ways where another source has them, else that of the turns."""
     index = next(i for i, stack in enumerate(single) if stack.kind == "wheels")
     has_way = sum(stack.channel("way") is not None for stack in single) > 1
-    free = [
-        Stack(stack.kind, [replace(stack.alternatives[0], way_sigma=_FREE, turn_sigma=_FREE)]) if i == index else stack
-        for i, stack in enumerate(single)
-    ]
-    c, sigma = scales(free, "way" if has_way else "turn")[index]
+    c, sigma = scales(_freed(single, index), "way" if has_way else "turn")[index]
     nominal = row.value or 1.0
     factor = nominal if abs(c) < 2.0 * max(sigma, _NAMED_SIGMA) and row.detail == "0.05" else float(f"{nominal * math.exp(-c):.4g}")
     what = "large" if factor < 1.0 else "small"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ _WIDTHS = (8, 6, 5, 3)
 """Choices that are expanded by one more row, by depth: three faults at once are found, and the one beside them."""
 _RESCORED = 50
 """Best choices whose evidence is integrated over the level of the noise."""
+_CLEAR = 9.0
+"""Logarithm of the evidence by which the robot file's set-up beats each single row, from where on no pair of rows is tried."""
+_SEARCH_LEVELS = (0.35, 1.0)
+"""Levels of the noise at which set-ups are searched."""
 _MAX_BINS = 140
 _CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
 """Prior odds of a clock that is off by `_CLOCK_S`; of a longer delay x they fall as 1 / x^2, as many delays are tried (`delays`)."""
@@ -101,18 +105,31 @@ def _own_size_evidence(channel: FloatArray) -> float:
     return -0.5 * TEMPER * len(known) * (1.0 + math.log(math.tau * mean_square))
 
 
-def search(stacks: Sequence[Stack]) -> dict[Choice, float]:
+@dataclass(frozen=True)
+class Found:
+    """Result of a search."""
+
+    scores: Mapping[Choice, float]
     """Log posterior by choice, of the best ones, the level of the noise integrated out."""
+    against: Mapping[str, float]
+    """By id of a row: logarithm of the Bayes factor against that fault alone."""
+
+
+def search(stacks: Sequence[Stack]) -> Found:
+    """The best choices, and how far the drive refutes each single fault."""
     null = tuple(0 for _ in stacks)
     found: dict[Choice, float] = {}
-    for level in (0.35, 1.0):
-        _search_at(stacks, null, level, found)
+    against: dict[str, float] = {}
+    for level in _SEARCH_LEVELS:
+        for key, value in _search_at(stacks, null, level, found).items():
+            against[key] = min(value, against.get(key, math.inf))
     best = sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED]
     kept = dict.fromkeys([null, *best])
-    return {choice: _marginal(stacks, choice) for choice in kept}
+    return Found({choice: _marginal(stacks, choice) for choice in kept}, against)
 
 
-def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[Choice, float]) -> None:
+def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[Choice, float]) -> dict[str, float]:
+    """Add the best choices at a ``level`` to ``found``; the Bayes factors against single faults."""
     at_level: dict[Choice, float] = {}
     done: set[Choice] = set()
 
@@ -123,13 +140,27 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
                 at_level[(*choice[:i], k, *choice[i + 1 :])] = float(value)
 
     expand(null)
-    for width in _WIDTHS:
+    against = _against(stacks, null, at_level)
+    rivals = max((score for choice, score in at_level.items() if any(row.is_fault for row in rows_of(stacks, choice))), default=-math.inf)
+    for width in _WIDTHS if rivals > at_level[null] - _CLEAR else ():
         for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
             expand(choice)
     best = sorted(at_level, key=at_level.__getitem__, reverse=True)[:_RESCORED]
     top = at_level[best[0]]
     for choice in best:
         found[choice] = max(found.get(choice, -math.inf), at_level[choice] - top)
+    return against
+
+
+def _against(stacks: Sequence[Stack], null: Choice, scores: Mapping[Choice, float]) -> dict[str, float]:
+    """By id of a row: logarithm of the Bayes factor of the robot file's set-up over that fault alone."""
+    found: dict[str, float] = {}
+    for choice, score in scores.items():
+        faults = [row for row in rows_of(stacks, choice) if row.is_fault]
+        if len(faults) == 1:
+            key = faults[0].id
+            found[key] = min(found.get(key, math.inf), scores[null] - score + faults[0].log_odds)
+    return found
 
 
 def _marginal(stacks: Sequence[Stack], choice: Choice) -> float:

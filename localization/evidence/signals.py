@@ -59,14 +59,24 @@ class Source:
     """Left wheels, then right ones."""
     left: int = 0
     """How many of ``joints`` are left."""
-    up: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    """(3,) the body's z axis in the gyro's frame, by its mount."""
     force: FloatArray | None = None
     """(3,) mean specific force at the start, in the IMU's frame [m/s^2]."""
-    place: complex = 0.0
-    """Place of the LiDAR in the body, x + i y [m], by its mount."""
     frame: str = ""
     """Frame of a LiDAR or an IMU."""
+    jumps: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """(m, 2) row and size of the steps of wheels' angles that are no motion [rad]."""
+    mount: Mount = Mount()  # noqa: RUF009 (frozen)
+    """Its mount, as log and robot file have it."""
+
+    @property
+    def up(self) -> FloatArray:
+        """(3,) the body's z axis in the sensor's frame, by its mount."""
+        return np.asarray(self.mount.rotation[2])
+
+    @property
+    def place(self) -> complex:
+        """Place of the sensor in the body, x + i y [m], by its mount."""
+        return complex(self.mount.x, self.mount.y)
 
     @property
     def period_s(self) -> float:
@@ -104,11 +114,13 @@ def from_joints(name: str, readings: Sequence[JointReading], joints: tuple[Seque
         return None
     names, left = (*joints[0], *joints[1]), len(joints[0])
     velocity = _integrated(t, np.array([reading.velocity for reading in rows]))
-    position, is_known = _without_resets(np.array([reading.position for reading in rows]))
+    angles = np.array([reading.position for reading in rows])
+    position, is_known = _without_resets(angles)
     has_angles = bool(np.isfinite(position).any(axis=0).all() and np.ptp(np.nan_to_num(position), axis=0).any())
     if has_angles:
         has_rates = bool(np.isfinite(velocity).all() and np.ptp(velocity, axis=0).any())
-        return Source(name, "wheels", t, position, is_known, velocity if has_rates else None, names, left)
+        second = velocity if has_rates else None
+        return Source(name, "wheels", t, position, is_known, second, names, left, jumps=_jumps(angles, is_known))
     return Source(name, "wheels", t, np.nan_to_num(velocity), _finite_steps(velocity), None, names, left)
 
 
@@ -135,8 +147,8 @@ def from_gyro(name: str, samples: Sequence[ImuSample], mounts: Mapping[str, Moun
         return None
     angles = _integrated(t, np.array([sample.angular_velocity for sample in rows]))
     force = np.median([sample.linear_acceleration for sample in rows[:_STEADY_SAMPLES]], axis=0)
-    up = mounts.get(frame, Mount()).rotation[2]
-    return Source(name, "gyro", t, angles, np.ones((len(t) - 1, 3), bool), up=up, force=force, frame=frame)
+    known = np.ones((len(t) - 1, 3), bool)
+    return Source(name, "gyro", t, angles, known, force=force, frame=frame, mount=mounts.get(frame, Mount()))
 
 
 def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], first_ns: int) -> Source | None:
@@ -158,15 +170,16 @@ def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], fi
     if len(t) < 4:
         return None
     mount = mounts.get(frame or "", Mount())
-    place = complex(mount.x, mount.y)
     moves = np.where(np.array(known), np.array(steps), 0.0)
-    at_sensor = moves[:, 0] + 1j * moves[:, 1] + 1j * moves[:, 2] * place  # the body's motion by the file's place, at that place
+    at_sensor = (
+        moves[:, 0] + 1j * moves[:, 1] + 1j * moves[:, 2] * complex(mount.x, mount.y)
+    )  # the body's motion by the file's place, at that place
     columns = np.stack([at_sensor.real, at_sensor.imag, moves[:, 2]], axis=1)
     integrals = np.vstack([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
-    return Source(name, "lidar", np.array(t), integrals, np.array(known), place=place, frame=frame or "")
+    return Source(name, "lidar", np.array(t), integrals, np.array(known), frame=frame or "", mount=mount)
 
 
-def from_poses(name: str, stamps_ns: FloatArray, poses: FloatArray, first_ns: int) -> Source | None:
+def from_poses(name: str, stamps_ns: NDArray[np.int64], poses: FloatArray, first_ns: int) -> Source | None:
     """Reference poses (m, 3), NaN where they have no heading, as motion in their own axes."""
     order = np.argsort(stamps_ns, kind="stable")
     t = (np.asarray(stamps_ns)[order] - first_ns) * 1e-9
@@ -179,7 +192,9 @@ def from_poses(name: str, stamps_ns: FloatArray, poses: FloatArray, first_ns: in
     columns = np.stack([way.real, way.imag, turn], axis=1)
     gap = np.diff(t) > 4.0 * np.median(np.diff(t)) + _BIN_S
     known = np.repeat(~gap[:, None], 3, axis=1)
-    return Source(name, "reference", t, np.vstack([np.zeros((1, 3)), np.cumsum(columns, axis=0)]), known)
+    return Source(
+        name, "reference", np.asarray(t, dtype=float), np.vstack([np.zeros((1, 3)), np.cumsum(columns, axis=0)]).astype(float), known
+    )
 
 
 def _local(delta: FloatArray) -> tuple[float, float, float]:
@@ -204,6 +219,13 @@ def _integrated(t: FloatArray, rates: FloatArray) -> FloatArray:
 
 def _finite_steps(integrals: FloatArray) -> BoolArray:
     return np.isfinite(np.diff(integrals, axis=0))
+
+
+def _jumps(values: FloatArray, is_known: BoolArray) -> FloatArray:
+    """(m, 2) row and size of the finite steps of ``values`` (n, c) that are no motion."""
+    steps = np.diff(values, axis=0)
+    rows, columns = np.nonzero(np.isfinite(steps) & ~is_known)
+    return np.column_stack([rows.astype(float), steps[rows, columns]])
 
 
 def _without_resets(values: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from localization.evidence.alternatives import Row
 from localization.evidence.likelihood import Stack
-from localization.evidence.refine import refined_rows
+from localization.evidence.refine import measured_scales, refined_rows
 from localization.evidence.search import Choice, posterior, search
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
@@ -57,6 +57,12 @@ class SetUp:
     """False where the gyro may have another sign or axis, or measures another motion."""
     reason: str = ""
     """Why nothing could be compared."""
+    by_file: float = 0.0
+    """Probability that all is as the robot file says."""
+    against: Mapping[str, float] = field(default_factory=dict)
+    """By id of a row: logarithm of the Bayes factor against that fault alone."""
+    scales: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)
+    """By source and channel (way, turn): logarithm of what it measures over the motion, with the others as scale, and its sigma."""
 
     @property
     def is_ambiguous(self) -> bool:
@@ -69,26 +75,66 @@ class SetUp:
         return self.hypotheses[0].rows if self.verdict in ("certain", "ambiguous") else ()
 
 
-def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot) -> SetUp:
-    """The answer to `search`."""
-    ranked = posterior(stacks, search(stacks))
-    found = [(p, choice, _faults(refined_rows(stacks, choice, robot))) for p, choice in ranked]
+def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own: tuple[Row, ...] = ()) -> SetUp:
+    """The answer to `search`, beside the faults that messages show by their ``own`` fields."""
+    searched = search(stacks)
+    ranked = posterior(stacks, searched.scores)
+    found = [(p, choice, (*own, *_faults(refined_rows(stacks, choice, robot)))) for p, choice in ranked]
     hypotheses = tuple(Hypothesis(p, rows) for p, _, rows in found if p >= _NAMED)
     by_file = sum(p for p, _, rows in found if not rows)
     if by_file > 1.0 - CERTAIN:
-        return SetUp("consistent", robot, hypotheses)
+        return SetUp(
+            "consistent", robot, hypotheses, by_file=by_file, against=searched.against, scales=measured_scales(stacks, ranked[0][1])
+        )
     kept = [(p, choice, rows) for p, choice, rows in found if p >= _NAMED]
     common = _common(kept)
     is_certain = kept[0][0] >= CERTAIN or all(len(rows) == len(common) for _, _, rows in kept)
+    if (alignment := _alignment(sources, kept, common)) is not None:
+        return _aligned(sources, kept, common, alignment, robot, hypotheses, by_file)
     corrected = _correct(robot, common)
-    rest = [] if is_certain else [tuple(row for row in rows if row not in common) for _, _, rows in kept]
+    families = {row.family for row in common}
+    rest = [] if is_certain else [tuple(row for row in rows if row.family not in families) for _, _, rows in kept]
     is_gyro_used = not any(row.source == "gyro" and row.correct is None for row in common)
     is_gyro_used &= not any(row.source == "gyro" for rows in rest for row in rows)
-    unresolved = [(p, choice) for p, choice, rows in kept if any(row.correct is None or row not in common for row in rows)]
+    unresolved = [(p, choice) for p, choice, rows in kept if any(row.correct is None or row.family not in families for row in rows)]
     corrected = _with_mixture_noise(corrected, stacks, unresolved)
     keys = changed_entries(robot, _correct(robot, common))
     sentences = (*_sentences(sources, common, robot, kept), *_ambiguity(sources, kept, rest))
-    return SetUp("certain" if is_certain else "ambiguous", corrected, hypotheses, sentences, keys, is_gyro_used)
+    return SetUp("certain" if is_certain else "ambiguous", corrected, hypotheses, sentences, keys, is_gyro_used, by_file=by_file)
+
+
+def _alignment(sources: Sequence[Source], kept: Sequence[tuple[float, Choice, tuple[Row, ...]]], common: tuple[Row, ...]) -> Row | None:
+    """The clock to shift where set-ups differ in which of the clocks is off, and agree in how far they are apart; else None."""
+    rest = [[row for row in rows if row.family not in {r.family for r in common}] for _, _, rows in kept]
+    clocks = {row.id: row for rows in rest for row in rows}
+    if len(kept) < 2 or len(clocks) < 2 or any(len(rows) != 1 or rows[0].source != "clock" for rows in rest):
+        return None
+    return next((clocks[key] for key in ("clock.wheels", "clock.gyro", "clock.lidar") if key in clocks), None)
+
+
+def _aligned(
+    sources: Sequence[Source],
+    kept: Sequence[tuple[float, Choice, tuple[Row, ...]]],
+    common: tuple[Row, ...],
+    clock: Row,
+    robot: Robot,
+    hypotheses: tuple[Hypothesis, ...],
+    by_file: float,
+) -> SetUp:
+    """Two clocks are apart, and nothing shows which is off: they are brought together, and the covariance has the way in that time."""
+    rows = (*common, clock)
+    corrected, others = _correct(robot, rows), sorted({row.text for _, _, r in kept for row in r if row.source == "clock"} - {clock.text})
+    late_s = abs(clock.value or 0.0)
+    keys = changed_entries(robot, corrected)
+    written = "; ".join(f"{key} = {value}" for key, value in keys.items() if key.startswith("clock."))
+    names = " and ".join(source.name for source in sources)
+    text = (
+        f"{names}: their stamps are {late_s:.2f} s apart, and nothing in the log shows whose clock is off"
+        f" ({_topic(sources, clock)}: {clock.text}; or {', '.join(others)}). {CORRECTED} {written}, or synchronize the clocks."
+        " The covariance has the way in that time."
+    )
+    corrected = replace(corrected, clock=replace(corrected.clock, sigma_s=max(corrected.clock.sigma_s, late_s)))
+    return SetUp("ambiguous", corrected, hypotheses, (*_sentences(sources, common, robot, kept), text), keys, by_file=by_file)
 
 
 def _faults(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -96,9 +142,9 @@ def _faults(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 
 def _common(kept: Sequence[tuple[float, Choice, tuple[Row, ...]]]) -> tuple[Row, ...]:
-    """Faults of the most probable set-up that all named ones share."""
-    shared = set.intersection(*({row.key for row in rows} for _, _, rows in kept))
-    return tuple(row for row in kept[0][2] if row.key in shared)
+    """Faults of the most probable set-up of whose family all named ones have one: their measured values hardly differ."""
+    shared = set.intersection(*({row.family for row in rows} for _, _, rows in kept))
+    return tuple(row for row in kept[0][2] if row.family in shared)
 
 
 def _correct(robot: Robot, rows: Sequence[Row]) -> Robot:

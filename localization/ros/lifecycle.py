@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from localization.errors import SettingError
@@ -105,9 +106,10 @@ class ManagedNode:
         def is_over() -> bool:
             return stop.is_set() or not self._is_active
 
+        answers = ThreadPoolExecutor(1, "set-up")
         try:
             with files.claimed():
-                self._estimator = Node.start(transport, self._live_run, self._log.warning, is_over)
+                self._estimator = Node.start(transport, self._live_run, self._log.warning, is_over, executor=answers)
                 self._log.info(f"running {settings.model} in {settings.estimator} on {', '.join(self._estimator.topics)}")
                 self._estimator.spin(is_over)
                 count = self._estimator.finish()
@@ -118,6 +120,7 @@ class ManagedNode:
         except SkidlocError as error:
             self._fail(error)
         finally:
+            answers.shutdown(wait=False, cancel_futures=True)
             self._estimator = None
             self._transport.release()
 

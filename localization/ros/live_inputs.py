@@ -8,14 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.calibration.lidar_check import LidarCheck
-from localization.calibration.wheel_wiring import LiveSensors
 from localization.logs.decode import MessageStats
 from localization.logs.topic_roles import Sources
 from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TransformConflicts
 from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
 from localization.ros.live_stream import LiveStream
-from localization.ros.live_wiring import LiveWiring
 from localization.ros.payloads import Payloads
 from localization.ros.session import LiveRobot
 from localization.ros.settings import LiveRun
@@ -95,21 +92,6 @@ class LiveInputs:
         self.stats.clear()
         self.stream = self.open_stream(self.stats)
         self.payloads.loads, self.payloads.mounts = loads, mounts
-
-    def wiring_check(self, mounts: Mapping[str, Mount], *, is_clock_known: bool) -> LiveWiring | None:
-        """Check of the wheels against gyro and LiDAR; None where nothing can contradict them: neither each other, nor a gyro their driver's
-        odometry."""
-        wheels = self.sources.wheels
-        if wheels is None or (wheels.kind != "joint_states" and self.sources.imu is None):
-            return None
-        return LiveWiring(LiveSensors(self.robot, self.sources, mounts), self.discovered.parts.joints, is_clock_known)
-
-    def lidar_check(self, mounts: Mapping[str, Mount], *, is_clock_known: bool) -> LidarCheck | None:
-        """Check of the LiDAR's mount and clock against wheels and gyro on the first metres; None without wheels or LiDAR."""
-        lidar, has_gyro = self.sources.lidar, self.sources.imu is not None
-        if lidar is None or self.sources.wheels is None:
-            return None
-        return LidarCheck(mounts, self.robot, lidar.topic, has_gyro, is_clock_known)
 
 
 def _gnss(run: LiveRun, transport: Transport, stats: MessageStats) -> GnssReceiver | None:

@@ -12,6 +12,7 @@ import queue
 import signal
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -19,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from localization.calibration.lidar_check import corrected
 from localization.errors import CheckpointError
 from localization.estimators import Estimate, PriorMap, SavedMapFusion
 from localization.events import Event, Scan
@@ -30,9 +30,9 @@ from localization.ros.diagnostics import Doctor, Health, Status
 from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
 from localization.ros.interim_odometry import WaitingMessages
 from localization.ros.jit_warm_up import WarmUp
-from localization.ros.live_entrance import EntranceChecks, LiveEntrance
 from localization.ros.live_inputs import LiveInputs
 from localization.ros.live_outputs import LiveOutputs
+from localization.ros.live_set_up import EntranceChecks, LiveSensors, LiveSetUp
 from localization.ros.live_stream import WheelAngles, check_age
 from localization.ros.node_status import NodeStatus
 from localization.ros.operator_commands import OperatorCommands
@@ -87,14 +87,16 @@ class Node:
         trial: Trial,
         publisher: EstimatePublisher,
         report: Callable[[str], None],
+        executor: Executor | None = None,
     ) -> None:
-        """``run`` with resolved topics. The session begins in `_open_session`."""
+        """``run`` with resolved topics; ``executor``: where questions about the set-up are answered beside the estimator. The session
+        begins in `_open_session`."""
         self._transport, self._run, self._trial, self._report = transport, run, trial, report
         self.inputs = LiveInputs(transport, run, discovered)
         self.outputs = LiveOutputs(publisher, self.inputs, trial, run)
         doctor = Doctor(run.robot, trial.model.name, discovered.mounts, 60.0 * run.node.diagnose_every_min)
         self.status = NodeStatus(self.inputs, publisher, doctor, report)
-        self._checks = EntranceChecks(self.inputs)
+        self._checks = EntranceChecks(executor)
         self.commands = OperatorCommands(self, transport, run.node.names, report)
         self._waiting: WaitingMessages | None = None
         """None where messages are processed as they come."""
@@ -109,11 +111,13 @@ class Node:
         report: Callable[[str], None],
         is_over: Callable[[], bool] = lambda: False,
         view: View | None = None,
+        executor: Executor | None = None,
     ) -> Node:
         """Compile and discover the topics side by side, then begin, or continue from the state on disk. Where compiling takes longer,
         odometry is by wheels alone until then.
 
-        ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`). Raises `TransportError`, `TopicError`,
+        ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`); ``executor`` answers which set-up the
+        robot has beside the estimator, None at once. Raises `TransportError`, `TopicError`,
         `EstimatorError`, `CheckpointError` and `OutputError`.
         """
         warming = WarmUp(run)
@@ -138,7 +142,7 @@ class Node:
         notes = prior_notes(run.robot, [trial.model.name])
         for warning in (*notes, *notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
             report(warning)
-        node = cls(transport, run, discovered, trial, publisher, report)
+        node = cls(transport, run, discovered, trial, publisher, report, executor)
         node._open_session(discovered, view, is_compiled)
         return node
 
@@ -163,7 +167,7 @@ class Node:
             if self.session.head:
                 self._continue_from(self.session.head, discovered.start_ns)
             else:
-                self._checks.begin(self.session.pipeline.mounts)
+                self._begin_checks()
             if not is_compiled():
                 self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
                 self._waiting = WaitingMessages.of(self.inputs.open_stream(MessageStats()), is_ready=is_compiled)
@@ -243,7 +247,7 @@ class Node:
         """Begin anew at ``start``: with a new map, and nothing learned of the motion model. ``is_moved``: `odom` jumps to there."""
         pipeline = self._make_pipeline(self.session.pipeline.mounts)
         if self._checks.running is not None:  # of the motion from here on
-            self._checks.begin(self.session.pipeline.mounts, lidar=False)
+            self._begin_checks()
             self.session.start_error_m = 0.0
         if self._trial.prior is not None:  # the saved map stays where it is
             start = replace(start, map_T_start=np.zeros(3), map_cov=np.zeros((3, 3)))
@@ -375,55 +379,35 @@ class Node:
             self.status.report_problems(self.session)
         return bool(estimates)
 
-    def _add_to_entrance(self, entrance: LiveEntrance, event: Event) -> None:
+    def _add_to_entrance(self, entrance: LiveSetUp, event: Event) -> None:
         entrance.add_event(event)
         self.session.start_error_m = entrance.largest_error_m
 
-    def _pass_entrance(self, entrance: LiveEntrance) -> None:
+    def _begin_checks(self) -> None:
+        """Ask from here on which set-up the robot has."""
+        inputs = self.inputs
+        sensors = LiveSensors(inputs.robot, inputs.sources, inputs.discovered.parts.joints, self.session.pipeline.mounts)
+        running = self._checks.begin(sensors)
+        inputs.stream.on_reading = None if running is None else running.add
+
+    def _pass_entrance(self, entrance: LiveSetUp) -> None:
         """Go on as robot file and transforms have it, or, from the start of the drive on, with what was found."""
         self._checks.end(self._report)
-        wiring, lidar, reading = entrance.wiring, entrance.lidar, self.inputs.open_stream(MessageStats())
+        reading = self.inputs.open_stream(MessageStats())
         reading.restore(self.inputs.stream.wheel_angles)
-        if wiring is not None:
-            uses_gyro = wiring.has_lost_signs or not wiring.is_ambiguous
-            self.inputs.rewire(self._keep_wiring(LiveRobot(wiring.robot, uses_gyro)), self.session.pipeline.mounts)
-            self._begin_anew(self.session.pipeline.mounts)
-            is_clock_known = any(key.startswith("clock.") for key in wiring.keys)
-            self._checks.begin(  # what comes next: units after signs, the LiDAR after both
-                self.session.pipeline.mounts,
-                wiring=bool(wiring.keys),
-                lidar=not wiring.is_ambiguous,
-                is_gyro_clock_known=is_clock_known,
-            )
-        elif lidar is not None and lidar.is_corrected:
-            is_clock_known = lidar.clock is not None
-            if lidar.clock is not None:
-                robot = replace(self.inputs.robot, clock=lidar.clock)
-                self.inputs.rewire(self._keep_wiring(LiveRobot(robot, self._uses_gyro)), self.session.pipeline.mounts)
-            before = self.session.pipeline.mounts
-            is_turned = lidar.mount is not None and lidar.mount.x == before[lidar.frame].x  # it may be elsewhere, too
-            self._begin_anew(corrected(before, lidar))
-            self._checks.begin(
-                self.session.pipeline.mounts,
-                lidar=is_clock_known or is_turned,
-                is_gyro_clock_known=is_clock_known,
-                is_lidar_clock_known=not is_turned,
-            )
-        else:
+        self.inputs.stream.on_reading, found = None, entrance.found
+        if found is None or not found.sentences:
+            self.session.start_error_m = 0.0
             return
+        self.session.state.wiring = LiveRobot(found.robot, found.is_gyro_used)  # checkpoints hold it from now on
+        self.inputs.rewire(self.session.state.wiring, self.session.pipeline.mounts)
+        self._begin_anew(found.robot.with_mounts(self.session.pipeline.mounts))
+        if found.keys:  # more may show once that is corrected
+            self._begin_checks()
         rest = () if self._waiting is None else self._waiting.queue
         waiting = WaitingMessages.of(reading, entrance.messages)
         waiting.queue.extend(rest)
         self._waiting = waiting
-
-    @property
-    def _uses_gyro(self) -> bool:
-        return self.session.state.wiring is None or self.session.state.wiring.uses_gyro
-
-    def _keep_wiring(self, wiring: LiveRobot) -> LiveRobot:
-        """``wiring``, which checkpoints hold from now on."""
-        self.session.state.wiring = wiring
-        return wiring
 
     def _begin_anew(self, mounts: Mapping[str, Mount]) -> None:
         """Estimate with ``mounts`` from the start of the drive on, of which the messages come again."""

@@ -15,7 +15,7 @@ from typing import Any
 
 from localization.pipeline import Pipeline, Trial
 from localization.ros.jit_warm_up import WarmUp
-from localization.ros.live_entrance import LiveEntrance
+from localization.ros.live_set_up import LiveSetUp
 from localization.ros.live_stream import LiveStream
 from localization.ros.node import Node
 from localization.ros.predictor import Predictor
@@ -38,7 +38,7 @@ _PARTS: tuple[tuple[str, type[Any], str], ...] = (
     ("encoding of predictions", EstimatePublisher, "publish_prediction"),
     ("encoding of estimates", EstimatePublisher, "publish_estimate"),
     ("state to disk", Session, "save_state"),
-    ("comparison of sensors on the first metres", LiveEntrance, "add_event"),
+    ("comparison of sensors on the first metres", LiveSetUp, "add_event"),
     ("diagnostics, path, map", Node, "publish_status"),
 )
 

@@ -36,7 +36,14 @@ def quantities(found: dict[str, Any], verdict: str) -> set[str]:
 def test_check_of_healthy_robot_has_no_contradiction(tmp_path: Path) -> None:
     found = check(tmp_path, CASES / "base-log" / "log.mcap")
     assert quantities(found, "contradiction") == set()
-    assert {"signs and sides", "units", "track and multiplier", "axes of IMU", "stamps", "reference"} <= quantities(found, "ok")
+    assert {
+        "signs and sides of wheels",
+        "units of wheels",
+        "axis and sign of gyro",
+        "track and multiplier",
+        "stamps",
+        "reference",
+    } <= quantities(found, "ok")
     assert quantities(found, "cannot be seen") == {"topic of LiDAR", "wheel radius"}
     robot = load_robot(tmp_path / "out" / "robot.toml")
     assert robot.models["skid_steer"]["k_0"] == pytest.approx(0.55, abs=0.01)
@@ -69,7 +76,7 @@ def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
 
 def test_check_with_inverted_side_writes_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = check(tmp_path, CASES / "H06-right-side-inverted" / "log.mcap")
-    assert quantities(found, "contradiction") == {"wheels and gyro"}
+    assert quantities(found, "contradiction") == {"sensors"}
     assert load_robot(tmp_path / "out" / "robot.toml").joints.reversed == RIGHT
     assert "the right side counts backwards" in capsys.readouterr().out
     assert "the right side counts backwards" in (tmp_path / "out" / "check.html").read_text()
@@ -77,7 +84,7 @@ def test_check_with_inverted_side_writes_the_key(tmp_path: Path, capsys: pytest.
 
 def test_check_of_two_sensors_that_contradict_corrects_none(tmp_path: Path) -> None:
     found = check(tmp_path, drive(tmp_path / "log.mcap", names=(*RIGHT, *LEFT)))
-    assert "wheels and gyro" in quantities(found, "contradiction")
+    assert "sensors" in quantities(found, "contradiction")
     robot = load_robot(tmp_path / "out" / "robot.toml")
     assert (robot.joints, robot.wheel_noise) == (load_robot(ROBOT_TOML).joints, load_robot(ROBOT_TOML).wheel_noise)
 
@@ -101,7 +108,7 @@ def test_check_without_wheels_ends_with_one_sentence(tmp_path: Path, capsys: pyt
 
 def test_check_without_gyro_has_no_sentence_about_it(tmp_path: Path) -> None:
     found = check(tmp_path, CASES / "base-log" / "log.mcap", "--robot", str(ROBOT_TOML), "--topic.imu", "")
-    texts = [row for row in found["rows"] if "by the gyro" in row["second_source"] or row["quantity"] == "axes of IMU"]
+    texts = [row for row in found["rows"] if "by the gyro" in row["second_source"] or "gyro" in row["quantity"]]
     assert texts == []
     assert open_log(CASES / "base-log" / "log.mcap", load_robot(ROBOT_TOML)).sources.imu is not None
 
@@ -158,5 +165,5 @@ def test_check_with_a_wrong_radius_has_k_of_the_measured_one(tmp_path: Path) -> 
     found = check(tmp_path, log, "--robot", str(tmp_path / "wrong.toml"))
     assert quantities(found, "contradiction") == {"wheel radius"}
     robot = load_robot(tmp_path / "out" / "robot.toml")
-    assert robot.geometry.wheel_radius_m == pytest.approx(0.165, rel=0.01)
+    assert robot.geometry.wheel_radius_m == pytest.approx(0.165, rel=0.03)  # scans over 0.2 s are up to 3 % low
     assert robot.models["skid_steer"]["k_0"] == pytest.approx(0.5, abs=0.02)

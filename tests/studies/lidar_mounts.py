@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.calibration.lidar_check import LidarFinding, open_log_checked
+from localization.evidence import open_log_with_set_up
+from localization.evidence.alternatives import Row
+from localization.logs import open_log
 from localization.logs.writer import write_bag
 from localization.simulation.simulator import simulate
 from motion_models.robot_file import load_robot
@@ -27,8 +29,8 @@ ROBOTS = (
 SECONDS = 75.0
 
 
-def found_on(robot_name: str, experiment: str, seed: int, effects: dict[str, float]) -> tuple[tuple[LidarFinding, ...], float, float]:
-    """Findings of a drive, and true yaw and place along the robot of its LiDAR less those of the mount that is used then [rad, m]."""
+def found_on(robot_name: str, experiment: str, seed: int, effects: dict[str, float]) -> tuple[tuple[Row, ...], float, float]:
+    """Faults of its LiDAR in a drive, and true yaw and place along the robot of its LiDAR less those of the mount that is used then [rad, m]."""
     robot = load_robot(robot_name)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.mcap"
@@ -36,12 +38,13 @@ def found_on(robot_name: str, experiment: str, seed: int, effects: dict[str, flo
         messages = simulation.messages()
         first = next(messages)
         write_bag(path, (first, *takewhile(lambda message: message.log_ns < first.log_ns + SECONDS * 1e9, messages)))
-        checked = open_log_checked(path, robot)
+        checked = open_log_with_set_up(path, robot)
         sources = checked.log.sources
         frame = "" if sources.lidar is None else checked.log.frames[sources.lidar.topic]
-        before, after = checked.log.mounts[frame], checked.mounts[frame]
+        before, after = open_log(path, robot).mounts[frame], checked.log.mounts[frame]
     yaw = math.remainder(before.yaw + effects.get("lidar_yaw", 0.0) - after.yaw, math.tau)
-    return checked.lidar, yaw, before.x + effects.get("lidar_offset_x", 0.0) - after.x
+    found = tuple(row for row in checked.set_up.faults if row.source == "lidar")
+    return found, yaw, before.x + effects.get("lidar_offset_x", 0.0) - after.x
 
 
 def main() -> None:

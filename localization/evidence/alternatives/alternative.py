@@ -18,8 +18,10 @@ OUTLIER = 0.1
 """Share of bins in which a source slips, is matched to the wrong place or is lost."""
 LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0)
 """Factors on all noise, of which each log has one, equally probable before: from a simulator to a worn robot on gravel."""
-WAY_M_S, TURN_RAD_S = 0.5, 0.6
-"""Prior standard deviation of a robot's forward speed and yaw rate: those of the drives of `tests/data`."""
+WAY_M_S = 0.5
+"""Prior standard deviation of a robot's forward speed [m/s]: that of the drives of `tests/data`."""
+TURN_RAD_S = 0.6
+"""Prior standard deviation of its yaw rate [rad/s]."""
 _SIDE_FLOOR_M_S, _SIDE_OF_WAY, _SIDE_OF_TURN_M = 0.02, 0.1, 0.05
 """Standard deviation of a robot's sideways speed: floor, part of the speed (slides are below 20 degrees in 99.9 % of three buildings), and
 metres per radian of turn beyond its centre of rotation."""
@@ -52,6 +54,11 @@ class Row:
         return self.id.partition(".")[0]
 
     @property
+    def family(self) -> str:
+        """What of its source it is about: rows of one family exclude each other."""
+        return "wheels.scale" if self.id in ("wheels.unit", "wheels.factor", "wheels.angle_unit") else f"{self.id}:{self.detail}"
+
+    @property
     def key(self) -> tuple[str, str]:
         """Equal for rows that are corrected alike, up to a measured value."""
         return self.id, self.detail
@@ -67,7 +74,7 @@ class Alternative:
     turn: FloatArray | None = None
     """(n,) yaw rate [rad/s]; None: not measured."""
     log_jacobian: float = 0.0
-    """Of all channels, per bin: the density of a change of units."""
+    """Logarithm of the Jacobian of all channels, per bin: the density of a change of units."""
     own: float = 0.0
     """Evidence that the source has by itself: wheels of a side turn alike, gravity is up, robots do not drive sideways."""
     way_sigma: float = 0.0
@@ -79,7 +86,7 @@ class Alternative:
 
     @property
     def log_prior(self) -> float:
-        """Of its rows."""
+        """Logarithm of the prior odds of its rows."""
         return sum(row.log_odds for row in self.rows)
 
 

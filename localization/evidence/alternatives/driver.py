@@ -12,8 +12,18 @@ from motion_models.prior import expected_scaling
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-_ODDS = {"sign": math.log(5e-4), "side": math.log(2e-4), "unit": math.log(5e-4), "multiplier": math.log(0.05), "k": math.log(0.03)}
-"""Prior odds by kind, as of wheels; a driver that corrects for skidding is usual."""
+_ODDS = {
+    "sign": math.log(5e-4),
+    "side": math.log(2e-4),
+    "unit": math.log(5e-4),
+    "usual": 0.0,
+    "multiplier": math.log(0.05),
+    "k": math.log(0.03),
+}
+"""Prior odds by kind, as of wheels; where the robot file has the default multiplier, a driver that corrects for
+skidding is as usual as one that does not (diff_drive_controller's wheel_separation_multiplier)."""
+_K_SIGMA = 0.25
+"""Sigma of the logarithm of k by geometry: that of seven robots whose k was measured (`motion_models.prior.EVIDENCE`), and of floors."""
 UNITS = {
     "millimetres": 1e-3,
     "centimetres": 1e-2,
@@ -29,6 +39,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
     """Sides times units of the ``rates`` (n, 2) way and turn of a driver's odometry."""
     way, turned = rates[:, 0], rates[:, 1]
     multiplier = expected_scaling(robot) * robot.driver.wheel_separation_multiplier
+    is_default = robot.driver.wheel_separation_multiplier == 1.0 and "k_0" not in robot.models.get("skid_steer", {})
     half = 0.5 * robot.driver.track_width_m
     at_driver = "Correct the encoder's or motor's sign in the driver."
     sides: list[tuple[FloatArray, FloatArray, float, tuple[Row, ...]]] = [
@@ -47,21 +58,20 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         sides.append((sign * half * turned, sign * way / half, 0.15, (row,)))
     found = []
     for v, w, sigma, rows in sides:
-        found.append(Alternative(rows, v, multiplier * w, 0.0, 0.0, sigma, sigma))
+        found.append(Alternative(rows, v, multiplier * w, 0.0, 0.0, sigma, _K_SIGMA + sigma))
         for name, factor in UNITS.items():
             correct = partial(_set_unit, factor * robot.driver.length_unit_m)
             row = Row("driver.unit", f"the driver publishes {name}", _ODDS["unit"], name, factor, correct)
-            found.append(Alternative((*rows, row), factor * v, multiplier * w, math.log(factor), 0.0, sigma, sigma))
+            found.append(Alternative((*rows, row), factor * v, multiplier * w, math.log(factor), 0.0, sigma, _K_SIGMA + sigma))
         if abs(math.log(multiplier)) > 0.05:
             corrected = Row(
                 "driver.corrects_skidding",
                 "the driver corrects for skidding",
-                _ODDS["multiplier"],
+                _ODDS["usual" if is_default else "multiplier"],
                 value=float(f"{1.0 / expected_scaling(robot):.4g}"),
-                is_fault=False,
                 correct=partial(_set_multiplier, float(f"{1.0 / expected_scaling(robot):.4g}")),
             )
-            found.append(Alternative((*rows, corrected), v, w, 0.0, 0.0, sigma, 0.05 - 0.4))
+            found.append(Alternative((*rows, corrected), v, w, -math.log(multiplier), 0.0, sigma, sigma))
     vary = Row("driver.turns_vary", "the robot turns by a changing part of what its wheels turn", _ODDS["k"], is_fault=False)
     found.append(Alternative((vary,), way, multiplier * turned, 0.0, 0.0, 0.0, 1.0, 8.0))
     return found

@@ -13,7 +13,7 @@ from localization.evidence.signals import Source
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
-_ODDS = {"sign": math.log(2e-6), "axis": math.log(2e-3), "unit": math.log(5e-4)}
+_ODDS = {"sign": math.log(3e-5), "axis": math.log(2e-3), "unit": math.log(5e-4)}
 """Prior odds by kind (`docs/theory/set-up.md`); a driver that turns the rates' sign alone, and not gravity's, is rare."""
 _DEG = math.pi / 180.0
 _GRAVITY_M_S2 = (7.0, 13.0)
@@ -36,7 +36,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         if axis @ by_file < _SAME_AXIS:
             name = f"{'+' if sign > 0 else '-'}{'xyz'[i]}"
             mount = Mount(roll=_rotation_to_up(axis)[0], pitch=_rotation_to_up(axis)[1])
-            correct = mount_correction(source.frame, Mount(), partial(_turned, mount)) if source.frame else None
+            correct = mount_correction(source.frame, source.mount, partial(_turned, mount)) if source.frame else None
             axes.append((axis, (Row("gyro.axis", f"the IMU's {name} axis points up", _ODDS["axis"], name, correct=correct),)))
     for axis, rows in axes:
         own = _gravity_evidence(source.force, axis)

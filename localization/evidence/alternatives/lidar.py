@@ -19,15 +19,15 @@ _ODDS = {"quarter": math.log(2e-3), "yaw": math.log(3e-4), "flip": math.log(1e-3
 _QUARTER_RAD, _YAW_SIGMA_RAD = math.radians(4.0), math.radians(3.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that; and the standard deviation of a mount's yaw with a
 slide."""
-_PLACE_SIGMA_M, _WRONG_PLACE_SIGMA_M = 0.12, 0.6
-"""Standard deviation along the robot of a mount with the centre of rotation, and of a mount that is wrong."""
+_PLACE_SIGMA_M, _WRONG_PLACE_SIGMA_M = 0.07, 0.6
+"""Standard deviation along the robot of a mount with the centre of rotation (robots turn within 5 cm of the middle of their wheels), and of
+a mount that is wrong."""
 _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
 
 
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Yaws times upside down times units of the ``rates`` (n, 3) ahead, to the left and turn at the sensor, in the axes of its mount."""
-    mount = robot.mounts.get(source.frame, Mount(source.place.real, source.place.imag))
-    found = []
+    mount, found = source.mount, list[Alternative]()
     for is_flipped, unit in itertools.product((False, True), (1.0, 1e-3)):
         velocity, turn = unit * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:

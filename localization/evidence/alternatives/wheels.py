@@ -26,6 +26,14 @@ _GEARS = ((2.0, 0.05), (0.5, 0.05), (0.01, 2.5), (1.0, 0.8))
 _HOPELESS = 50.0
 """Logarithm of the evidence that wheels of a side turn alike, below the best wiring's, from where on no other source can redeem one."""
 
+_ALIKE = 0.1
+"""Difference of the logarithms of two units up to which they are one symptom, as m/s and rev/s of a wheel of 1 / (2 pi) m."""
+_FIELDS_SIGMA, _FIELDS_WIDE = 0.1, 3.0
+"""Sigma of the logarithm of velocities over rates of angles, of drivers that filter them; and of those in another unit."""
+
+_MIN_MOVING = 12
+"""Values in motion that show a ratio or a sign: half a wheel's rates over six seconds."""
+
 Wiring = tuple[tuple[int, ...], tuple[int, ...], FloatArray, tuple[Row, ...]]
 """Columns of the left and right wheels, signs (joints,), rows."""
 
@@ -35,11 +43,11 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
     radius = robot.geometry.wheel_radius_m
     scale = expected_scaling(robot) * radius / robot.geometry.track_width_m
     rates = _with_dead_filled(rates, source.left)
-    found = []
+    found, fields = [], _fields(rates, second, radius)
     for left, right, signs, rows, alike in _believable(list(_wirings(source)), rates):
         of_left, of_right = (rates * signs)[:, left].mean(axis=1), (rates * signs)[:, right].mean(axis=1)
         way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
-        for factor, sigma, unit_rows in _units(robot):
+        for factor, sigma, unit_rows in (*fields, *_units(robot)[len(fields) > 0 :]):
             found.append(Alternative((*rows, *unit_rows), factor * way, factor * turn, 2.0 * math.log(factor), alike, sigma, sigma))
         if not rows:
             found += [*_of_one_side(source, rates, radius, scale), Alternative((_turns_vary(),), way, turn, 0.0, alike, 0.0, 1.0, 8.0)]
@@ -116,23 +124,67 @@ def _signs(source: Source) -> Iterator[tuple[tuple[int, ...], tuple[Row, ...]]]:
         yield (i,), (Row("wheels.one_reversed", f"{names[i]} counts backwards", _ODDS["sign"], names[i], correct=correct),)
 
 
-def _units(robot: Robot) -> Iterator[tuple[float, float, tuple[Row, ...]]]:
-    """Factor to rad/s, sigma of its logarithm, rows. The unit is that of the field that is used (angles, where there are any)."""
-    yield 1.0, 0.0, ()
-    radius = robot.geometry.wheel_radius_m
-    named = {
-        "rpm": math.tau / 60.0,
-        "deg/s": math.pi / 180.0,
-        "rev/s": math.tau,
-        "m/s": 1.0 / radius,
-        "mm/s": 1e-3 / radius,
-    }
+Unit = tuple[float, float, tuple[Row, ...]]
+"""Factor to rad/s, sigma of its logarithm, rows."""
+
+
+def _names(radius: float) -> dict[str, float]:
+    """Radians per second, by the unit's name."""
+    return {"rpm": math.tau / 60.0, "deg/s": math.pi / 180.0, "rev/s": math.tau, "m/s": 1.0 / radius, "mm/s": 1e-3 / radius}
+
+
+def _fields(rates: FloatArray, second: FloatArray, radius: float) -> list[Unit]:
+    """Where velocities are another multiple of the angles' rates: the velocities have another unit, or the angles have."""
+    ratio, sigma, is_unsigned = _log_ratio(rates, second)
+    if is_unsigned:
+        text = "velocities of the wheels have no sign: they are positive while angles go backwards; angles are used"
+        remedy = "Let the driver publish signed velocities, or none."
+        return [(1.0, 0.0, (Row("wheels.unsigned_velocities", text, _ODDS["unit"], remedy=remedy),))]
+    same = -0.5 * (ratio / math.hypot(sigma, _FIELDS_SIGMA)) ** 2 - math.log(_FIELDS_SIGMA)
+    other = _ODDS["unit"] - 0.5 * (ratio / _FIELDS_WIDE) ** 2 - math.log(_FIELDS_WIDE)
+    if not math.isfinite(sigma) or same > other:
+        return []
+    times = math.exp(ratio)
+    name = min(_names(radius), key=lambda n: abs(ratio + math.log(_names(radius)[n])))
+    exact = _names(radius)[name] if abs(ratio + math.log(_names(radius)[name])) < _FIELDS_SIGMA else 1.0 / times
+    inverse = min(_names(radius), key=lambda n: abs(ratio - math.log(_names(radius)[n])))
+    of_angles = _names(radius)[inverse] if abs(ratio - math.log(_names(radius)[inverse])) < _FIELDS_SIGMA else times
+    velocity = f"velocities of the wheels are {times:.3g} times those of their angles ({exact:.6g} rad/s each)"
+    angle = f"angles of the wheels turn {1.0 / times:.3g} times as fast as their velocities ({of_angles:.6g} rad each)"
+    odds = _ODDS["unit"]
+    return [
+        (1.0, 0.0, (Row("wheels.velocity_unit", velocity, odds, value=exact, correct=partial(_scale_fields, 1.0, exact)),)),
+        (of_angles, 0.0, (Row("wheels.angle_unit", angle, odds, value=of_angles, correct=partial(_scale_fields, of_angles, 1.0)),)),
+    ]
+
+
+def _log_ratio(first: FloatArray, second: FloatArray) -> tuple[float, float, bool]:
+    """Logarithm of the size of ``second`` (n, joints) over ``first``, its standard error, and whether ``second`` has no sign."""
+    known = np.isfinite(first) & np.isfinite(second)
+    a, b = first[known], second[known]
+    size = float(np.sqrt(np.mean(a * a))) if len(a) else 0.0
+    moving = np.abs(a) > 0.3 * size
+    if size == 0.0 or moving.sum() < _MIN_MOVING or not np.any(b[moving]):
+        return 0.0, math.inf, False
+    ratios = np.log(np.abs(b[moving]) / np.abs(a[moving]) + 1e-12)
+    spread = float(np.median(np.abs(ratios - np.median(ratios)))) * 1.48
+    is_unsigned = bool((a < -0.3 * size).sum() >= _MIN_MOVING and b.min() > -1e-3 * np.abs(b).max() and b[a < -0.3 * size].min() > 0.0)
+    return float(np.median(ratios)), max(spread, 0.03) / math.sqrt(moving.sum() / 4.0), is_unsigned
+
+
+def _units(robot: Robot) -> list[Unit]:
+    """The unit of both fields, that of the robot file first."""
+    found: list[Unit] = [(1.0, 0.0, ())]
+    named = _names(robot.geometry.wheel_radius_m)
     for name, factor in named.items():
         text = f"the wheels' rates are in {name}, not in rad/s (1 rad/s is {1.0 / factor:.4g} of them)"
-        yield factor, 0.05, (Row("wheels.unit", text, _ODDS["unit"], name, factor, partial(scale_unit, factor)),)
+        alike = [n for n, other in named.items() if abs(math.log(other / factor)) < _ALIKE]
+        detail = " or ".join(alike)  # nothing tells them apart, and their corrections hardly differ
+        found.append((factor, 0.05, (Row("wheels.unit", text, _ODDS["unit"], detail, factor, partial(scale_unit, factor)),)))
     for factor, sigma in _GEARS:
         row = Row("wheels.factor", "the wheels' rates have a factor", _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor))
-        yield factor, sigma, (row,)
+        found.append((factor, sigma, (row,)))
+    return found
 
 
 def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float) -> Iterator[Alternative]:
@@ -167,11 +219,12 @@ def _reverse(names: tuple[str, ...], robot: Robot) -> Robot:
 
 def scale_unit(factor: float, robot: Robot) -> Robot:
     """``robot`` whose wheel joints have ``factor`` times the units."""
-    joints = robot.joints
-    return replace(
-        robot,
-        joints=replace(joints, angle_unit_rad=_six(joints.angle_unit_rad * factor), rate_unit_rad_s=_six(joints.rate_unit_rad_s * factor)),
-    )
+    return _scale_fields(factor, factor, robot)
+
+
+def _scale_fields(of_angles: float, of_rates: float, robot: Robot) -> Robot:
+    angle, rate = _six(robot.joints.angle_unit_rad * of_angles), _six(robot.joints.rate_unit_rad_s * of_rates)
+    return replace(robot, joints=replace(robot.joints, angle_unit_rad=angle, rate_unit_rad_s=rate))
 
 
 def _scale_side(side: str, factor: float, robot: Robot) -> Robot:
