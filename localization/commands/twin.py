@@ -12,10 +12,10 @@ import tyro
 from rich.console import Console
 
 from localization.calibration.calibrate import MotionReferenceName
-from localization.calibration.wheel_wiring import open_wired
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import add_row, in_radians, new_folder, plain_table, print_line, print_table, write_json
 from localization.diagnosis.drive import drive_of_log, drive_of_table
+from localization.evidence import open_log_as_declared
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.twin_page import percent, write_twin_page
@@ -90,7 +90,7 @@ class Twin:
     def _maneuvers(self, path: Path, robot: Robot) -> list[Maneuver]:
         """Maneuvers of one log or table."""
         if path.suffix.lower() != ".csv":
-            log = open_wired(path, robot, self.topic.scored_against(self.reference))
+            log = open_log_as_declared(path, robot, self.topic.scored_against(self.reference))
             config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
             return list(drive_of_log(log, self.motion_reference, self.reference, config, sigmas).maneuvers)
         if "rotation_ratio" in table_columns(path):

@@ -8,6 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from tests.ros.test_live_wiring import LIVE
 
 from localization.estimators import PriorMap
 from localization.log_replay import replay
@@ -29,7 +30,6 @@ from motion_models.registry import make_model
 from tests.helpers.entrance_drives import drive as robot_drive
 from tests.helpers.entrance_drives import write
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, stamp_of, track
-from tests.ros.test_live_wiring import LIVE
 from tests.ros.test_operator_commands import pose_message
 
 S = 1_000_000_000

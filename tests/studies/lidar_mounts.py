@@ -30,7 +30,7 @@ SECONDS = 75.0
 
 
 def found_on(robot_name: str, experiment: str, seed: int, effects: dict[str, float]) -> tuple[tuple[Row, ...], float, float]:
-    """Faults of its LiDAR in a drive, and true yaw and place along the robot of its LiDAR less those of the mount that is used then [rad, m]."""
+    """Faults of its LiDAR, and true yaw and place along the robot of its LiDAR less those of the mount that is used then [rad, m]."""
     robot = load_robot(robot_name)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.mcap"
