@@ -27,6 +27,7 @@ _DEFECT = 70
 _INTERRUPTED = 130
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
+    "try": ("Try", "Run info, init, check, calibrate, replay and diagnose on a log, and write one page."),
     "info": ("Info", "List the topics of a log and what each is used for."),
     "replay": ("Replay", "Run motion models and estimators over a log and score their trajectories."),
     "compare": ("Compare", "Compare motion models and estimators over many logs."),

@@ -1,0 +1,174 @@
+"""`skidloc try`: one log in, one page out: the robot, what was corrected, k and centre of rotation, and what to do next."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shlex
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from localization.calibration.calibrate import Cut, cut_log
+from localization.commands.calibrate import Calibrate
+from localization.commands.check import Check
+from localization.commands.common import PlainConsole, new_folder, print_line, write_json
+from localization.commands.diagnose import Diagnose
+from localization.commands.info import Info
+from localization.commands.init import Init
+from localization.commands.replay import Replay
+from localization.logs import TopicOverrides, open_log
+from localization.output import check_outputs
+from localization.report.try_page import Part, TryResult, summarize, write_try_page
+from motion_models.errors import SkidlocError
+from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.robot_file import load_robot
+
+_PARTS = 7
+_WIDTH = 160
+"""Characters a line of what the parts print, for the page."""
+
+
+@dataclass(frozen=True)
+class Try:
+    """Run info, init, check, calibrate, replay and diagnose on a log, and write one page.
+
+    Each part can be run alone by the line that is printed for it.
+    """
+
+    log: tyro.conf.Positional[Path]
+    """ROS 1 .bag, ROS 2 bag folder, or bare .mcap."""
+    robot: str | None = None
+    """Name of a shipped robot, or path of a robot TOML file. Default: a new robot file by log, --urdf and --controller."""
+    urdf: Path | None = None
+    """URDF or xacro file of the robot: wheels, lengths, masses and arms."""
+    controller: Path | None = None
+    """YAML of the robot's drive controller (diff_drive_controller, ros2_control)."""
+    wheel_radius_m: float | None = None
+    """Radius of the wheels [m], where neither URDF nor controller has it."""
+    track_width_m: float | None = None
+    """Distance between the left and the right wheels' contacts [m], in the same way."""
+    wheelbase_m: float | None = None
+    """Distance between the front and the rear wheels' contacts [m], in the same way."""
+    reference: str | None = None
+    """Topic or file to score the replay against; never used for the calibration."""
+    out: Path = Path("skidloc_try")
+    """New folder for index.html, robot.toml, summary.json and the pages of the parts."""
+
+    def run(self, console: Console) -> None:
+        """Run the command. Raises `SkidlocError` where the log cannot be read or the robot is not known."""
+        check_outputs(self.out)
+        with new_folder(self.out) as folder, _progress(console) as (progress, task):
+            runner = _Runner(
+                console, folder, self.out, lambda text: progress.update(task, description=text), lambda: progress.advance(task)
+            )
+            found = self._parts(runner)
+            write_try_page(folder / "index.html", found)
+            write_json(
+                folder / "summary.json", {"sentences": summarize(found), "parts": [part.name for part in found.parts if part.is_done]}
+            )
+        for sentence in summarize(found):
+            print_line(console, sentence)
+        print_line(console, f"page: {self.out / 'index.html'}")
+
+    def _parts(self, runner: _Runner) -> TryResult:
+        folder = runner.folder
+        robot_file = self.robot or str(folder / "robot.toml")
+        if self.robot is None:
+            lengths = (self.wheel_radius_m, self.track_width_m, self.wheelbase_m)
+            init = Init(
+                self.log,
+                folder / "robot.toml",
+                urdf=self.urdf,
+                controller=self.controller,
+                wheel_radius_m=lengths[0],
+                track_width_m=lengths[1],
+                wheelbase_m=lengths[2],
+            )
+            runner.run("init", init, self._line("init"), is_needed=True)
+        robot = load_robot(robot_file)
+        runner.run("info", Info(self.log, robot_file, json=folder / "info.json"), self._line("info"))
+        runner.run("check", Check(self.log, robot_file, out=folder / "check"), self._line("check"))
+        checked = folder / "check" / "robot.toml"
+        robot_file = str(checked) if checked.exists() else robot_file
+        models = ("diff_drive",) if robot.drive == DIFF_DRIVE else ("diff_drive", "skid_steer")
+        for model in models:
+            name = "calibrated.toml" if model == models[-1] else f"{model}.toml"
+            calibrate = Calibrate((self.log,), robot_file, model, out=folder / name, json=folder / f"calibrate_{model}.json")
+            runner.run(f"calibrate {model}", calibrate, self._line("calibrate", f"--model {model}"))
+        calibrated = folder / "calibrated.toml"
+        best = str(calibrated) if calibrated.exists() else robot_file
+        has_lidar = open_log(self.log, load_robot(best)).sources.lidar is not None
+        estimators = "odometry,graph" if has_lidar else "odometry,ekf"
+        replay = Replay(
+            self.log, best, folder / "replay", model=",".join(models), estimator=estimators, reference=self.reference, static=True
+        )
+        runner.run("replay", replay, self._line("replay", f"--model {','.join(models)} --estimator {estimators}"))
+        runner.run("diagnose", Diagnose(self.log, best, out=folder / "diagnosis", static=True), self._line("diagnose"))
+        before, after = load_robot(robot_file), load_robot(best)
+        return TryResult(self.log.name, before, after, models[-1], tuple(runner.parts), self._cut(after), _contents(folder, models))
+
+    def _cut(self, robot: Robot) -> Cut | None:
+        """Windows of the log with what measured them; None where nothing did."""
+        try:
+            return cut_log(self.log, robot, TopicOverrides(), "auto", None)
+        except SkidlocError:
+            return None
+
+    def _line(self, command: str, more: str = "") -> str:
+        """Command line of one part alone."""
+        robot = self.robot or str(self.out / "robot.toml")
+        options = {"init": f"--out {robot}" + "".join(f" --{n} {shlex.quote(str(p))}" for n, p in self._descriptions())}
+        tail = options.get(command, f"--robot {robot}")
+        out = f" --out {command}" if command in ("check", "replay", "diagnose") else ""
+        return f"skidloc {command} {shlex.quote(str(self.log))} {tail}{' ' + more if more else ''}{out}"
+
+    def _descriptions(self) -> list[tuple[str, Path]]:
+        return [(name, path) for name, path in (("urdf", self.urdf), ("controller", self.controller)) if path is not None]
+
+
+@contextlib.contextmanager
+def _progress(console: Console) -> Iterator[tuple[Progress, TaskID]]:
+    """Progress bar over the parts, where the output is a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield bar, bar.add_task("reading", total=_PARTS)
+
+
+class _Runner:
+    """Runs the parts one after another with their output captured; a part that fails is reported, and the others follow."""
+
+    def __init__(self, console: Console, folder: Path, out: Path, describe: Callable[[str], None], advance: Callable[[], None]) -> None:
+        self.folder, self.parts = folder, list[Part]()
+        self._console, self._out, self._describe, self._advance = console, out, describe, advance
+
+    def run(self, name: str, command: Any, line: str, is_needed: bool = False) -> None:
+        """Run ``command``. Raises what it does where the others cannot go on without it."""
+        self._describe(name)
+        self._console.print(f"[bold]{escape(name)}[/]  {escape(line)}", soft_wrap=True)
+        quiet = PlainConsole(width=_WIDTH, record=True, file=io.StringIO(), highlight=False)
+        try:
+            command.run(quiet)
+            text, is_done = quiet.export_text(), True
+        except SkidlocError as error:
+            if is_needed:
+                raise
+            text, is_done = str(error), False
+            print_line(self._console, f"! {name}: {error}")
+        self.parts.append(Part(name, line, text.replace(str(self.folder), str(self._out)), is_done))
+        self._advance()
+
+
+def _contents(folder: Path, models: tuple[str, ...]) -> dict[str, Any]:
+    """JSON of the parts by name, of those that were written."""
+    files = {f"calibrate_{model}": folder / f"calibrate_{model}.json" for model in models}
+    files |= {"check": folder / "check" / "check.json", "replay": folder / "replay" / "metrics.json"}
+    files |= {"diagnose": folder / "diagnosis" / "diagnosis.json"}
+    return {name: json.loads(path.read_text(encoding="utf-8")) for name, path in files.items() if path.exists()}

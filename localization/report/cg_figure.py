@@ -1,0 +1,108 @@
+"""k and centre of rotation against the centre of gravity: measured on a drive's turns, and by a motion model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.report.figures import Figure, svg
+from localization.report.page import COLOURS, WIDTH_IN
+from motion_models.base import MotionModel
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.robot import Robot
+from motion_models.se2 import FloatArray
+
+_MIN_TURN_RAD = 0.3
+"""Turn of a window from which its centre of rotation stands out of 2 cm of noise by a few centimetres."""
+_MAX_FORWARD = 0.3
+"""Mean rate of both sides over half their difference up to which a window counts as turning in place."""
+_MIN_SPREAD_M = 0.005
+"""Range of the centre of gravity from which its effect is drawn as a curve."""
+
+
+class Turns(NamedTuple):
+    """Turns in place, one a window."""
+
+    cg: FloatArray
+    """(n, 2) centre of gravity [m]."""
+    k: FloatArray
+    """(n,) yaw rate over that of wheels without slip."""
+    x_cr: FloatArray
+    """(n,) centre of rotation ahead of the middle [m]; NaN where no position was measured."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether the centre of gravity moved between them."""
+        return len(self.k) > 1 and float(np.ptp(self.cg[:, 0])) > _MIN_SPREAD_M
+
+
+def measured_turns(maneuvers: Sequence[Maneuver], robot: Robot) -> Turns:
+    """k and centre of rotation of each window that turns in place, by what measured the motion: p = (1 - R(yaw)) c."""
+    cg, k, x_cr = [], [], []
+    per_rad = robot.geometry.wheel_radius_m / robot.geometry.track_width_m
+    for m in maneuvers:
+        if m.middle:
+            continue
+        inside = slice(m.lead, m.lead + int(m.ends[-1]))
+        left, right = m.dt[inside] @ m.wheels[inside]
+        x, y, yaw = m.measured[-1]
+        by_wheels = per_rad * (right - left)
+        if abs(yaw) < _MIN_TURN_RAD or abs(yaw) > np.pi or abs(left + right) > _MAX_FORWARD * abs(right - left):
+            continue
+        c, s = np.cos(yaw), np.sin(yaw)
+        at = np.linalg.solve(np.array([[1.0 - c, s], [-s, 1.0 - c]]), np.array([x, y]))
+        has_position = bool(np.isfinite(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1, 0, 0]))
+        cg.append(np.atleast_2d(m.cg)[inside if m.cg.ndim == 2 else slice(None)].mean(axis=0))
+        k.append(yaw / by_wheels)
+        x_cr.append(at[0] if has_position else np.nan)
+    return Turns(np.array(cg).reshape(-1, 2), np.array(k), np.array(x_cr))
+
+
+def predicted_turns(model: MotionModel, robot: Robot, cg: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """k and x_CR [m], each (n,), of ``model`` turning in place at ``cg`` (n, 2)."""
+    g = robot.geometry
+    rate = 0.25 * g.track_width_m / g.wheel_radius_m
+    _, vy, wz = np.moveaxis(model.twist(np.array([-rate, rate]), cg, model.nominal).value, -1, 0)
+    return wz * g.track_width_m / (2.0 * rate * g.wheel_radius_m), -vy / wz
+
+
+def cg_svg(turns: Turns, models: Sequence[tuple[str, MotionModel]], robot: Robot, name: str = "cg") -> str:
+    """Both against the CG ahead, measured as dots and by each of the ``models`` (label, model) as a curve."""
+    low, high = (float(f(turns.cg[:, 0])) for f in (np.min, np.max))
+    pad = max(0.1 * (high - low), 0.02 * robot.geometry.wheelbase_m)
+    x = np.linspace(low - pad, high + pad, 60)
+    along = np.column_stack([x, np.full(len(x), float(np.median(turns.cg[:, 1])))])
+    styles = ((COLOURS["red"], "--"), (COLOURS["blue"], "-"))
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots(1, 2)
+        for ax, measured, row, title, unit in (
+            (axes[0], turns.k, 0, "How much it turns", "rotation scaling k"),
+            (axes[1], turns.x_cr, 1, "Where it turns about", "centre of rotation ahead [m]"),
+        ):
+            ax.scatter(turns.cg[:, 0], measured, s=16, color=COLOURS["soft"], label=f"measured, {np.isfinite(measured).sum()} turns")
+            for (label, model), (colour, style) in zip(models, styles, strict=False):
+                ax.plot(x, predicted_turns(model, robot, along)[row], color=colour, linestyle=style, label=label)
+            ax.set_title(title)
+            ax.set_xlabel("centre of gravity ahead of the middle [m]")
+            ax.set_ylabel(unit)
+        axes[0].legend(frameon=False)
+
+    return svg(name, WIDTH_IN, 3.2, draw)
+
+
+def describe_turns(turns: Turns, model: MotionModel, robot: Robot) -> str:
+    """Range of measured k and centre of rotation, and how near the model comes, in a sentence; empty without turns."""
+    if not len(turns.k):
+        return ""
+    k, x_cr = predicted_turns(model, robot, turns.cg)
+    moved = f"the centre of gravity moved by {100.0 * np.ptp(turns.cg[:, 0]):.1f} cm along the robot" if turns.moves else ""
+    low, high = (float(f(turns.k)) for f in (np.min, np.max))
+    text = f"In {len(turns.k)} turns in place k was {low:.2f} to {high:.2f}{' while ' + moved if moved else ''}; the model predicts it to "
+    text += f"{np.sqrt(np.mean((k - turns.k) ** 2)):.3f}"
+    known = np.isfinite(turns.x_cr)
+    if known.any():
+        text += f" and the centre of rotation to {1e3 * np.sqrt(np.mean((x_cr - turns.x_cr)[known] ** 2)):.0f} mm"
+    return text + " RMS."
