@@ -119,8 +119,8 @@ def _next_steps(found: TryResult) -> list[str]:
         steps.append(_DRIVE)
     if found.after.drive != DIFF_DRIVE and not found.turns.moves:
         steps.append(
-            "The centre of gravity did not move in this drive's turns in place: turn 10 s in place with the arms or the load ahead, and 10 s "
-            "with them drawn in, to measure what it does to k and the centre of rotation."
+            "The centre of gravity did not move in this drive's turns in place: turn 10 s in place with the arms or the load ahead, and "
+            "10 s with them drawn in, to measure what it does to k and the centre of rotation."
         )
     steps.append("Use the robot file from now on: skidloc replay LOG --robot calibrated.toml --out results, or skidloc online.")
     return steps
