@@ -19,6 +19,7 @@ from typing import Any
 from localization.blas_threads import use_one_blas_thread
 from localization.commands.common import PlainConsole
 from localization.commands.short_help import short_help
+from localization.errors import LogError
 from motion_models.errors import SkidlocError
 
 _BAD_INPUT = 2
@@ -49,6 +50,8 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 }
 """By name: the class in `localization.commands.NAME`, and one line for the overview."""
 
+_OF_LOGS = ("try", "info", "replay", "calibrate", "diagnose", "weigh", "init", "check")
+"""Commands whose first argument is a log."""
 USAGE = "usage: skidloc COMMAND [OPTIONS]"
 
 
@@ -153,7 +156,16 @@ def _run(name: str, options: Sequence[str]) -> None:
     if text is not None:
         print(text)
         return
+    _require_log(name, options)
     parse(name, options).run(PlainConsole(highlight=False))
+
+
+def _require_log(name: str, options: Sequence[str]) -> None:
+    """Raise `LogError` for a log that is not there before anything heavy is imported."""
+    if name not in _OF_LOGS or not options or options[0].startswith("-") or options[0].lower().endswith(".csv"):
+        return
+    if not os.path.exists(options[0]):
+        raise LogError(f"no log '{options[0]}': there is no such file or folder.")
 
 
 def parse(name: str, options: Sequence[str]) -> Any:

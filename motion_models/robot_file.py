@@ -100,7 +100,9 @@ def load_robot(robot: str | Path) -> Robot:
             " of a URDF and a controller's YAML."
         )
     if str(robot) not in robot_names():
-        raise RobotError(f"no robot '{robot}'; shipped are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
+        near = difflib.get_close_matches(str(robot), robot_names(), n=1)
+        meant = f"did you mean '{near[0]}'? Shipped" if near else "shipped"
+        raise RobotError(f"no robot '{robot}'; {meant} are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
     text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")
     return parse_robot(text, source=f"{robot}.toml")
 

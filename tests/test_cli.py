@@ -29,7 +29,7 @@ def test_help_without_command_lists_all_and_imports_no_numerical_library() -> No
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"), [(["inof"], "did you mean 'info'?"), ([], "a command is missing"), (["xyz"], "there are info, replay")]
+    ("arguments", "expected"), [(["inof"], "did you mean 'info'?"), ([], "a command is missing"), (["xyz"], "there are try, info, replay")]
 )
 def test_unknown_command_is_refused_with_the_nearest(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
@@ -66,5 +66,22 @@ def test_version_is_that_of_the_distribution(capsys: pytest.CaptureFixture[str])
 def test_planar_option_has_three_states(monkeypatch, tmp_path, options, planar):
     seen = []
     monkeypatch.setattr("localization.commands.replay.Replay.run", lambda self, console: seen.append(self.config.step.planar))
-    assert main(["replay", "some.bag", "--robot", "husky_a200", *options, "--out", str(tmp_path / "out")]) == 0
+    (tmp_path / "some.bag").touch()
+    assert main(["replay", str(tmp_path / "some.bag"), "--robot", "husky_a200", *options, "--out", str(tmp_path / "out")]) == 0
     assert seen == [planar]
+
+
+def test_log_that_is_not_there_is_refused_before_numerical_libraries_are_imported() -> None:
+    code = (
+        f"import sys; from localization.cli import main; print(main(['replay', 'nofile.bag', '--robot', 'x', '--out', 'y'])); "
+        f"print([n for n in {HEAVY} if n in sys.modules])"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert shown.stdout.split() == ["2", "[]"]
+    assert "no log 'nofile.bag'" in shown.stderr
+
+
+def test_robot_and_model_with_a_slip_of_the_pen_are_refused_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["robots", "vaultbot"]) == 0
+    assert main(["cg", "--robot", "vaultbt", "--posture", "ready"]) == 2
+    assert "did you mean 'vaultbot'?" in capsys.readouterr().err
