@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -19,9 +20,10 @@ from localization.evidence import open_log_as_declared
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.twin_page import percent, write_twin_page
-from localization.twin.mjcf import load
+from localization.twin.mjcf import Mjcf, load
 from localization.twin.robot_mjcf import mjcf_of
 from localization.twin.twin import LAW_MODULE, Mended, TwinConfig, TwinResult, examine, provenance
+from localization.twin.urdf import is_urdf, mjcf_of_urdf
 from motion_models.calibration.maneuvers import Maneuver, read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotations, rotations_as_maneuvers
 from motion_models.errors import CalibrationError
@@ -43,7 +45,8 @@ class Twin:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     simulator: Path | None = None
-    """The robot in MuJoCo (MJCF, .xml). Without one it is written from the robot file, with MuJoCo's default contacts."""
+    """The robot in MuJoCo (MJCF, .xml), or its URDF, which is converted. Without one the file is written from the robot file, with MuJoCo's
+    default contacts."""
     out: Path | None = None
     """New folder for twin.json, report.html and, where it is better, the mended simulator."""
     motion_reference: MotionReferenceName = "auto"
@@ -67,11 +70,12 @@ class Twin:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
-        mjcf = mjcf_of(robot) if self.simulator is None else load(self.simulator)
+        mjcf, notes = self._simulator(robot)
         with console.status("reading"):
             maneuvers = [m for path in self.source for m in self._maneuvers(path, robot)]
         with console.status("simulating"):
             result = examine(maneuvers, robot, mjcf, self.config)
+            result = dataclasses.replace(result, notes=(*notes, *result.notes))
         print_twin(console, result)
         names = ", ".join(path.name for path in self.source)
         if self.json is not None:
@@ -86,6 +90,14 @@ class Twin:
             for repair in (m for m in result.repaired if m.is_better):
                 is_best = " (the better one)" if repair is result.best and len(result.repaired) > 1 else ""
                 print_line(console, f"simulator with {repair.name}{is_best}: {self.out / FOLDERS[repair.name] / repair.file.name}")
+
+    def _simulator(self, robot: Robot) -> tuple[Mjcf, tuple[str, ...]]:
+        """The simulator's file, and what was left out of it."""
+        if self.simulator is None:
+            return mjcf_of(robot), ()
+        if is_urdf(self.simulator):
+            return mjcf_of_urdf(self.simulator, robot)
+        return load(self.simulator), ()
 
     def _maneuvers(self, path: Path, robot: Robot) -> list[Maneuver]:
         """Maneuvers of one log or table."""

@@ -212,7 +212,7 @@ def fit_all(problem: Problem, iterations: int = 12) -> Point:
     return problem.minimize(best, columns, iterations)
 
 
-def fit_law(problem: Problem, base: Numbers, iterations: int = 4) -> Point | None:
+def fit_law(problem: Problem, base: Numbers, iterations: int = 6) -> Point | None:
     """The few numbers of a simulator with the contact law, from ``base``; None where the robot does not stand with it."""
     first = problem.point(base, np.zeros(len(problem.hypotheses.parameters)))
     return None if first is None else problem.minimize(first, list(range(len(first.x))), iterations)

@@ -10,6 +10,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,11 @@ def compile_robot(mjcf: Mjcf, robot: Robot) -> MujocoRobot:
     model = _compile(spec, mjcf)
     hinges, base = _hinges(model, mjcf)
     wheels = find_wheels(hinges, robot, mjcf.path.name)
+    joints = (*wheels.left, *wheels.right)
+    geoms = tuple(_touching(model, _below(model, int(model.jnt_bodyid[j]))) for j in joints)
+    bare = [model.joint(j).name for j, g in zip(joints, geoms, strict=True) if not g]
+    if bare:
+        raise SimulationError(f"simulator '{mjcf.path.name}': the wheels {', '.join(bare)} have no geom that collides.")
     gears, others = _servos(model, wheels)
     has_servos = bool((gears != 0.0).any(axis=0).all())
     if not has_servos:
@@ -82,16 +88,21 @@ def compile_robot(mjcf: Mjcf, robot: Robot) -> MujocoRobot:
             notes.append(f"the actuators {names} of the wheels are no velocity servos: stiff ones took their place, and are not judged.")
         else:
             notes.append("the wheels have no velocity servos: stiff ones were added to compare with, and are not judged.")
-    joints = (*wheels.left, *wheels.right)
-    geoms = tuple(_touching(model, _below(model, int(model.jnt_bodyid[j]))) for j in joints)
-    bare = [model.joint(j).name for j, g in zip(joints, geoms, strict=True) if not g]
-    if bare:
-        raise SimulationError(f"simulator '{mjcf.path.name}': the wheels {', '.join(bare)} have no geom that collides.")
     _add_touch_sensors(spec, model, joints)
     model = _compile(spec, mjcf)
     gears, _ = _servos(model, wheels)
     radius = float(np.mean([max(_radius(model, g) for g in of_wheel) for of_wheel in geoms]))
     return MujocoRobot(mjcf.path.name, model, wheels, base, joints, geoms, radius, gears, has_servos, tuple(notes))
+
+
+def converted(urdf: str, path: Path) -> str:
+    """MJCF text of a ``urdf``. Raises `SimulationError` with the engine's own message."""
+    try:
+        spec = mujoco.MjSpec.from_string(urdf)
+        spec.compile()
+    except ValueError as error:
+        raise SimulationError(f"simulator '{path}' does not load in MuJoCo: {_one_line(error)}") from error
+    return str(spec.to_xml())
 
 
 def _read(mjcf: Mjcf) -> mujoco.MjSpec:

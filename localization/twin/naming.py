@@ -22,6 +22,8 @@ _MOST_FINDINGS = 4
 _TRIED = 6
 """Numbers that are searched for themselves, the best ones by secants."""
 _ITERATIONS = 2
+_CONVERGING = 8
+"""Iterations after which a finding's own number has converged: else what is left of it is taken for another's."""
 CONTACTS = "contacts"
 _HOP = "contacts at which the wheels hop, time that a wheel is on the ground"
 
@@ -82,7 +84,7 @@ def name_causes(problem: Problem, start: Point, floor: float) -> tuple[list[Find
         best, point, columns = tried[0]
         rivals = tuple(c for c, _, _ in tried[1:] if c.evidence > best.evidence - SEPARATED_NATS)
         found.append(Finding(best, rivals))
-        at, chosen = problem.minimize(point, columns, _ITERATIONS), columns
+        at, chosen = problem.minimize(point, columns, _CONVERGING), columns
     return found, at
 
 

@@ -11,7 +11,7 @@ from motion_models.robot import Robot
 
 WHEEL_MASS_SHARE = 0.02
 """Mass of a wheel over that of the robot: a Husky's weighs 2.6 kg of 46 to 119."""
-_HALF_WIDTH = 0.3
+HALF_WIDTH = 0.3
 """Half the width of a wheel over its radius (a Husky's 0.05 m over 0.165 m)."""
 _GYRATION = (0.12, 0.15, 0.18)
 """Moments of inertia of the body over its mass [m^2] on a wheelbase of 0.5 m: a Husky's with two arms."""
@@ -34,7 +34,7 @@ def mjcf_of(robot: Robot) -> Mjcf:
         f"""
       <body name="{name}_body" pos="{_n(px)} {_n(py)} {_n(r)}">
         <joint name="{name}" type="hinge" axis="0 1 0" armature="{_n(_ARMATURE * wheel * r * r)}"/>
-        <geom name="{name}_tyre" type="cylinder" size="{_n(r)} {_n(_HALF_WIDTH * r)}" euler="90 0 0" mass="{_n(wheel)}"/>
+        <geom name="{name}_tyre" type="cylinder" size="{_n(r)} {_n(HALF_WIDTH * r)}" euler="90 0 0" mass="{_n(wheel)}"/>
       </body>"""
         for name, (px, py) in zip(names, places, strict=True)
     )

@@ -128,10 +128,15 @@ class TwinResult:
         if not best.is_better:
             return f"{first} Neither numbers of its engine nor the contact law make it better on windows held out."
         means = "other numbers" if best.name == "numbers" else "the contact law"
-        return (
-            f"{first} With {means}, errors on windows held out fall from {row.position_rms_m:.3f} m and"
-            f" {row.heading_rms_rad:.3f} rad to {after.position_rms_m:.3f} m and {after.heading_rms_rad:.3f} rad."
-        )
+        errors = [
+            f"{old:.3f} to {new:.3f} {unit}"
+            for old, new, unit in (
+                (row.position_rms_m, after.position_rms_m, "m"),
+                (row.heading_rms_rad, after.heading_rms_rad, "rad"),
+            )
+            if math.isfinite(old)
+        ]
+        return f"{first} With {means}, errors on windows held out fall from {' and from '.join(errors)}."
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""

@@ -1,0 +1,122 @@
+"""Simulators against measured motion, mended and judged on what was held out; and simulators that were spoiled on purpose.
+
+python -m tests.studies.twin rotations      VaultBot's 68 rotations against MuJoCo's default contacts
+python -m tests.studies.twin husky          DRIVE's Husky windows, beside the friction model calibrated on the same windows
+python -m tests.studies.twin spoiled [--seed 1] [--only mu,servo]     five spoiled copies of a true simulator, and an untouched one
+
+Rotations are fitted on every second row of x_G and judged on the others. Needs the extra `twin`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from rich.console import Console
+
+from localization.commands.twin import print_twin
+from localization.twin.discrepancy import centres, turns
+from localization.twin.robot_mjcf import mjcf_of
+from localization.twin.twin import Judged, TwinConfig, TwinResult, examine
+from motion_models import se2
+from motion_models.calibration.fit import fit
+from motion_models.calibration.maneuvers import Maneuver
+from motion_models.calibration.regressions import rotations_as_maneuvers
+from motion_models.registry import make_model
+from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
+from tests.helpers.twin_drives import drive, spoiled, true_simulator
+from tests.studies import drive_husky
+from tests.studies.thesis_regressions import grid
+
+FRICTION = ("wheel_radius", "mu_ratio", "tracked_x")
+"""Parameters that the friction model is calibrated in by logs."""
+SPOILS = ("healthy", "mu", "servo", "radius", "cg", "mass")
+
+
+def k_and_centre(result: TwinResult, judged: Judged, robot: Robot) -> tuple[float, float, float, float]:
+    """Root mean square errors of k [-] and of the centre of rotation ahead and across [m] on held-out rotations, and correlation of k."""
+    windows = result.windows
+    wheels = np.array([(w.mean_rates[1] - w.mean_rates[0]) * w.duration_s for w in windows])
+    per_turn = robot.geometry.track_width_m / (wheels * robot.geometry.wheel_radius_m)
+    T = np.array([*judged.frame, 0.0])
+    moved = se2.compose(se2.compose(se2.inverse(T), judged.played.poses), T)
+    measured = np.array([w.measured for w in windows])
+    k, true = turns(windows, moved, robot) * per_turn, turns(windows, measured, robot) * per_turn
+    off = centres(moved, turns(windows, moved, robot)) - centres(measured, turns(windows, measured, robot))
+    rms = np.sqrt((off**2).mean(axis=0))
+    return float(np.sqrt(((k - true) ** 2).mean())), float(rms[0]), float(rms[1]), float(np.corrcoef(k, true)[0, 1])
+
+
+def study_rotations(console: Console) -> None:
+    """Print the comparison of the thesis's rotations."""
+    robot = load_robot("vaultbot")
+    result = examine(rotations_as_maneuvers(grid(), robot), robot, mjcf_of(robot))
+    print_twin(console, result)
+    for name, judged in (("file", result.before), *((m.name, m.judged) for m in result.repaired)):
+        k, x, y, r = k_and_centre(result, judged, robot)
+        console.print(f"{name}: k rms {k:.3f}, centre of rotation {1e3 * x:.0f}, {1e3 * y:.0f} mm, r of k {r:.3f}", soft_wrap=True)
+
+
+def husky_maneuvers(steps: int) -> list[Maneuver]:
+    """Windows of the first ``steps`` calibration steps of DRIVE's Husky; each has the one before it in its step as lead."""
+    found = []
+    maneuvers = drive_husky.maneuvers(mended=True)[: 3 * steps]
+    for i, m in enumerate(maneuvers):
+        if i % drive_husky.WINDOWS_PER_STEP == 0:
+            continue
+        before = maneuvers[i - 1]
+        lead = len(before.dt)
+        found.append(Maneuver(np.r_[before.dt, m.dt], np.r_[before.wheels, m.wheels], m.measured, m.ends, m.cg, m.cov, m.group, lead))
+    return found
+
+
+def study_husky(console: Console, steps: int = 100) -> None:
+    """Print the comparison of DRIVE's Husky, beside the friction model fitted to the other half of the windows."""
+    robot = drive_husky.robot()
+    maneuvers = husky_maneuvers(steps)
+    result = examine(maneuvers, robot, mjcf_of(robot))
+    print_twin(console, result)
+    held = {w.group for w in result.windows}
+    fitted = fit(make_model("friction", robot), [m for m in maneuvers if m.group not in held], FRICTION)
+    residuals = fitted.residuals([m for m in maneuvers if m.group in held])
+    friction = math.sqrt(float((residuals[:, :2] ** 2).sum(axis=1).mean()))
+    console.print(f"friction, calibrated: position {friction:.3f} m, heading {np.sqrt((residuals[:, 2] ** 2).mean()):.3f} rad")
+    for m in result.repaired:
+        console.print(f"{m.name}: position over that of friction {m.judged.rows[-1].position_rms_m / friction:.2f}")
+
+
+def study_spoiled(console: Console, seed: int, only: Sequence[str], config: TwinConfig | None = None) -> None:
+    """Print what is named of each spoiled simulator."""
+    robot = load_robot("husky_a200")
+    true = true_simulator(robot)
+    maneuvers, n = drive(true, robot, seed), true.numbers
+    changes = {
+        "healthy": {},
+        "mu": {"mu": 0.5 * n.mu},
+        "servo": {"servo_gain": 0.2 * n.servo_gain},
+        "radius": {"radius_scale": 1.04},
+        "cg": {"cg_x_m": n.cg_x_m + 0.08},
+        "mass": {"mass_kg": 0.7 * n.mass_kg},
+    }
+    for name in only:
+        result = examine(maneuvers, robot, spoiled(true, **changes[name]).mjcf, config)
+        named = "; ".join(f"{f.best.field} ({', '.join(r.field for r in f.rivals) or 'alone'})" for f in result.findings) or "nothing"
+        console.print(f"{name}: {named}; better: {', '.join(m.name for m in result.repaired if m.is_better) or 'none'}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=("rotations", "husky", "spoiled"))
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", default=",".join(SPOILS))
+    given = parser.parse_args()
+    terminal = Console(width=200, highlight=False)
+    if given.what == "rotations":
+        study_rotations(terminal)
+    elif given.what == "husky":
+        study_husky(terminal)
+    else:
+        study_spoiled(terminal, given.seed, given.only.split(","))

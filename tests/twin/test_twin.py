@@ -1,0 +1,78 @@
+"""The search: the effect that is hidden in the simulator is found, and a simulator that is right is left as it is."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="needs the extra 'twin'")
+
+from localization.cli import main
+from localization.twin import fit
+from localization.twin.discrepancy import Row, words
+from localization.twin.naming import name_causes
+from localization.twin.parameters import hypotheses_of
+from localization.twin.windows import spread, windows_of
+from motion_models.robot_file import load_robot
+from tests.helpers.twin_drives import drive, spoiled, true_simulator
+
+GRID = Path(__file__).parents[1] / "data" / "vaultbot" / "rotation_grid.csv"
+SMALL = ["--config.windows", "3", "--config.held-windows", "6", "--config.budget-steps", "1000"]
+SPOILS = {"mu": ("mu", 0.5), "servo": ("servo_gain", 0.2)}
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("name", SPOILS)
+def test_spoiled_number_is_named_first_or_among_its_rivals(name: str) -> None:
+    robot = load_robot("husky_a200")
+    true = true_simulator(robot)
+    field, factor = SPOILS[name]
+    file = spoiled(true, **{field: factor * getattr(true.numbers, field)})
+    windows = windows_of(drive(true, robot, seed=3, count=16), robot)
+    fitted = [windows[i] for i in spread(windows, robot, 4)]
+    problem = fit.Problem(file, hypotheses_of(file, robot), fitted, 600_000)
+    problem.noise = np.array([0.02, 0.02, 0.01, 0.05, 0.05, 1.0])  # the drive's own noise, not a real robot's
+    findings, _ = name_causes(problem, fit.start(problem), -math.inf)
+    assert field in [findings[0].best.field, *(rival.field for rival in findings[0].rivals)]
+
+
+def test_command_writes_files_that_are_better_and_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "twin"
+    assert main(["twin", str(GRID), "--robot", "vaultbot", *SMALL, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "in place it turns" in printed
+    assert "too little" in printed
+    content = json.loads((out / "twin.json").read_text())
+    law = next(repair for repair in content["repairs"] if repair["name"] == "contact law")
+    assert law["is_better"]
+    assert abs(law["rows"][-1]["turn_error"]) < 0.2 < abs(content["before"]["rows"][-1]["turn_error"])
+    assert (out / "contact_law" / "skidloc_contact.py").exists()
+    assert b"skidloc_contact" in (out / "contact_law" / "vaultbot.xml").read_bytes()
+    assert "Side by side" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco><worldbody/></mujoco>", "no body has a free joint"),
+        ("<sdf version='1.9'/>", "is no MJCF"),
+        ("<mujoco><worldbody><body></worldbody></mujoco>", "line 1"),
+        ("<mujoco><worldbody><body><freejoint/><geom size='nan'/></body></worldbody></mujoco>", "MuJoCo"),
+    ],
+)
+def test_simulator_that_cannot_be_used_is_refused(text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.xml"
+    path.write_text(text)
+    assert main(["twin", str(GRID), "--robot", "vaultbot", "--simulator", str(path), "--out", str(tmp_path / "o")]) == 2
+    error = capsys.readouterr().err
+    assert message in error.replace("\n", " ")
+    assert not (tmp_path / "o").exists()
+
+
+def test_motion_within_its_scatter_is_not_called_wrong() -> None:
+    row = Row("in place", 20, -0.03, 0.03, math.nan, math.nan, (0.01, 0.0), (0.01, 0.01), 0.02, 0.05, -0.01)
+    assert words([row]) == []
