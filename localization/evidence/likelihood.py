@@ -12,12 +12,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import OUTLIER, TEMPER, TURN_RAD_S, WAY_M_S, Alternative
+from localization.evidence.alternatives.alternative import (
+    OUTLIER,
+    STILL_M_S,
+    STILL_RAD_S,
+    TEMPER,
+    TURN_RAD_S,
+    WAY_M_S,
+    Alternative,
+    size_of,
+)
 from localization.evidence.signals import Kind
 from motion_models.se2 import FloatArray
 
@@ -49,8 +58,16 @@ NOISE: Mapping[Kind, Noise] = {
 }
 """Measured on fr079, MIT-CSAIL, ACES and the Husky of `tests/data`; the level is estimated in each log (`LEVELS`)."""
 _ITERATIONS = 4
-_SIZE_SIGMA = 1.0
-"""Standard deviation of the logarithm of a drive's speed over `WAY_M_S`, and of its turns: from crawling to driving."""
+_SCALE_SHARE: Mapping[Kind, tuple[float, float]] = {
+    "wheels": (0.5, 0.5),
+    "driver": (1.0, 0.0),
+    "gyro": (0.0, 1.0),
+    "lidar": (0.5, 0.0),
+    "reference": (0.5, 0.0),
+}
+"""Part of `Alternative.log_jacobian` that is the logarithm of the unit of the way, and of the turn."""
+_SIZE_SIGMA = 0.7
+"""Standard deviation of the logarithm of a drive's speed over `WAY_M_S`, and of its turns: 0.1 m/s to 2 m/s are two of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +76,31 @@ class Stack:
 
     kind: Kind
     alternatives: Sequence[Alternative]
+    raw: Mapping[str, float] = field(default_factory=dict)
+    """Size of the way and of the turn by the robot file, where ``alternatives`` are not all of them."""
+
+    @cached_property
+    def sizes(self) -> Mapping[str, float]:
+        """Size of the way [m/s] and of the turn [rad/s] by the robot file, of what is no motion at least."""
+        if self.raw:
+            return self.raw
+        by_file = self.alternatives[0]
+        floors = {"way": STILL_M_S, "turn": STILL_RAD_S}
+        return {name: max(size_of(c), floors[name]) for name in floors if (c := getattr(by_file, name)) is not None}
+
+    def only(self, k: int) -> Stack:
+        """The stack with alternative ``k`` alone."""
+        return Stack(self.kind, [self.alternatives[k]], self.sizes)
+
+    def alone(self, name: str, size: float) -> FloatArray:
+        """Evidence (A,) of a channel that no other source measures; ``size``: of the motion of usual robots. 0 where it is unknown."""
+        channel = self.channel(name)
+        assert channel is not None
+        known = np.isfinite(channel)
+        mean_square = (np.where(known, channel, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        plausible = -0.5 * (0.5 * np.log(mean_square / size**2 + 1e-4) / _SIZE_SIGMA) ** 2
+        log_size = self.log_scale(name) + math.log(self.sizes[name]) + 0.5 * (1.0 + math.log(math.tau))
+        return np.asarray(np.where(known.any(axis=1), plausible - TEMPER * known.sum(axis=1) * log_size, 0.0))
 
     @cached_property
     def own(self) -> FloatArray:
@@ -89,6 +131,11 @@ class Stack:
             "way": np.array([math.hypot(noise.way_scale, a.way_sigma) for a in self.alternatives]),
             "turn": np.array([math.hypot(noise.turn_scale, a.turn_sigma) for a in self.alternatives]),
         }
+
+    def log_scale(self, name: str) -> FloatArray:
+        """(A,) logarithm of the unit of a channel."""
+        shares = _SCALE_SHARE[self.kind]
+        return np.array([a.log_jacobian * shares[(name == "turn") != a.is_crossed] for a in self.alternatives])
 
     @cached_property
     def relative(self) -> FloatArray:
@@ -126,7 +173,21 @@ def _channel_evidence(
     _, known, _, _, tau, bias_sigma = inputs
     fitted = _profile(*inputs, size)
     own_size, of_size = _size_of_motion(*fitted[:3], size)
-    return np.asarray(_integrated(*fitted, known, own_size) + _scale_price(*fitted[3:], tau, bias_sigma) + of_size)
+    found = _integrated(*fitted, known, own_size) + _scale_price(*fitted[3:], tau, bias_sigma) + of_size
+    is_alone = known.any(axis=2).sum(axis=1) < 2
+    return np.asarray(np.where(is_alone, _of_one_source(stacks, choice, vary, name, size, used), found))
+
+
+def _of_one_source(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: str, size: float, used: Sequence[int]) -> FloatArray:
+    """Evidence (A,) of a channel that one source measures alone: of its unit, and of nothing else.
+
+    Flat over motions up to the size of the source's rates: a map by which the robot moves less than its wheels turn explains nothing.
+    """
+    found = np.zeros(len(stacks[vary].alternatives))
+    for i in used:
+        mine = stacks[i].alone(name, size)
+        found = found + (mine if i == vary else mine[choice[i]])
+    return found
 
 
 def _channel_inputs(

@@ -21,7 +21,7 @@ Choice = tuple[int, ...]
 
 def refined_rows(stacks: Sequence[Stack], choice: Choice, robot: Robot) -> tuple[Row, ...]:
     """Rows of ``choice``, with the factor of wheels that have one as it was measured."""
-    single = [Stack(stack.kind, [stack.alternatives[k]]) for stack, k in zip(stacks, choice, strict=True)]
+    single = [stack.only(k) for stack, k in zip(stacks, choice, strict=True)]
     found = []
     for stack in single:
         for row in stack.alternatives[0].rows:
@@ -31,7 +31,7 @@ def refined_rows(stacks: Sequence[Stack], choice: Choice, robot: Robot) -> tuple
 
 def measured_scales(stacks: Sequence[Stack], choice: Choice) -> dict[tuple[str, str], tuple[float, float]]:
     """Logarithm of the scale of wheels or driver by the other sources, and its sigma, by source and channel."""
-    single = [Stack(stack.kind, [stack.alternatives[k]]) for stack, k in zip(stacks, choice, strict=True)]
+    single = [stack.only(k) for stack, k in zip(stacks, choice, strict=True)]
     found: dict[tuple[str, str], tuple[float, float]] = {}
     for i, stack in enumerate(single):
         for name in ("way", "turn") if stack.kind in ("wheels", "driver") else ():
@@ -43,7 +43,7 @@ def measured_scales(stacks: Sequence[Stack], choice: Choice) -> dict[tuple[str, 
 def _freed(single: Sequence[Stack], index: int) -> list[Stack]:
     """``single`` with the scale of one source free."""
     free = replace(single[index].alternatives[0], way_sigma=_FREE, turn_sigma=_FREE)
-    return [Stack(stack.kind, [free]) if i == index else stack for i, stack in enumerate(single)]
+    return [Stack(stack.kind, [free], stack.sizes) if i == index else stack for i, stack in enumerate(single)]
 
 
 def _with_factor(row: Row, single: Sequence[Stack]) -> Row:

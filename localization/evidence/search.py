@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives import MAKERS, Alternative, Row
-from localization.evidence.alternatives.alternative import LEVELS, TEMPER
+from localization.evidence.alternatives.alternative import LEVELS, STILL_M_S, STILL_RAD_S, unrelated_evidence
 from localization.evidence.delays import candidate_delays
 from localization.evidence.likelihood import Stack, log_posterior
 from localization.evidence.signals import Source
@@ -19,6 +19,8 @@ from motion_models.se2 import FloatArray
 
 _WIDTHS = (8, 6, 5, 3)
 """Choices that are expanded by one more row, by depth: three faults at once are found, and the one beside them."""
+_SAME = 0.2
+"""Relative difference of channels that are the same."""
 _RESCORED = 50
 """Best choices whose evidence is integrated over the level of the noise."""
 _CLEAR = 9.0
@@ -94,15 +96,9 @@ def _unrelated(source: Source, by_file: Alternative) -> Alternative:
     """A source whose channels are of another motion: each has its own size."""
     row = Row(f"{source.kind}.unrelated", f"{source.name} measures another motion than the others", _UNRELATED_ODDS)
     channels = {name: getattr(by_file, name) for name in ("way", "turn") if getattr(by_file, name) is not None}
-    own = by_file.own + sum(_own_size_evidence(channel) for channel in channels.values())
+    floors = {"way": STILL_M_S, "turn": STILL_RAD_S}
+    own = by_file.own + sum(unrelated_evidence(channel, floors[name]) for name, channel in channels.items())
     return replace(by_file, rows=(row,), own=own, **{name: np.full_like(channel, np.nan) for name, channel in channels.items()})
-
-
-def _own_size_evidence(channel: FloatArray) -> float:
-    """Tempered log density of a ``channel`` (n,) as noise of its own size."""
-    known = channel[np.isfinite(channel)]
-    mean_square = float(np.mean(known**2)) + 1e-6 if len(known) else 1.0
-    return -0.5 * TEMPER * len(known) * (1.0 + math.log(math.tau * mean_square))
 
 
 @dataclass(frozen=True)
@@ -145,6 +141,10 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
     for width in _WIDTHS if rivals > at_level[null] - _CLEAR else ():
         for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
             expand(choice)
+    for choice in sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
+        for twin in _mirrored(stacks, choice):
+            if twin not in done:
+                expand(twin)
     best = sorted(at_level, key=at_level.__getitem__, reverse=True)[:_RESCORED]
     top = at_level[best[0]]
     for choice in best:
@@ -163,9 +163,35 @@ def _against(stacks: Sequence[Stack], null: Choice, scores: Mapping[Choice, floa
     return found
 
 
+def _mirrored(stacks: Sequence[Stack], choice: Choice) -> list[Choice]:
+    """Choices by which the robot moves backwards, to the other side, or both, whose sources agree as well as those of ``choice``.
+
+    They differ in each source at once, so that no change of one source leads to them.
+    """
+    found = []
+    for signs in ({"way": -1.0, "turn": 1.0}, {"way": 1.0, "turn": -1.0}, {"way": -1.0, "turn": -1.0}):
+        twin = [_mirror_of(stack, k, signs) for stack, k in zip(stacks, choice, strict=True)]
+        if all(k is not None for k in twin):
+            found.append(tuple(k for k in twin if k is not None))
+    return found
+
+
+def _mirror_of(stack: Stack, k: int, signs: Mapping[str, float]) -> int | None:
+    """The most probable alternative of one source, at the same delay, whose channels are those of alternative ``k`` times ``signs``."""
+    delays = np.array([a.delay_s for a in stack.alternatives])
+    fits = delays == delays[k]
+    for name, sign in signs.items():
+        channels = stack.channel(name)
+        if channels is not None:
+            wanted = np.nan_to_num(sign * channels[k])
+            error = ((np.nan_to_num(channels) - wanted) ** 2).sum(axis=1)
+            fits &= error < _SAME**2 * (wanted**2).sum() + 1e-12
+    return int(np.flatnonzero(fits)[stack.own[fits].argmax()]) if fits.any() else None
+
+
 def _marginal(stacks: Sequence[Stack], choice: Choice) -> float:
     """Log posterior of one choice, integrated over the level of the noise."""
-    single = [Stack(stack.kind, [stack.alternatives[k]]) for stack, k in zip(stacks, choice, strict=True)]
+    single = [stack.only(k) for stack, k in zip(stacks, choice, strict=True)]
     return float(np.logaddexp.reduce([log_posterior(single, [0] * len(single), 0, level)[0] for level in LEVELS]))
 
 

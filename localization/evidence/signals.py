@@ -54,7 +54,7 @@ class Source:
     is_known: BoolArray
     """(m - 1, c) bool: whether the channel is known from one sample to the next."""
     second: FloatArray | None = None
-    """(m, c) the same channels by the other field of the same messages: velocities of wheels, twist of a driver."""
+    """(m, c) the same channels by the other field of the same messages: velocities of wheels, twist of a driver; inverse poses."""
     joints: tuple[str, ...] = ()
     """Left wheels, then right ones."""
     left: int = 0
@@ -187,14 +187,18 @@ def from_poses(name: str, stamps_ns: NDArray[np.int64], poses: FloatArray, first
     t, poses = t[is_new], poses[order][is_new]
     if len(t) < 4 or not np.isfinite(poses).all():
         return None
-    turn = np.array([math.remainder(angle, math.tau) for angle in np.diff(poses[:, 2])])
-    way = np.diff(poses[:, 0] + 1j * poses[:, 1]) * np.exp(-1j * (poses[:-1, 2] + 0.5 * turn))
-    columns = np.stack([way.real, way.imag, turn], axis=1)
+    place = poses[:, 0] + 1j * poses[:, 1]
+    inverse = -place * np.exp(-1j * poses[:, 2])
     gap = np.diff(t) > 4.0 * np.median(np.diff(t)) + _BIN_S
     known = np.repeat(~gap[:, None], 3, axis=1)
-    return Source(
-        name, "reference", np.asarray(t, dtype=float), np.vstack([np.zeros((1, 3)), np.cumsum(columns, axis=0)]).astype(float), known
-    )
+    return Source(name, "reference", np.asarray(t, dtype=float), _moved(place, poses[:, 2]), known, _moved(inverse, -poses[:, 2]))
+
+
+def _moved(place: NDArray[np.complex128], yaws: FloatArray) -> FloatArray:
+    """Integrals (m, 3) of the way ahead, to the left, and of the turn, of poses."""
+    turn = np.array([math.remainder(angle, math.tau) for angle in np.diff(yaws)])
+    way = np.diff(place) * np.exp(-1j * (yaws[:-1] + 0.5 * turn))
+    return np.vstack([np.zeros((1, 3)), np.cumsum(np.stack([way.real, way.imag, turn], axis=1), axis=0)])
 
 
 def _local(delta: FloatArray) -> tuple[float, float, float]:

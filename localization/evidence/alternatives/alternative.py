@@ -18,6 +18,8 @@ OUTLIER = 0.1
 """Share of bins in which a source slips, is matched to the wrong place or is lost."""
 LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0)
 """Factors on all noise, of which each log has one, equally probable before: from a simulator to a worn robot on gravel."""
+STILL_M_S, STILL_RAD_S = 0.02, 0.03
+"""Noise of sources at rest: what is smaller is no motion."""
 WAY_M_S = 0.5
 """Prior standard deviation of a robot's forward speed [m/s]: that of the drives of `tests/data`."""
 TURN_RAD_S = 0.6
@@ -83,6 +85,8 @@ class Alternative:
     relative: float = 1.0
     """Factor on the source's relative noise of turns."""
     delay_s: float = 0.0
+    is_crossed: bool = False
+    """Whether the way is made of what the source calls a turn, and the turn of its way: units go with them."""
 
     @property
     def log_prior(self) -> float:
@@ -102,6 +106,17 @@ def mixture(residual: FloatArray, sigma: FloatArray | float, wide: float) -> flo
     outlier = math.log(OUTLIER) - 0.5 * (r / wide) ** 2 - math.log(wide)
     at_level = TEMPER * np.logaddexp(inlier, outlier).sum(axis=1)
     return float(np.logaddexp.reduce(at_level) - math.log(len(LEVELS)))
+
+
+def unrelated_evidence(channel: FloatArray, floor: float) -> float:
+    """Tempered log density of a ``channel`` (n,) that is of another motion: noise of its own size, of ``floor`` at least."""
+    return noise_evidence(channel, max(size_of(channel), floor))
+
+
+def noise_evidence(channel: FloatArray, sigma: float) -> float:
+    """Tempered log density of a ``channel`` (n,) that is noise of standard deviation ``sigma``."""
+    known, variance = channel[np.isfinite(channel)], sigma**2
+    return -0.5 * TEMPER * float((np.log(math.tau * variance) + known**2 / variance).sum())
 
 
 def side_evidence(side: FloatArray, way: FloatArray, turn: FloatArray, place_sigma_m: float) -> tuple[float, float]:

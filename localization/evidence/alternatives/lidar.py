@@ -16,6 +16,8 @@ from motion_models.se2 import FloatArray
 
 _ODDS = {"quarter": math.log(2e-3), "yaw": math.log(3e-4), "flip": math.log(1e-3), "unit": math.log(1e-4), "place": math.log(1e-3)}
 """Prior odds by kind (`docs/theory/set-up.md`)."""
+UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
+"""Metres per unit."""
 _QUARTER_RAD, _YAW_SIGMA_RAD = math.radians(4.0), math.radians(3.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that; and the standard deviation of a mount's yaw with a
 slide."""
@@ -28,21 +30,21 @@ _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Yaws times upside down times units of the ``rates`` (n, 3) ahead, to the left and turn at the sensor, in the axes of its mount."""
     mount, found = source.mount, list[Alternative]()
-    for is_flipped, unit in itertools.product((False, True), (1.0, 1e-3)):
-        velocity, turn = unit * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
+    for is_flipped, (unit, factor) in itertools.product((False, True), (("", 1.0), *UNITS.items())):
+        velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:
             velocity, turn = velocity.conj(), -turn
-        in_mm = Row("lidar.unit", "the LiDAR's ranges are in millimetres", _ODDS["unit"], "mm", 1e-3, partial(_set_range, 1e3))
+        in_unit = Row("lidar.unit", f"the LiDAR's ranges are in {unit}", _ODDS["unit"], unit, factor, partial(_set_range, 1.0 / factor))
         for yaw, odds in _yaws(velocity, turn, source.place):
-            rows = [*([in_mm] if unit != 1.0 else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
+            rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
             own_yaw = yaw if odds else _small_yaw(velocity, turn, source.place)
             body = velocity * np.exp(1j * own_yaw) - 1j * turn * source.place
             of_yaw = 0.0 if odds else -0.5 * (own_yaw / _YAW_SIGMA_RAD) ** 2
             evidence, _ = side_evidence(body.imag, body.real, turn, _PLACE_SIGMA_M)
-            found.append(Alternative(tuple(rows), body.real, turn, 2.0 * math.log(unit), of_yaw + evidence))
+            found.append(Alternative(tuple(rows), body.real, turn, 2.0 * math.log(factor), of_yaw + evidence))
             evidence, ahead = side_evidence(body.imag, body.real, turn, _WRONG_PLACE_SIGMA_M)
             rows = [*rows, _place_row(source.frame, mount, ahead)]
-            found.append(Alternative(tuple(rows), body.real, turn, 2.0 * math.log(unit), of_yaw + evidence))
+            found.append(Alternative(tuple(rows), body.real, turn, 2.0 * math.log(factor), of_yaw + evidence))
     return found
 
 

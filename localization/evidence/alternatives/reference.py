@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -12,10 +13,10 @@ from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-_ODDS = {"mirror": math.log(1e-3), "yaw": math.log(2e-3), "unit": math.log(1e-3), "heading": math.log(5e-4)}
+_ODDS = {"mirror": math.log(1e-3), "yaw": math.log(2e-3), "unit": math.log(1e-3), "inverse": math.log(3e-4), "place": math.log(3e-3)}
 """Prior odds by kind (`docs/theory/set-up.md`)."""
-_PLACE_SIGMA_M = 0.5
-"""Standard deviation of the place of an antenna, prism or marker along the robot."""
+_PLACE_SIGMA_M, _OTHER_PLACE_SIGMA_M = 0.12, 0.6
+"""Standard deviation along the robot of the middle of tracked markers with the centre of rotation, and of an antenna or a prism."""
 UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "inch": 0.0254, "km": 1e3}
 """Metres per unit."""
 
@@ -23,28 +24,34 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "inch": 0.0254, "km": 1e3}
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Mirrors times yaws times units of the ``rates`` (n, 3) ahead, to the left and turn in the axes of the tracked body."""
     found = []
-    for is_mirrored in (False, True):
-        velocity, turn = rates[:, 0] + 1j * rates[:, 1], rates[:, 2]
+    for is_mirrored, (unit, factor) in itertools.product((False, True), (("", 1.0), *UNITS.items())):
+        velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         rows: tuple[Row, ...] = ()
         if is_mirrored:
             velocity, turn = velocity.conj(), -turn
-            rows = (
-                Row(
-                    "reference.mirrored",
-                    "the reference is mirrored (an axis with the opposite sign, or x and y exchanged)",
-                    _ODDS["mirror"],
-                ),
-            )
-        for name, factor in (("", 1.0), *UNITS.items()):
-            unit = (Row("reference.unit", f"the reference is in {name}", _ODDS["unit"], name, factor),) if name else ()
-            for yaw, odds in _yaws(factor * velocity, turn, 0.0):
-                own_yaw = yaw if odds else _small_yaw(factor * velocity, turn, 0.0)
-                body = factor * velocity * np.exp(1j * own_yaw)
-                evidence, _ = side_evidence(body.imag, body.real, turn, _PLACE_SIGMA_M)
-                turned = (
-                    (Row("reference.yaw", f"its headings are turned by {math.degrees(yaw):.0f} deg", _ODDS["yaw"], _sector(yaw), yaw),)
-                    if odds
-                    else ()
-                )
-                found.append(Alternative((*rows, *unit, *turned), body.real, turn, 2.0 * math.log(factor), evidence))
+            text = "the reference is mirrored (an axis with the opposite sign, or x and y exchanged)"
+            rows = (Row("reference.mirrored", text, _ODDS["mirror"]),)
+        if unit:
+            rows = (*rows, Row("reference.unit", f"the reference is in {unit}", _ODDS["unit"], unit, factor))
+        found += _of_motion(rows, velocity, turn, 2.0 * math.log(factor))
+    if np.isfinite(second).any():
+        inverse = Row("reference.inverse", "the reference's poses are those of the world by the robot", _ODDS["inverse"])
+        found += _of_motion((inverse,), second[:, 0] + 1j * second[:, 1], second[:, 2], 0.0)
+    return found
+
+
+def _of_motion(rows: tuple[Row, ...], velocity: FloatArray, turn: FloatArray, log_jacobian: float) -> list[Alternative]:
+    """Yaws of the tracked body, at the robot's middle or elsewhere, times ``rows``."""
+    found = []
+    for yaw, odds in _yaws(velocity, turn, 0.0):
+        own_yaw = yaw if odds else _small_yaw(velocity, turn, 0.0)
+        body = velocity * np.exp(1j * own_yaw)
+        of_yaw = f"its headings are turned by {math.degrees(yaw):.0f} deg"
+        turned = (Row("reference.yaw", of_yaw, _ODDS["yaw"], _sector(yaw), yaw),) if odds else ()
+        evidence, _ = side_evidence(body.imag, body.real, turn, _PLACE_SIGMA_M)
+        found.append(Alternative((*rows, *turned), body.real, turn, log_jacobian, evidence))
+        evidence, ahead = side_evidence(body.imag, body.real, turn, _OTHER_PLACE_SIGMA_M)
+        text = f"the tracked point is {abs(ahead):.2f} m {'ahead of' if ahead > 0.0 else 'behind'} the middle of the wheels"
+        place = Row("reference.place", text, _ODDS["place"], value=ahead)
+        found.append(Alternative((*rows, *turned, place), body.real, turn, log_jacobian, evidence))
     return found

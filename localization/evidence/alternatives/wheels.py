@@ -191,7 +191,15 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
     """Rates of one side in another unit."""
     n, nl = rates.shape[1], source.left
     sides = tuple(range(nl)), tuple(range(nl, n))
-    for name, factor in (("rpm", math.tau / 60.0), ("deg/s", math.pi / 180.0), ("x 2", 0.5), ("x 1/2", 2.0), ("m/s", 1.0 / radius)):
+    for name, factor in (
+        ("rpm", math.tau / 60.0),
+        ("deg/s", math.pi / 180.0),
+        ("x 2", 0.5),
+        ("x 1/2", 2.0),
+        ("x 4", 0.25),
+        ("x 1/4", 4.0),
+        ("m/s", 1.0 / radius),
+    ):
         for side, columns in zip(("left", "right"), sides, strict=True):
             factors = np.ones(n)
             factors[list(columns)] = factor

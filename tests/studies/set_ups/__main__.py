@@ -27,10 +27,11 @@ def draw_log(seed: int, i: int, faults: tuple[int, int], real_share: float, rows
 
     own = seed_of(seed, i)
     low, high = faults
-    count = low + (i // len(SENSORS) + i) % (high - low + 1)
+    count = low + (i // len(SENSORS) + i) % (high - low + 1)  # each number with each choice of sources
     if (own % 1000) / 1000.0 < real_share:
         return real(own, min(count, 2), allowed=is_asked)
-    sources = SENSORS[i % len(SENSORS)]
+    having = [sources for sources in SENSORS if not rows or any(row.split(".")[0] in (*sources, "clock") for row in rows)]
+    sources = having[i % len(having)]
     return simulated(own, min(count, len(sources)), sources, is_asked)
 
 
