@@ -77,7 +77,10 @@ class RateSeries:
         angle, dt = self._angle(end_ns) - self._angle(start_ns), (end_ns - start_ns) * _NS
         variance = self._white**2 * dt + self._sampling_variance(start_ns, end_ns)
         age_s = max(end_ns - self._stamps[-1], 0) * _NS
-        return Turn(angle, variance, dt, self._rate_at(end_ns), self._rate_variance(end_ns), age_s)
+        of_rate = self._rate_variance(end_ns)
+        first = max(len(self._stamps) - _SCATTER_SAMPLES, 0)
+        period = (self._stamps[-1] - self._stamps[first]) * _NS / max(len(self._stamps) - 1 - first, 1)
+        return Turn(angle, variance, dt, self._rate_at(end_ns), of_rate, of_rate * period * dt, age_s)
 
     def _append(self, stamp_ns: int, rate: float) -> None:
         angle = squares = 0.0

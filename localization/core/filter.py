@@ -206,6 +206,17 @@ def inflate_both(state: State, names: tuple[str, str], cov: FloatArray) -> State
     return State(state.layout, state.means, P)
 
 
+def widen(state: State, name: str, variance: float) -> State:
+    """The state whose variable ``name``, of one dimension, has at least this ``variance``: what was known of it was known too well.
+
+    The errors of all variables that come from its own grow with it: P' = P + (variance - P_nn) c c^T with their regression c = P_n / P_nn.
+    """
+    row = state.layout.rows[name].start
+    known = state.P[row, row]
+    c = state.P[:, row] / known
+    return State(state.layout, state.means, state.P + max(variance - known, 0.0) * np.outer(c, c))
+
+
 def set_marginal(state: State, name: str, mean: FloatArray, cov: FloatArray) -> State:
     """The state with ``mean`` and ``cov`` (k, k) of the variable ``name`` by another estimator, which has used these measurements too:
     correlations with the other variables are dropped."""

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from localization.core.filter import Innovation, clone, inflate, inflate_both, propagate, set_marginal, update
+from localization.core.filter import Innovation, clone, inflate, inflate_both, propagate, set_marginal, update, widen
 from localization.core.measurements.scan import key_scan_transition, measure_scan
+from localization.core.measurements.standstill import measure_bias, measure_standstill
 from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, NoiseModel, initial_state, wheel_transition
 from localization.core.policies.clock_offset import ClocksApart, clock_warnings, find_clocks_apart
@@ -18,6 +19,7 @@ from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import NOTHING_MISSED, PriorOutlier
 from localization.core.policies.slip import SweepSlip
+from localization.core.policies.standstill import StandstillTest
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State
 from localization.core.twist import fuse_turn, mean_twist, slip_change_cov, twist_at_end, wheel_twist_cov
@@ -63,6 +65,7 @@ class Policies:
     """What is not nominal about a step, one object each."""
 
     excitation: Excitation
+    standstill: StandstillTest
     continuous: ContinuousPose | None
     """None where scans hold the pose."""
     wheel_noise: WheelNoiseScale = field(default_factory=WheelNoiseScale)
@@ -83,7 +86,8 @@ class EkfFusion(Estimator):
         self.state = initial_state(self.noise, has_lidar=sensor is not None)
         """Means and covariance at the end of the last step."""
         excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
-        self._policies = Policies(excitation, ContinuousPose() if sensor is None else None)
+        standstill = StandstillTest(robot.gyro_noise.bias_sigma_rad_per_s)
+        self._policies = Policies(excitation, standstill, ContinuousPose() if sensor is None else None)
         self.last = LastStep(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
         self._has_gyro = self._is_scan_pending = False
         self.counts_by_name = dict.fromkeys(("scans", "matched", "standing"), 0)
@@ -98,6 +102,10 @@ class EkfFusion(Estimator):
             self._restart_calibration()
         if step.restarts_map and self._sensor is not None:
             self._sensor.begin_submap()
+        step, bias = policies.standstill.add(self.state, step)
+        if bias is not None:
+            self.state = widen(self.state, "gyro_bias", bias.prior_variance)
+            self.state, _ = update(self.state, measure_bias(self.state, bias.rate, bias.variance), policies.excitation.considered())
         state = clone(self.state, "pose", "start")
         by_wheels = state = propagate(state, wheel_transition(state, step, motion, self.noise))
         if unseen.any():  # the submap moves along
@@ -131,20 +139,30 @@ class EkfFusion(Estimator):
 
     def _restart_calibration(self) -> None:
         """Reset all calibration variables and the wheel noise to their priors; the pose is kept."""
+        self._policies.standstill = StandstillTest(self.noise.gyro.bias_sigma_rad_per_s)
         prior, self._policies.wheel_noise = initial_state(self.noise, has_lidar=self._sensor is not None), WheelNoiseScale()
         for name in ("gyro_bias", "gyro_scale", "clock", "radius", "corrections"):
             self.state = set_marginal(self.state, name, prior[name], prior.cov(name))
 
     def _update_turn(self, state: State, step: Step) -> tuple[State, Innovation | None]:
-        """Update by the gyro's turn, if there is one. With its first there is a second clock, from which the wheels' may be off."""
+        """Update by the gyro's turn, if there is one, and by a standstill. With the first turn there is a second clock, from which the
+        wheels' may be off."""
         if step.turn is None:
             return state, None
         if not self._has_gyro:
             self._has_gyro = True
             if self._sensor is None:
                 state = inflate(state, "clock", np.array([[self.noise.config.clock_sigma_s**2]]))
-        state, innovation = update(state, measure_turn(state, step.turn), self._policies.excitation.considered())
+        standstill, considered = self._policies.standstill, self._policies.excitation.considered()
+        of_step, before = standstill.unknown_turns(step)
+        if of_step:
+            state = inflate_both(state, ("start", "pose"), np.diag([0.0, 0.0, before]))
+            state = inflate(state, "pose", np.diag([0.0, 0.0, of_step]))
+        open_bias = {"gyro_bias"} if standstill.is_bias_open else set()
+        state, innovation = update(state, measure_turn(state, step.turn), considered | open_bias)
         self._policies.wheel_noise.learn(innovation)
+        if standstill.is_at_rest:
+            state, _ = update(state, measure_standstill(state), considered)
         return state, innovation
 
     def _update_scan(self, state: State, step: Step) -> tuple[State, Innovation | None, Cov3]:

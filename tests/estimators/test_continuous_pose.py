@@ -18,7 +18,7 @@ from motion_models.se2 import FloatArray
 from tests.helpers.synthetic_steps import PoseSensor, make_filter, make_world, weave
 
 DRIVES = 30
-MOVING, RESTING = 200, 20
+MOVING, RESTING = 200, 40
 """Steps of a drive: it ends at rest, where the gyro shows its bias."""
 AT_REST = MOVING + 2
 """First step that is at rest by the clocks of all."""

@@ -1,0 +1,138 @@
+"""Whether a robot whose wheels read zero is at rest, and whether the prior of the gyro's bias holds, by the evidence of the gyro."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from localization.core.state import State
+from localization.events import Step
+
+_BIAS_PRIORS = ((0.8, 1.0, 0.0), (0.2, 0.0, 1.75e-2))
+"""Hypotheses on a bias that no rest has measured: prior probability, sigma over that of the robot file, and sigma [rad/s]. Drivers that
+zero their gyro at switch-on have the robot file's; the others the sensor's own, 1 deg/s in data sheets of MEMS gyros (BMI088)."""
+_AT_REST = 0.97
+"""Prior probability that a robot whose wheels read zero is at rest, and least posterior to use that."""
+_MAX_RATE_RAD_S = 1.0
+"""Rates of a robot that is turned with its wheels at rest, as on a turntable or carried, are uniform up to this [rad/s]."""
+_SETTLING_S = 0.2
+"""Time in which a robot whose wheels read zero stops [s]: their clock may be ahead of the gyro's by a driver's latency (`clock_offset`)."""
+_MIN_SPELL_S, _MIN_STEPS = 0.5, 5
+"""Shortest standstill after that which is judged: the scatter of the gyro's rates is that of 25 samples."""
+
+
+class BiasAtRest(NamedTuple):
+    """A bias by the time at rest that was not yet used to measure it."""
+
+    prior_variance: float
+    """Of the prior that holds, where it is wider than the filter's [rad^2/s^2]; else 0."""
+    rate: float
+    """Mean of the gyro's rate in the standstill before this step [rad/s]."""
+    variance: float
+    """[rad^2/s^2]"""
+
+
+class StandstillTest:
+    """`add` each step. A standstill is a time of zero wheels; by Bayes' rule on the gyro's turns in it, with their own scatter for noise:
+
+    - at rest, the turns are those of one bias, which has the filter's variance, or, in the first rest, one of `_BIAS_PRIORS`;
+    - moved, they are those of any rate, constant as on a turntable, or varying as of a robot that rolls or is carried.
+
+    A gyro that never scatters tells nothing about its noise: the robot file's is taken. Vibration scatters, and is no motion.
+    """
+
+    def __init__(self, bias_sigma: float) -> None:
+        """``bias_sigma``: of the robot file [rad/s]."""
+        self._priors = [(share, factor * bias_sigma + sigma) for share, factor, sigma in _BIAS_PRIORS]
+        self._turns: list[tuple[float, float, float]] = []  # angle, time, variance of each step of the standstill
+        self._bias = 0.0, 0.0  # mean and variance at its begin
+        self._stood_s = 0.0
+        self._is_prior_tested = False
+        self._rest = 0.0  # probability
+        self._angle = 0.0  # of the gyro, in all of the standstill
+        self._is_moved = False
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether the robot is at rest, by the standstill up to now."""
+        return self._rest > _AT_REST
+
+    @property
+    def is_bias_open(self) -> bool:
+        """Whether wheels read zero and the gyro has not shown that they are right: its turn is no measurement of its bias then."""
+        return self._stood_s > 0.0 and not self.is_at_rest
+
+    def unknown_turns(self, step: Step) -> tuple[float, float]:
+        """Variances of the yaw of a robot that is moved while its wheels read zero: of the turn in ``step``, and, as that is found, of the
+        turn before it, which was taken for none [rad^2]; else 0."""
+        if not self._is_long or self._rest >= 1.0 - _AT_REST:
+            return 0.0, 0.0
+        before, self._is_moved = 0.0 if self._is_moved else self._angle, True
+        return (_MAX_RATE_RAD_S * step.duration) ** 2, before**2
+
+    def add(self, state: State, step: Step) -> tuple[Step, BiasAtRest | None]:
+        """``step``, with a gyro of its own noise where it shows rest; and the bias, where rest is found, or contradicts its prior.
+        ``state``: at the start of the step."""
+        if not step.is_standing or not step.has_wheels or step.turn is None or step.duration <= 0.0:
+            self._is_prior_tested |= self.is_at_rest
+            self._turns.clear()
+            self._rest = self._stood_s = self._angle = 0.0
+            self._is_moved = False
+            return step, None
+        self._stood_s += step.duration
+        self._angle += step.turn.angle
+        if self._stood_s <= _SETTLING_S:
+            return step, None
+        if not self._turns:
+            self._bias = state.number("gyro_bias"), state.variance("gyro_bias")
+        found = self._judge()
+        turn = step.turn
+        self._turns.append((turn.angle, turn.duration, turn.scatter_variance or turn.variance))
+        return (replace(step, turn=replace(turn, variance=self._density() * turn.duration)) if self.is_at_rest else step), found
+
+    @property
+    def _is_long(self) -> bool:
+        """Whether the standstill is long enough to be judged."""
+        return len(self._turns) >= _MIN_STEPS and sum(seconds for _, seconds, _ in self._turns) >= _MIN_SPELL_S
+
+    def _judge(self) -> BiasAtRest | None:
+        """Set the probability of rest; return the bias, where rest is found now, or another prior holds than the filter has."""
+        if not self._is_long:
+            return None
+        angle, seconds, _ = np.array(self._turns).sum(axis=0).tolist()
+        rate, noise = angle / seconds, self._density() / seconds
+        biases = [(1.0, *self._bias)]
+        if not self._is_prior_tested:
+            (share, _), *others = self._priors
+            biases = [(share, *self._bias), *((share, 0.0, sigma**2) for share, sigma in others)]
+        likelihoods = [share * _normal(rate - mean, cov + noise) for share, mean, cov in biases]
+        at_rest = _AT_REST * sum(likelihoods) * math.exp(-self._variation(rate))
+        moved = (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S
+        was_at_rest, self._rest = self.is_at_rest, at_rest / (at_rest + moved)
+        best = int(np.argmax(likelihoods))
+        if not self.is_at_rest or (was_at_rest and best == 0):
+            return None
+        if best:
+            self._is_prior_tested, self._bias = True, (rate, noise)
+        return BiasAtRest(biases[best][2] if best else 0.0, rate, noise)
+
+    def _density(self) -> float:
+        """Variance of the turns of this standstill, by the scatter in all of it [rad^2/s]."""
+        _, seconds, variance = np.array(self._turns).sum(axis=0).tolist()
+        return float(variance / seconds)
+
+    def _variation(self, rate: float) -> float:
+        """By how much the turns fit better by rates that vary, with a variance of their own, than by the constant ``rate``: log of the
+        likelihood ratio, less half the logarithm of their number for that parameter (Schwarz 1978)."""
+        turns = np.array(self._turns)
+        n = len(turns)
+        ratio = float(np.sum((turns[:, 0] - rate * turns[:, 1]) ** 2 / turns[:, 1])) / (n * self._density())
+        return max(0.5 * n * (ratio - 1.0 - math.log(ratio)) - 0.5 * math.log(n), 0.0) if ratio > 1.0 else 0.0
+
+
+def _normal(residual: float, variance: float) -> float:
+    """Density of a normal distribution."""
+    return math.exp(-0.5 * residual**2 / variance) / math.sqrt(math.tau * variance)

@@ -1,0 +1,106 @@
+"""A gyro at rest: two seconds know its bias to its own noise; a robot that rolls, is carried or turned with its wheels at rest is none."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from localization.core.motion import FilterConfig
+from localization.estimators.fusion import EkfFusion
+from localization.events import Step
+from localization.rate_series import RateSeries
+from motion_models.motion import Motion
+from motion_models.online_calibration import make_corrections
+from motion_models.registry import make_model
+from motion_models.robot import GyroNoise
+from motion_models.robot_file import load_robot
+from tests.helpers.extended import cases
+
+ROBOT = load_robot("vaultbot")
+RATE_HZ, STEP_S, WHITE = 100.0, 0.05, 5e-4
+MEMS_RAD_S = math.radians(0.4)
+
+
+def drive(rates: np.ndarray, white: float = WHITE, rest_s: float = math.inf, seed: int = 0) -> tuple[EkfFusion, np.ndarray]:
+    """The filter after ``rates`` (n,) of the gyro [rad/s] at `RATE_HZ`, with wheels at rest for ``rest_s`` and turning as the gyro's true
+    rate, zero, after that; and the published yaw after each step."""
+    model = make_model("diff_drive", ROBOT)
+    ekf = EkfFusion(model, make_corrections(model, "constant"), ROBOT, None, FilterConfig())
+    series, yaws = RateSeries(ROBOT.gyro_noise.white_rad_per_sqrt_s, 10.0), []
+    noise = np.random.default_rng(seed).normal(0.0, white * math.sqrt(RATE_HZ), len(rates))
+    per_step = round(STEP_S * RATE_HZ)
+    for i, rate in enumerate(rates + noise):
+        series.insert(round(i / RATE_HZ * 1e9), rate)
+        if i % per_step or not i:
+            continue
+        start_ns, end_ns = round((i - per_step) / RATE_HZ * 1e9), round(i / RATE_HZ * 1e9)
+        is_standing = i / RATE_HZ <= rest_s
+        way = 0.0 if is_standing else 0.4 * STEP_S
+        cov = np.zeros((3, 3)) if is_standing else np.diag([4e-4, 1e-4, 1e-3]) * way
+        motion = Motion(np.array([way, 0.0, 0.0]), cov, np.zeros((3, len(model.nominal))), np.zeros((3, 2)))
+        step = Step(
+            start_ns, end_ns, motion, np.zeros(3), np.array([way / STEP_S, 0.0, 0.0]), is_standing, True, series.turn(start_ns, end_ns)
+        )
+        yaws.append(ekf.step(step).pose[2])
+    return ekf, np.array(yaws)
+
+
+def constant_rate(rate: float, seconds: float) -> np.ndarray:
+    return np.full(round(seconds * RATE_HZ), rate)
+
+
+def test_two_seconds_of_rest_know_a_mems_bias_to_the_noise_of_the_gyro():
+    """NEES of the bias over draws, of the published yaw after a minute that is driven straight on, and its error."""
+    bias_nees, yaw_nees, yaw_errors = [], [], []
+    for seed in range(30):
+        ekf, yaws = drive(constant_rate(MEMS_RAD_S, 12.0), rest_s=2.0, seed=seed)
+        error, variance = ekf.state.number("gyro_bias") - MEMS_RAD_S, ekf.state.variance("gyro_bias")
+        assert math.sqrt(variance) < 1.5 * WHITE / math.sqrt(2.0)
+        bias_nees.append(error**2 / variance)
+        yaw_nees.append(yaws[-1] ** 2 / ekf.state.cov("pose")[2, 2])
+        yaw_errors.append(yaws[-1] * 6.0)
+    assert 0.5 < np.mean(bias_nees) < 2.0
+    assert np.mean(yaw_nees) < 2.0
+    assert math.degrees(float(np.sqrt(np.mean(np.square(yaw_errors))))) < 3.0
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.0, 3.0])
+def test_rest_of_a_gyro_as_the_robot_file_has_it_is_consistent(sigma):
+    bias = sigma * GyroNoise.bias_sigma_rad_per_s
+    ekf, _ = drive(constant_rate(bias, 2.0))
+    assert abs(ekf.state.number("gyro_bias") - bias) < 3.5 * math.sqrt(ekf.state.variance("gyro_bias"))
+    assert math.sqrt(ekf.state.variance("gyro_bias")) < 1.5 * WHITE / math.sqrt(2.0)
+
+
+def turning(rate: float) -> np.ndarray:
+    return np.concatenate([constant_rate(0.001, 0.3), constant_rate(rate, 4.0)])
+
+
+MOVED = {
+    "turntable": turning(0.3),
+    "slow turntable": turning(0.1),
+    "turntable from the start": constant_rate(0.2, 4.0),
+    "carried": 0.2 * np.sin(2.0 * np.arange(400) / RATE_HZ) + 0.05,
+    "rolls on a bend": 0.04 * np.arange(400) / RATE_HZ,
+}
+
+
+@pytest.mark.parametrize("name", cases(MOVED, usual=["turntable", "carried", "rolls on a bend"]))
+def test_robot_that_is_moved_with_its_wheels_at_rest_is_not_at_rest(name):
+    """It turns as the gyro has it, and none of that is taken for the bias."""
+    rates = MOVED[name]
+    ekf, yaws = drive(rates)
+    assert not ekf._policies.standstill.is_at_rest
+    assert abs(ekf.state.number("gyro_bias")) < 5.0 * GyroNoise.bias_sigma_rad_per_s
+    assert abs(yaws[-1] - rates.sum() / RATE_HZ) < 4.0 * math.sqrt(ekf.state.cov("pose")[2, 2])
+
+
+def test_vibration_at_rest_is_noise_and_no_motion():
+    """Of an engine at 30 Hz, forty times the gyro's own."""
+    seconds = np.arange(400) / RATE_HZ
+    ekf, yaws = drive(MEMS_RAD_S + 0.2 * np.sin(math.tau * 30.3 * seconds), rest_s=math.inf)
+    assert ekf._policies.standstill.is_at_rest
+    assert abs(ekf.state.number("gyro_bias") - MEMS_RAD_S) < 1.2 * MEMS_RAD_S
+    assert abs(yaws[-1]) < math.radians(0.5)
