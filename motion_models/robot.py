@@ -38,6 +38,10 @@ class Geometry:
     """Centre of gravity ahead of the wheelbase's centre, used where the log has none."""
     cg_y_m: float = 0.0
     """Centre of gravity left of the wheelbase's centre, used where the log has none."""
+    cg_offset_x_m: float = 0.0
+    """How much farther ahead the centre of gravity lies than by `cg_x_m`, by the arms or by its topic, whichever is used."""
+    cg_offset_y_m: float = 0.0
+    """How much farther left the centre of gravity lies than by `cg_y_m`, by the arms or by its topic, whichever is used."""
     left_wheel_radius_multiplier: float = 1.0
     """Rolled distance of the left wheels over `wheel_radius_m` times their angle, as in ROS's diff_drive_controller."""
     right_wheel_radius_multiplier: float = 1.0
@@ -50,6 +54,11 @@ class Geometry:
     def radius_multipliers(self) -> FloatArray:
         """(2,) left and right; wheel rates of logs and topics are multiplied by them."""
         return np.array([self.left_wheel_radius_multiplier, self.right_wheel_radius_multiplier])
+
+    @property
+    def cg_offset(self) -> FloatArray:
+        """(2,) x and y that are added to the centre of gravity of every source [m]."""
+        return np.array([self.cg_offset_x_m, self.cg_offset_y_m])
 
 
 @dataclass(frozen=True)
@@ -274,7 +283,7 @@ class Robot:
     @property
     def center_of_gravity(self) -> FloatArray:
         """(2,) nominal x, y of the centre of gravity in the body frame [m]."""
-        return np.array([self.geometry.cg_x_m, self.geometry.cg_y_m])
+        return np.array([self.geometry.cg_x_m, self.geometry.cg_y_m]) + self.geometry.cg_offset
 
     def coefficients(self, model: str, names: tuple[str, ...], defaults: FloatArray) -> FloatArray:
         """(k,) parameters of ``model``: the robot's coefficients where it names them, else ``defaults`` (k,).

@@ -207,7 +207,9 @@ def _postures(robot: Robot) -> FloatArray | None:
         return None
     model = arms_model(robot.arms, robot.folder)
     postures = arms_postures(robot.arms, robot.folder)
-    return np.array([model.cg(model.chain.posture(posture)) for posture in postures.values()]) if postures else None
+    return (
+        np.array([model.cg(model.chain.posture(posture)) for posture in postures.values()]) + robot.geometry.cg_offset if postures else None
+    )
 
 
 def _each(found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> list[tuple[str, TurningInPlace | None]]:

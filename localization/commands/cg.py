@@ -76,6 +76,8 @@ class Cg:
         else:
             estimate, static, steps = self._with_arms(robot, weighed)
             source += steps
+        if weighed is None and self.urdf is None:
+            estimate = CgEstimate(estimate.position + g.cg_offset, estimate.covariance, estimate.mass)
         off_middle = 0.0 if weighed is not None or self.urdf is None else _off_middle(self.urdf, self.base_link)
         if off_middle:
             estimate = CgEstimate(estimate.position, estimate.covariance + np.diag([0.0, off_middle**2]), estimate.mass)

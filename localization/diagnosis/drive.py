@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
+CgSource = Literal["topic", "arms", "constant", "table"]
 _GRIPPERS = ("left_gripper", "gripper", "tool0", "left_tool0")
 _MAX_STANDSTILL_RATE = 0.05  # rad/s; five sigma of plausible gyro biases (`causes`): a robot that turns while its wheels stand
 _MIN_REGULAR_SHARE = 0.6  # of the intervals between messages that must be near their median for messages to have a period
@@ -96,6 +97,8 @@ class Drive:
     is_gyro_reference: bool = False
     forces: FloatArray | None = None
     """(W, 2) mean specific force along the body's x and y over each maneuver [m/s^2]; None without accelerometers."""
+    cg_source: CgSource = "constant"
+    """Where the centre of gravity comes from: its topic, the arms' joint states, the robot file's constant, or the table."""
     payload_arms: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) from the CG to where a payload would be held, in each interval of the maneuvers end to end [m]."""
     payload_link: str = ""
@@ -210,13 +213,14 @@ class ImuRecord:
 class _Postures:
     """The log's model of the arms, which also records the joints of each centre of gravity."""
 
-    def __init__(self, model: Any) -> None:
-        self._model, self.chain = model, model.chain
+    def __init__(self, model: Any, offset: FloatArray) -> None:
+        self._model, self.chain, self._offset = model, model.chain, offset
         self.joints: dict[tuple[float, float], FloatArray] = {}
 
     def estimate(self, positions: FloatArray) -> Any:
         found = self._model.estimate(positions)
-        self.joints.setdefault((float(found.position[0]), float(found.position[1])), np.array(positions))
+        x, y = (found.position + self._offset).tolist()
+        self.joints.setdefault((x, y), np.array(positions))
         return found
 
     def __getattr__(self, name: str) -> Any:
@@ -248,7 +252,7 @@ def drive_of_log(
     inner = make_motion_reference(log, robot, motion_reference, reference, config, reference_sigmas, antenna)
     postures = None
     if log._arms is not None:
-        postures = _Postures(log._arms)
+        postures = _Postures(log._arms, robot.geometry.cg_offset)
         log._arms = postures  # type: ignore[assignment]
     drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
     if isinstance(inner[0], PositionMotionReference) and not inner[0].is_antenna_known and drive.maneuvers:
@@ -258,7 +262,8 @@ def drive_of_log(
         drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
         drive = dataclasses.replace(drive, warnings=(*drive.warnings, note))
     losses = tuple(EncoderLoss(f.joint, f.messages / max(drive.rolling_messages, f.messages), f.spells) for f in log.frozen_wheels())
-    return dataclasses.replace(drive, encoder_losses=losses, warnings=(*drive.warnings, *log.warnings()))
+    source: CgSource = "topic" if log.sources.center_of_gravity is not None else "arms" if log.sources.arms else "constant"
+    return dataclasses.replace(drive, encoder_losses=losses, cg_source=source, warnings=(*drive.warnings, *log.warnings()))
 
 
 def drive_of_events(
@@ -402,6 +407,7 @@ def drive_of_table(name: str, robot: Robot, maneuvers: Sequence[Maneuver], kind:
         maneuvers=tuple(maneuvers),
         motion_reference=f"the table of {len(maneuvers)} {kind}",
         kind=kind,
+        cg_source="table",
         starts_s=np.asarray(np.cumsum(seconds) - seconds),
         payload_arms=_payload_arms(robot, maneuvers, None),
     )
@@ -447,7 +453,7 @@ def _payload_arms(robot: Robot, maneuvers: Sequence[Maneuver], postures: _Postur
         key = np.round(joints, 3).tobytes()
         if key not in known:
             estimate = loaded.estimate(joints)
-            known[key] = (estimate.position - unique[i]) * estimate.mass
+            known[key] = (estimate.position + robot.geometry.cg_offset - unique[i]) * estimate.mass
         levers[i] = known[key]
     return np.asarray(levers[np.ravel(inverse)])
 

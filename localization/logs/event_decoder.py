@@ -111,6 +111,7 @@ class EventDecoder:
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats, is_whole=odometry_type not in ODOMETRY_DECODERS)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
+        self._cg_offset = robot.geometry.cg_offset
         cg_topic = "" if sources.center_of_gravity is None else sources.center_of_gravity.topic
         self._check_cg = partial(check_tipping, geometry=robot.geometry, topic=cg_topic, oddity=Oddity.TIPPING_CG, stats=stats)
         self.decoders: Mapping[str, TopicDecoder] = {
@@ -131,7 +132,7 @@ class EventDecoder:
         elif isinstance(payload, OdometryReading):
             yield from map(self._roll, self.from_odometry(payload))
         elif isinstance(payload, CgSample):
-            yield from self._check_cg(payload)
+            yield from self._check_cg(shift_cg(payload, self._cg_offset))
         elif isinstance(payload, Scan) and not self._lidar.is_exact:
             yield dataclasses.replace(payload, points=_with_true_ranges(payload.points, self._lidar))
         else:
@@ -218,12 +219,17 @@ def make_arm_cg_converter(
         estimate = tracker.update(reading.names, reading.position)
         if estimate is None or (estimate is last and reading.stamp_ns - last_ns < _SAME_CG_NS):
             return
-        sample = CgSample(reading.stamp_ns, estimate.position, estimate.covariance)
+        sample = shift_cg(CgSample(reading.stamp_ns, estimate.position, estimate.covariance), geometry.cg_offset)
         for supported in check_tipping(sample, geometry, topic, Oddity.TIPPING, stats):
             last, last_ns = estimate, reading.stamp_ns
             yield supported
 
     return convert
+
+
+def shift_cg(sample: CgSample, offset: FloatArray) -> CgSample:
+    """``sample`` moved by the robot file's ``offset`` (2,) of every source of the centre of gravity [m]."""
+    return dataclasses.replace(sample, position=sample.position + offset) if offset.any() else sample
 
 
 def check_tipping(sample: CgSample, geometry: Geometry, topic: str, oddity: Oddity, stats: MessageStats) -> Iterator[CgSample]:

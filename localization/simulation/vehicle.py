@@ -75,7 +75,7 @@ class Body:
     grip_split: float = 0.0
     """The left wheels grip more by half of this share, the right ones less."""
     cg_offset: tuple[float, float] = (0.0, 0.0)
-    """How far the CG really lies from where arms and robot file have it [m]."""
+    """How far the CG really lies from where arms, topic and `cg_x_m` have it [m]."""
     waves: FloatArray = field(default_factory=lambda: NO_WAVES)
     """(n, 4) hills (`simulation.terrain`)."""
     yields: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -86,7 +86,9 @@ class Body:
         """The nominal robot on its nominal floor."""
         plain = FrictionDynamics.from_robot(robot)
         radius = float(plain.params[0])
-        return cls(plain.params, plain.mass, plain.inertia, plain.cg_height, radius, radius, plain.saturation)
+        g = robot.geometry
+        off = (g.cg_offset_x_m, g.cg_offset_y_m)
+        return cls(plain.params, plain.mass, plain.inertia, plain.cg_height, radius, radius, plain.saturation, cg_offset=off)
 
     def with_param(self, name: str, value: float) -> Body:
         """This body with another friction parameter."""
@@ -232,7 +234,7 @@ class MassDistribution:
         self._robot = robot
         self._empty: CgModel | None = None
         self.postures: Mapping[str, Posture] = {}
-        start = robot.center_of_gravity
+        start = robot.center_of_gravity - robot.geometry.cg_offset
         if robot.arms is not None:
             self._empty = arms_model(robot.arms, robot.folder)
             self.postures = arms_postures(robot.arms, robot.folder)

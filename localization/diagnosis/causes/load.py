@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 
 from localization.diagnosis.causes.cause import Cause, CorrectionDraft, Setting, add, add_item
-from motion_models.center_of_gravity.files import arms_model
-from motion_models.center_of_gravity.parts import Arms
 from motion_models.se2 import FloatArray
 
 _TOLERATED_LOAD = 0.01
@@ -23,48 +20,30 @@ def _payload_of_robot(cause: Cause, setting: Setting) -> tuple[Cause, ...]:
 
 
 def _correct_payload(draft: CorrectionDraft, size: float) -> CorrectionDraft:
-    """The robot's mass; a payload in the gripper moves with the arms, ``[arms] payload_kg``, and another is at rest on the robot."""
+    """The robot's mass; a payload in the gripper moves with the arms, ``[arms] payload_kg``, where the log's centre of gravity is that of
+    its arms, and another is at rest on the robot."""
     drive, arms, g = draft.drive, draft.robot.arms, draft.robot.geometry
     mass = g.mass_kg + size
     draft = draft.with_robot(geometry=dataclasses.replace(g, mass_kg=mass))
     carried = drive.payload_arms * (size / mass)
-    if arms is not None and drive.payload_link and arms.payload_kg + size > 0.0:
+    if arms is not None and drive.payload_link and drive.cg_source == "arms" and arms.payload_kg + size > 0.0:
         arms = dataclasses.replace(arms, payload_kg=arms.payload_kg + size, payload_link=drive.payload_link)
         return dataclasses.replace(draft.with_robot(arms=arms), cg_shift=draft.cg_shift + carried)
     return _move_cg(draft, carried.mean(axis=0))
 
 
 def _move_cg(draft: CorrectionDraft, shift: FloatArray) -> CorrectionDraft:
-    """The CG of everything but the arms, so that the whole robot's moves by ``shift`` (2,) [m]; of a table, which has its own, no file
-    moves it, and only the models' coefficients hold it."""
-    arms, g = draft.robot.arms, draft.robot.geometry
+    """The offset ``shift`` (2,) [m] of the centre of gravity of every source: topic, arms and constant. A table has its own, which no file
+    moves, and only the models' coefficients hold it."""
+    g = draft.robot.geometry
     x, y = (float(v) for v in shift)
-    if arms is not None and draft.drive.kind != "log":
+    if draft.drive.cg_source == "table":
         return draft.with_step(
             f"the centre of gravity is off by ({x:+.4f}, {y:+.4f}) m from that of the table; the models' coefficients hold it, and the "
-            "file's arms stay."
+            "file's centre of gravity stays."
         )
-    if arms is None:
-        draft = draft.with_robot(geometry=dataclasses.replace(g, cg_x_m=g.cg_x_m + x, cg_y_m=g.cg_y_m + y))
-    else:
-        draft = draft.with_robot(arms=_with_static_part(arms, draft.robot.folder, shift))
+    draft = draft.with_robot(geometry=dataclasses.replace(g, cg_offset_x_m=g.cg_offset_x_m + x, cg_offset_y_m=g.cg_offset_y_m + y))
     return dataclasses.replace(draft, cg_shift=draft.cg_shift + shift)
-
-
-def _with_static_part(arms: Arms, folder: Path | None, shift: FloatArray) -> Arms:
-    """``arms`` with everything but the arms moved so that the whole robot's CG moves by ``shift`` (2,) [m]: by the shift times all mass
-    over its own."""
-    model = arms_model(arms, folder)
-    x, y = (float(v) for v in model.static.position + shift * (model.mass / model.static.mass))
-    sigmas = np.sqrt(np.diag(model.static.covariance))
-    return dataclasses.replace(
-        arms,
-        static_mass_kg=model.static.mass,
-        static_x_m=x,
-        static_y_m=y,
-        static_mass_sigma_kg=float(sigmas[0]),
-        static_sigma_m=float(sigmas[1]),
-    )
 
 
 PAYLOAD = Cause(
@@ -82,7 +61,7 @@ CG_OFFSET_X = Cause(
     *("m", "the centre of gravity lies farther ahead than given", 0.03, 0.003, add_item("cg", 0)),
     ("the centre of gravity lies {} farther ahead than given", "the centre of gravity lies {} farther back than given"),
     correct=lambda d, s: _move_cg(d, np.array([s, 0.0])),
-    remedy=_WEIGH + "cg_x_m = {g.cg_x_m:.4f}",
+    remedy=_WEIGH + "cg_offset_x_m = {g.cg_offset_x_m:.4f}",
     by_skidding=True,
 )
 CG_OFFSET_Y = Cause(
@@ -90,6 +69,6 @@ CG_OFFSET_Y = Cause(
     *("m", "the centre of gravity lies farther left than given", 0.02, 0.003, add_item("cg", 1)),
     ("the centre of gravity lies {} farther left than given", "the centre of gravity lies {} farther right than given"),
     correct=lambda d, s: _move_cg(d, np.array([0.0, s])),
-    remedy=_WEIGH + "cg_y_m = {g.cg_y_m:.4f}",
+    remedy=_WEIGH + "cg_offset_y_m = {g.cg_offset_y_m:.4f}",
     by_skidding=True,
 )
