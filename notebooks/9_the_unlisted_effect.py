@@ -27,8 +27,9 @@ import numpy as np
 from localization import Trial, open_log, replay, score
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
-from localization.diagnosis.extension import describe_term, extend
+from localization.diagnosis.extension import extend
 from localization.diagnosis.handover import Reader
+from localization.diagnosis.model_extension import describe_term
 from localization.evaluation.reference_files import load_reference
 from localization.events import Scan
 from localization.logs.writer import write_bag

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +19,7 @@ from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_runs, drive_of_table, read_runs
-from localization.diagnosis.extension import EXTEND_ADVICE, EXTENSION_HEADS, ExtendedResult, extend, suggests_extension
+from localization.diagnosis.extension import EXTEND_ADVICE, ExtendedResult, extend, suggests_extension
 from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
@@ -32,17 +31,16 @@ from localization.diagnosis.findings import (
     describe_sizes,
     describe_tolerated,
     is_contesting,
-    sentence,
 )
 from localization.diagnosis.handover import Reader, check_findings
 from localization.diagnosis.linearization import default_model
+from localization.diagnosis.model_extension import EXTENSION_HEADS
 from localization.diagnosis.result import DiagnosisResult
 from localization.diagnosis.suited_model import examine_beside_suited
 from localization.evidence import open_log_as_declared
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
-from motion_models.calibration.cross_validation import Interval
 from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotations, rotations_as_maneuvers
 from motion_models.errors import CalibrationError, SkidlocError
@@ -51,7 +49,7 @@ from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
 
-NOT_BETTER = "the corrected robot is not better on the half held out beyond its scatter: robot.toml keeps the old values."
+KEEPS_VALUES = "robot.toml keeps the old values: "
 _WHOLE_SHARE = 0.9
 """Share of a correction that a model holds, below which that is reported."""
 
@@ -66,6 +64,8 @@ class Diagnose:
     motion (window, dt_s, left_rad_per_s, right_rad_per_s, x_m, y_m, yaw_rad, ...)."""
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
+    others: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Logs of other drives of the same robot, which judge what the first one gives: a correction is written if it makes them better."""
     model: str = ""
     """Motion model to diagnose; by default friction, or diff_drive for a robot with casters (`drive = "diff_drive"` in its file)."""
     out: Path | None = None
@@ -99,10 +99,12 @@ class Diagnose:
         if not 0.5 <= self.window_s <= 20.0:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
+        self._check_others()
         robot = load_robot(self.robot)
         model = make_model(self.model or default_model(robot), robot)
         is_table = self.source.suffix.lower() == ".csv"
-        reader = None if is_table else Reader(lambda robot: self._open(self.source, robot), self._cut)
+        reader = None if is_table else self._reader(self.source)
+        others = [self._reader(path) for path in self.others]
         with console.status("reading"):
             drive = self._drive(robot, reader)
         baseline = None
@@ -116,23 +118,20 @@ class Diagnose:
         extended = None
         if self.extend:
             with console.status("searching for terms"):
-                extended = extend(found, drive, model, self.config, reader)
+                extended = extend(found, drive, model, self.config, reader, others)
                 found = extended.found
         notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings)
         found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
-        if self.out is not None and (extended is None or extended.robot is None):
+        if (self.out is not None or others) and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):
-                found = self._with_written_robot(found, reader)
+                found = _with_written_robot(found, reader, others)
         content = found.diagnosis.to_dict()
-        if extended is not None:
-            content["extension"] = None if extended.extension is None else extended.extension.to_dict()
         if self.out is not None:
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
                 corrected, manual_steps = self._write_robot(folder, found, robot, extended)
                 shares = held_shares(found.predictor, {f.definition: f.size for f in corrected}) if found.predictor and corrected else {}
-                terms = None if extended is None else extended.extension
-                write_diagnosis_report(folder / "diagnosis.html", found, terms, is_interactive=not self.static)
+                write_diagnosis_report(folder / "diagnosis.html", found, is_interactive=not self.static)
         if self.json is not None:
             write_json(self.json, content)
         print_diagnosis(console, found.diagnosis)
@@ -165,27 +164,26 @@ class Diagnose:
         found = drive_of_table(name, robot, maneuvers, "windows")
         return dataclasses.replace(found, warnings=(*notes, *found.warnings))
 
+    def _check_others(self) -> None:
+        """Refuse further drives beside a table, and files of one drive's reference."""
+        if not self.others:
+            return
+        if table := next((path for path in (self.source, *self.others) if path.suffix.lower() == ".csv"), None):
+            raise CalibrationError(
+                f"{table.name} is a table: drives that judge each other are logs. Name logs alone, or diagnose it by itself."
+            )
+        if self.reference is not None and Path(self.reference).suffix:
+            raise CalibrationError(f"--reference {self.reference} is of {self.source.name} alone: name a topic that all drives have.")
+
+    def _reader(self, path: Path) -> Reader:
+        return Reader(lambda robot: self._open(path, robot), self._cut)
+
     def _open(self, path: Path, robot: Robot) -> Log:
         return open_log_as_declared(path, robot, self.topic.scored_against(self.reference))
 
     def _cut(self, log: Log) -> Drive:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
         return drive_of_log(log, self.motion_reference, self.reference, config, sigmas, self.antenna)
-
-    def _with_written_robot(self, found: DiagnosisResult, reader: Reader | None) -> DiagnosisResult:
-        """``found`` with the gain of the robot file as it is written and read again, where the log can be replayed."""
-        d = found.diagnosis
-        if d.handover is None or found.predictor is None or found.linearization is None or reader is None:
-            return found
-        named = d.handover.corrected if d.is_confirmed else [f.definition.key for f in correctable_findings(d)]
-        try:
-            handover = check_findings(found.predictor, found.linearization, named, reader)
-        except SkidlocError as error:  # a robot that no command runs with keeps its old values
-            note = f"the corrected robot cannot be replayed: {error}"
-            handover = dataclasses.replace(d.handover, gain=Interval(0.0, 0.0, 0.0), shown=(0.0, math.inf))
-            d = dataclasses.replace(d, warnings=(*d.warnings, note))
-        d = dataclasses.replace(d, handover=handover or d.handover)
-        return dataclasses.replace(found, diagnosis=dataclasses.replace(d, sentence=sentence(d)))
 
     def _write_robot(
         self, folder: Path, found: DiagnosisResult, robot: Robot, extended: ExtendedResult | None
@@ -203,7 +201,7 @@ class Diagnose:
             patch = correct_robot(predictor, sizes)
             new, manual_steps = patch.robot, patch.manual_steps
         if d.handover is not None and not d.is_confirmed:
-            manual_steps = (NOT_BETTER, *manual_steps)
+            manual_steps = (f"{KEEPS_VALUES}{d.handover.refusal or 'a part of the drive stays unexplained'}.", *manual_steps)
         remarks = [f"Diagnosed by skidloc: {d.model} on {d.log}, from {robot.name}."]
         for title, findings in (
             ("Corrected here", corrected),
@@ -221,6 +219,19 @@ class Diagnose:
         return corrected, tuple(manual_steps)
 
 
+def _with_written_robot(found: DiagnosisResult, reader: Reader | None, others: Sequence[Reader]) -> DiagnosisResult:
+    """``found`` with the gain of the robot file as it is written and read again, where the log, or the ``others``, can be replayed."""
+    d = found.diagnosis
+    if d.handover is None or found.predictor is None or found.linearization is None or reader is None:
+        return found
+    named = [f.definition.key for f in correctable_findings(d)]
+    try:
+        handover = check_findings(found.predictor, found.linearization, named, reader, others)
+    except SkidlocError as error:  # a robot that no command runs with keeps its old values
+        handover = dataclasses.replace(d.handover, failure=f"the corrected robot cannot be replayed: {error}")
+    return dataclasses.replace(found, diagnosis=dataclasses.replace(d, handover=handover or d.handover))
+
+
 def print_extension(console: Console, found: DiagnosisResult, extended: ExtendedResult | None, is_suggested: bool) -> None:
     """The terms of the model, or that a search for them is possible, where it ``is_suggested``: no other model explains the drive."""
     if extended is None:
@@ -229,6 +240,7 @@ def print_extension(console: Console, found: DiagnosisResult, extended: Extended
         return
     if extended.extension is None:
         console.print("no term of the library explains what is left.", markup=False)
+    if extended.extension is None or not (extended.extension.terms or extended.extension.effects):
         return
     table = Table(box=None, header_style="bold", pad_edge=False)
     for head in EXTENSION_HEADS:
@@ -236,8 +248,6 @@ def print_extension(console: Console, found: DiagnosisResult, extended: Extended
     for row in extended.extension.table():
         table.add_row(*row)
     console.print(table)
-    if extended.robot is None and extended.extension.terms:
-        console.print(f"not written: {extended.extension.describe()}.", markup=False, soft_wrap=True)
 
 
 def print_handover(console: Console, corrected: Sequence[Finding], manual_steps: Sequence[str], shares: Mapping[str, float]) -> None:
@@ -249,7 +259,7 @@ def print_handover(console: Console, corrected: Sequence[Finding], manual_steps:
     if parts:
         console.print(f"as coefficients: {', '.join(parts)}", markup=False, soft_wrap=True)
     for step in manual_steps:
-        if step != NOT_BETTER:
+        if not step.startswith(KEEPS_VALUES):
             console.print(f"to do: {step}", markup=False, soft_wrap=True)
 
 
@@ -289,7 +299,8 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     if d.handover is not None:
         console.print(f"corrected robot, {d.handover.describe()}", markup=False, soft_wrap=True)
         if not d.is_confirmed:
-            console.print(NOT_BETTER, markup=False, soft_wrap=True)
+            why = d.handover.refusal or "a part of the drive stays unexplained"
+            console.print(f"{KEEPS_VALUES}{why}.", markup=False, soft_wrap=True)
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
     for note in (*d.contradictions, *describe_outliers(d), *d.warnings):

@@ -50,32 +50,44 @@ class BoundShape(NamedTuple):
         return f"{self.component}[{self.along}]"
 
 
-def bound_columns(predictor: DrivePredictor, hypothesis: Hypothesis) -> tuple[list[BoundShape], FloatArray]:
-    """Shapes that the drive can show, and (M, 6, K) what each of unit size changes in the discrepancies."""
+class BoundColumns(NamedTuple):
+    """Shapes that a drive can show, and what each of unit size changes in the discrepancies."""
+
+    shapes: list[BoundShape]
+    columns: FloatArray
+    """(M, 6, K)"""
+    motions: FloatArray
+    """(M, 6, K) of the motion that a place, a time, an angle or a tilt modulates; zero for what is bound to a sensor."""
+
+
+def bound_columns(predictor: DrivePredictor, hypothesis: Hypothesis) -> BoundColumns:
+    """Shapes that the drive can show, with their columns."""
     twist = predictor.corrected_twist(hypothesis)
     moved, of_twist = _moved_columns(predictor, twist)
     measured, of_sensors = _sensor_columns(predictor, twist)
-    columns = np.concatenate([moved, measured], axis=-1)
+    columns, motions = (np.concatenate([m, other], axis=-1) for m, other in zip(moved, (measured, np.zeros_like(measured)), strict=True))
     is_shown = np.sqrt(np.nanmean(np.nan_to_num(columns) ** 2, axis=(0, 1))) > 1e-9
     shapes = [shape for shape, shown in zip((*of_twist, *of_sensors), is_shown, strict=True) if shown]
-    return shapes, np.nan_to_num(columns[..., is_shown])
+    return BoundColumns(shapes, np.nan_to_num(columns[..., is_shown]), np.nan_to_num(motions[..., is_shown]))
 
 
-def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[FloatArray, list[BoundShape]]:
-    """Columns of additions to the twist, and what each of them is bound to."""
+def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[tuple[FloatArray, FloatArray], list[BoundShape]]:
+    """Columns of additions to the twist and of the motions that these modulate, and what each of them is bound to."""
     batch = predictor.batch
     densities = [*_of_time(predictor, twist), *_of_place(predictor, twist), *_of_wheel_angle(predictor), *_of_tilt(predictor, twist)]
-    table = np.column_stack([values for _, values in densities]) if densities else np.zeros((len(twist), 0))
-    columns = np.zeros((len(batch.ends), len(CHANNELS), len(densities)))
-    axes = [("vx", "vy", "wz").index(shape.component) for shape, _ in densities]
+    none = np.zeros((len(twist), 0))
+    table, motions = (np.column_stack([one[k] for one in densities]) if densities else none for k in (1, 2))
+    columns = np.zeros((2, len(batch.ends), len(CHANNELS), len(densities)))
+    axes = [("vx", "vy", "wz").index(shape.component) for shape, _, _ in densities]
     for i, inside in enumerate(batch.intervals()):
-        moved = moved_by(twist[inside], batch.dt[inside], table[inside] * batch.dt[inside, None])
-        columns[i, :3] = moved[:, axes, np.arange(len(densities))]
-    return columns, [shape for shape, _ in densities]
+        for found, values in zip(columns, (table, motions), strict=True):
+            moved = moved_by(twist[inside], batch.dt[inside], values[inside] * batch.dt[inside, None])
+            found[i, :3] = moved[:, axes, np.arange(len(densities))]
+    return (columns[0], columns[1]), [shape for shape, _, _ in densities]
 
 
-Densities = list[tuple[BoundShape, FloatArray]]
-"""Each shape with its density (N,) in every interval, in the unit of its component."""
+Densities = list[tuple[BoundShape, FloatArray, FloatArray]]
+"""Each shape with its density (N,) in every interval, in the unit of its component, and that of the motion alone."""
 
 
 def _of_time(predictor: DrivePredictor, twist: FloatArray) -> Densities:
@@ -84,7 +96,7 @@ def _of_time(predictor: DrivePredictor, twist: FloatArray) -> Densities:
         return []
     way = np.cumsum(np.abs(twist[:, 0]) * predictor.batch.dt)
     return [
-        (BoundShape(component, f"{name} times the way driven", "time", "1/m"), twist[:, i] * way)
+        (BoundShape(component, f"{name} times the way driven", "time", "1/m"), twist[:, i] * way, twist[:, i])
         for name, component, i in (("distance", "vx", 0), ("turning", "wz", 2))
     ]
 
@@ -116,7 +128,7 @@ def _of_place(predictor: DrivePredictor, twist: FloatArray) -> Densities:
         return []
     patches = [patch for cells in _CELLS for patch in _patches(at, low, high, cells)]
     return [
-        (BoundShape(component, f"{name} in the floor's patch {text}", "place", "1"), motion * inside)
+        (BoundShape(component, f"{name} in the floor's patch {text}", "place", "1"), motion * inside, motion)
         for text, inside in patches
         for name, component, motion in (("distance", "vx", twist[:, 0]), ("turning", "wz", twist[:, 2]))
     ]
@@ -154,8 +166,9 @@ def _of_wheel_angle(predictor: DrivePredictor) -> Densities:
         speed = 0.5 * r * batch.wheels[:, k]
         for name, wave in (("cosine", np.cos(angles)), ("sine", np.sin(angles))):
             along = f"the {side} wheels' angle ({name})"
-            found.append((BoundShape("vx", along, "wheel angle", "1"), speed * wave))
-            found.append((BoundShape("wz", along, "wheel angle", "1"), (2 * k - 1) * 2.0 / track * speed * wave))
+            turning = (2 * k - 1) * 2.0 / track * speed
+            found.append((BoundShape("vx", along, "wheel angle", "1"), speed * wave, speed))
+            found.append((BoundShape("wz", along, "wheel angle", "1"), turning * wave, turning))
     return found
 
 
@@ -172,7 +185,7 @@ def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> Densities:
     for k, axis in ((0, "pitch"), (1, "roll")):
         if GRAVITY * left[:, k].std() < _MIN_TILT_M_S2:
             continue
-        found.append((BoundShape(("vx", "vy")[k], f"speed times {axis}", "tilt", "1/rad"), speed * left[owner, k]))
+        found.append((BoundShape(("vx", "vy")[k], f"speed times {axis}", "tilt", "1/rad"), speed * left[owner, k], speed))
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +36,9 @@ class CorrectedRobot:
     """(N, 2) by which the new file moves the centre of gravity in each interval of the drive [m]."""
 
 
-def correct_robot(predictor: DrivePredictor, sizes: Mapping[Cause, float]) -> CorrectedRobot:
-    """The drive's robot where causes have these ``sizes``: what each writes into the file, and where the robot's motion changes every
-    model's coefficients, matched to the corrected motion on the drive's own wheels."""
+def correct_robot(predictor: DrivePredictor, sizes: Mapping[Cause, float], names: Collection[str] = MODELS) -> CorrectedRobot:
+    """The drive's robot where causes have these ``sizes``: what each writes into the file, and where the robot's motion changes the
+    coefficients of the models ``names``, matched to the corrected motion on the drive's own wheels."""
     robot, drive = predictor.drive.robot, predictor.drive
     friction = FrictionModel.from_robot(robot)
     own = dict(zip(friction.param_names, (float(v) for v in friction.nominal), strict=True))
@@ -51,7 +51,7 @@ def correct_robot(predictor: DrivePredictor, sizes: Mapping[Cause, float]) -> Co
         models = robot.models
     else:
         new, models = draft.robot, dict(draft.robot.models)
-        for name in MODELS:
+        for name in names:
             if name != friction.name:
                 models[name] = _matched(predictor, lasting, new, name, draft.cg_shift)
             elif any(lasting.key("twist")) or lasting.changed_rates:

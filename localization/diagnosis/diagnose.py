@@ -30,7 +30,6 @@ from localization.diagnosis.findings import (
     describe_standstill_turn,
     evidence,
     noise_notes,
-    sentence,
 )
 from localization.diagnosis.handover import check_findings
 from localization.diagnosis.linearization import (
@@ -141,8 +140,22 @@ def examine(
     chosen = _drop_insignificant(searched.linearization, searched.chosen, rng, config)
     if chosen and _is_worse_with(searched.predictor, searched.linearization, chosen):
         searched, chosen = searched._replace(linearization=searched.first), ()
-    found = _with_confirmed_names(searched, _conclude(searched, chosen, rng, config), config)
+    found = _without_harmful_names(searched, _conclude(searched, chosen, rng, config), config)
+    found = _with_confirmed_names(searched, found, config)
     return dataclasses.replace(_without_names_of_terms(searched, found, config), names=names)
+
+
+def _without_harmful_names(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
+    """``found`` without names with which windows that were held out get worse, one round after the other."""
+    while (check := found.diagnosis.handover) is not None and check.harmful:
+        keys = {f.definition.key for f in found.diagnosis.findings if not f.is_counted} - {*check.harmful}
+        linearization = searched.linearization if keys else searched.first
+        chosen = tuple(i for i, cause in enumerate(linearization.causes) if cause.key in keys)
+        if len(chosen) >= sum(not f.is_counted for f in found.diagnosis.findings):
+            break
+        searched = searched._replace(linearization=linearization)
+        found = _conclude(searched, chosen, np.random.default_rng(config.seed), config)
+    return found
 
 
 def _with_confirmed_names(searched: _Searched, found: DiagnosisResult, config: DiagnosisConfig) -> DiagnosisResult:
@@ -437,7 +450,6 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
         *(drive.name, drive.robot.name, predictor.model.name, drive.motion_reference, verdict, rows, tuple(findings), trends),
         left_share=share,
         next_drive=next_drive,
-        sentence="",
         within=within,
         tolerances={e.id: e.negligible for e in causes if e.id in within},
         detectable_sizes=detectable,
@@ -581,7 +593,7 @@ def _within_tolerance(
 
 
 def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
-    """``d`` with its sentence, with what was counted where the log was read as findings, and without a consistent verdict where
+    """``d`` with what was counted where the log was read as findings, and without a consistent verdict where
     measurements contradict each other."""
     verdict, findings = d.verdict, (*_counted_findings(d, drive), *d.findings)
     verdict = "explained" if verdict == "consistent" and findings else verdict
@@ -589,10 +601,9 @@ def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
     if contradictions and verdict == "consistent":
         verdict = "unexplained"
     suspected, next_drive = (d.suspected, d.next_drive) if verdict == d.verdict or d.suspected is None else (None, "")
-    d = dataclasses.replace(
+    return dataclasses.replace(
         d, verdict=verdict, findings=findings, contradictions=contradictions, suspected=suspected, next_drive=next_drive
     )
-    return dataclasses.replace(d, sentence=sentence(d))
 
 
 def _counted_findings(d: Diagnosis, drive: Drive) -> list[Finding]:
@@ -622,7 +633,6 @@ def _undecidable(drive: Drive, model: MotionModel, config: DiagnosisConfig) -> D
         *(drive.name, drive.robot.name, model.name, drive.motion_reference, "undecidable", {}, (), ()),
         left_share=0.0,
         next_drive=general_advice("undecidable", []),
-        sentence="",
         windows=len(drive.maneuvers),
         warnings=drive.warnings,
         too_little=drive.warnings[0] if drive.motion_reference == "none" else why,

@@ -15,8 +15,9 @@ from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.causes.gyro_and_ranging import RANGE_BIAS, RANGE_SCALE
 from localization.diagnosis.drive import EncoderLoss, MessageLoss, StandstillTurn
 from localization.diagnosis.drive_predictor import CHANNELS
+from localization.diagnosis.gate import HandoverCheck
+from localization.diagnosis.model_extension import Extension
 from localization.diagnosis.noise import Noise
-from motion_models.calibration.cross_validation import Interval
 from motion_models.se2 import FloatArray
 
 Verdict = Literal["consistent", "explained", "extended", "ambiguous", "unexplained", "undecidable"]
@@ -24,14 +25,13 @@ MAX_NOISE_OVER_REFERENCE = 3.0
 """Noise of the drive, over that of the motion reference by its own covariance: up to 2.0 where nothing is hidden, 3.1 to 200 for effects
 that no cause has (`tests.studies.unknown_effects --develop`)."""
 
-_MAX_GROWTH = 1.02
-"""Error of an estimator after a correction over that before: more is worse, whatever the model's own errors do."""
 _SHOWN_GAIN = 0.01  # smallest gain that a sentence reports: in short drives tolerated differences mask it
 
 _AND = " and "
 """Between the causes in whose place a trend explains a drive."""
 _NOT_SHOWN = "This drive cannot show what is wrong with {}."
 _TWO_SIDED_95 = 1.96
+_USUAL_SHARE = 0.75  # three of the four sigma up to which a size is plausible
 _MAX_MOVED_SHARE = 0.1  # of a size that is right although another finding beside it is not: accuracy of signatures
 _MAX_SUSPECTED_ALIASES = 3  # that a sentence names
 
@@ -98,6 +98,11 @@ class Finding:
         """Whether robots have the cause at a size in its 95 % interval."""
         low, high = self.definition.limits
         return abs(self.size) - _TWO_SIDED_95 * self.sigma <= self.definition.largest_plausible and low <= self.size <= high
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether the size is within three sigma of what robots have: only such sizes are written."""
+        return abs(self.size) <= _USUAL_SHARE * self.definition.largest_plausible
 
     def is_independent_of(self, causes: Collection[str]) -> bool:
         """Whether the size stays within its sigma, or within a tenth of it, where none of these ``causes`` has a size."""
@@ -222,76 +227,6 @@ class Trend:
         return f"the {self.component} left over follows {self.along} (t = {self.t:+.1f}, p = {self.p_value:.2g}, {size})"
 
 
-class Replayed(NamedTuple):
-    """Error of an estimator's motion in windows that were held out, replayed with the old robot file and with the corrected one."""
-
-    before_m: float
-    """Root mean square [m]."""
-    after_m: float
-    noise_m: float = 0.0
-    """Root mean square of the drive's noise in these windows [m]: an estimator with the same scans errs by less against them."""
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether errors grow by more than 2 %, and by more than the drive's noise."""
-        return self.after_m > _MAX_GROWTH * self.before_m and self.after_m**2 - self.before_m**2 > self.noise_m**2
-
-
-_SHOWN_CHANGE = 0.01
-"""Relative change of a component that is printed."""
-CLEAR_SIGMAS = 3.0
-"""Sigmas of the drive's noise by which a half that was held out has to show a change: neighbouring windows share some of it."""
-
-
-@dataclass(frozen=True)
-class HandoverCheck:
-    """Discrepancies of a half of a drive by the old robot, and by one that was corrected by the other half alone."""
-
-    before: dict[str, float]
-    """Root mean square by component, as `drive_predictor.CHANNELS`."""
-    after: dict[str, float]
-    windows: int
-    gain: Interval
-    """Share by which the windows' errors shrink, of the components that the file changes, over their noise; 95 % interval over blocks of
-    windows."""
-    replays: Mapping[str, Replayed] = field(default_factory=dict)
-    """Replays with the old and the new file, by estimator."""
-    corrected: tuple[str, ...] = ()
-    """Keys of the findings that the file corrects."""
-    shown: tuple[float, float] = (0.0, math.inf)
-    """How much of what the file changes the half held out shows, as a factor of the change, and its sigma by the drive's noise: errors
-    shrink where it is more than 1/2."""
-
-    @property
-    def is_better(self) -> bool:
-        """Whether errors shrink beyond what their scatter over the windows explains, or what the drive's noise does, and no estimator's
-        grow.
-
-        What acts in few windows, as a slip in left turns, scatters over the windows by as much as it gains.
-        """
-        share, sigma = self.shown
-        is_gain = self.gain.low > 0.0 or share - CLEAR_SIGMAS * sigma > 0.5
-        return is_gain and not any(one.is_worse for one in self.replays.values())
-
-    def describe(self) -> str:
-        """Errors of the half held out before and after, of the components that change, as a sentence without a stop."""
-        changed = [c for c in self.before if abs(self.after[c] - self.before[c]) > _SHOWN_CHANGE * self.before[c]] or list(self.before)
-        rows = ", ".join(f"{c} {self.before[c]:.3g} -> {self.after[c]:.3g} {'rad' if c in ('yaw', 'gyro') else 'm'}" for c in changed)
-        text = f"half of the drive ({self.windows} windows), corrected by the other half alone: {rows} (root mean square)"
-        return f"{text}; {self.describe_replays()}" if self.replays else text
-
-    def describe_replays(self) -> str:
-        """Errors of the estimators on windows held out, replayed with both files, as a clause."""
-        replayed = ", ".join(f"{name} {one.before_m:.3g} -> {one.after_m:.3g} m" for name, one in self.replays.items())
-        return f"replayed with the written file, the half held out: {replayed} a window"
-
-    def to_dict(self) -> dict[str, Any]:
-        """For `diagnose --json`; root mean squares by component [m or rad]."""
-        found = {"windows": self.windows, "rms_before": self.before, "rms_after": self.after, "is_better": self.is_better}
-        replays = {name: {"before_m": one.before_m, "after_m": one.after_m} for name, one in self.replays.items()}
-        return {**found, "gain": self.gain.value, "gain_interval": [self.gain.low, self.gain.high], "replays": replays}
-
-
 @dataclass(frozen=True)
 class Diagnosis:
     """The answer to one drive and one model."""
@@ -307,7 +242,6 @@ class Diagnosis:
     left_share: float
     """Share of the predictable part of the discrepancy that `trends` explain, 0 to 1."""
     next_drive: str
-    sentence: str
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Causes that are significant but smaller than their tolerance: size and sigma."""
     tolerances: Mapping[str, float] = field(default_factory=dict)
@@ -328,6 +262,13 @@ class Diagnosis:
     """Where the verdict is consistent: the strongest cause, too weak to be named, but stronger than four in five healthy drives show."""
     handover: HandoverCheck | None = None
     """Gain of the corrected robot file on the second half of the drive."""
+    extension: Extension | None = None
+    """Terms and bound effects that were searched beside the findings; None where none were searched, or none found."""
+
+    @property
+    def sentence(self) -> str:
+        """What to do, in one or two sentences; every text about the drive has it from here."""
+        return sentence(self)
 
     @property
     def is_confirmed(self) -> bool:
@@ -359,6 +300,8 @@ class Diagnosis:
             "sentence": self.sentence,
             "tolerances": dict(self.tolerances),
             "handover": None if self.handover is None else {**self.handover.to_dict(), "is_better": self.is_confirmed},
+            "extension": None if self.extension is None else self.extension.to_dict(),
+            "not_written": {f.definition.label: why for f, why in not_written(self)},
             "contradictions": list(self.contradictions),
             "outlier_windows_s": list(self.outliers_s),
             "witness": self.motion_reference,
@@ -475,17 +418,52 @@ of the ranges. On ACES, where the wheels' radius explained a drive as well as ra
 scale and 0.062 m without."""
 
 
+def not_written(d: Diagnosis) -> list[tuple[Finding, str]]:
+    """Findings that a robot file is not written with, each with the reason as a clause."""
+    written = confirmed_findings(d)
+    return [(f, _why_not(d, f)) for f in d.findings if not f.is_counted and f not in written]
+
+
+def _why_not(d: Diagnosis, f: Finding) -> str:
+    """Why a robot file is not written with ``f``."""
+    if why := _objection(d, f):
+        return why
+    if (contested := [other.cause for other in d.findings if _objection(d, other)]) and not f.is_independent_of(contested):
+        return f"its size depends on {' and '.join(dict.fromkeys(contested))}"
+    if d.handover is not None:
+        return d.handover.refused.get(f.definition.key, "") or d.handover.refusal or "a part of the drive stays unexplained"
+    return "nothing shows that it improves windows to which it was not fitted"
+
+
+def _objection(d: Diagnosis, f: Finding) -> str:
+    """What speaks against ``f`` by itself, before its file is tried; empty where nothing does.
+
+    Where a part stays unexplained, a finding has to improve by itself windows that it was not fitted to, and may not change within the
+    drive: it may be a step in the place of an unknown change. Ranges are not corrected where the wheels explain the drive as well.
+    """
+    if f.is_counted:
+        return ""
+    if not f.is_plausible:
+        return "no robot has as much"
+    if not f.is_usual:
+        return "it is more than three sigma of what robots have"
+    better = next((t for t in d.trends if f.cause in t.instead_of.split(_AND)), None) if d.trends else None
+    if better is not None:
+        return f"{better.component} follows {better.along} instead"
+    if f.cause in _RANGES and f.aliases:
+        return "other sensors explain it as well"
+    if d.verdict == "unexplained" and f.gain.low <= 0.0:
+        return "it does not improve windows to which it was not fitted beyond their scatter"
+    if d.verdict == "unexplained" and f.definition.changes_on_the_way:
+        return "it holds in a part of the drive, of which another part is unexplained"
+    return ""
+
+
 def correctable_findings(d: Diagnosis) -> list[Finding]:
-    """Findings that a robot may be corrected by: no sizes that no robot has, nothing in whose place a trend explains the drive, and nothing
-    whose size depends on one of these; where a part stays unexplained, only what by itself improves windows that it was not fitted to, and
-    nothing that changes within the drive: it may be a step in the place of an unknown change; and no ranges where the wheels explain the
-    drive as well."""
+    """Findings that a robot may be corrected by, strongest first: nothing speaks against them, and their sizes do not depend on one against
+    which something does."""
     estimated = [f for f in d.findings if not f.is_counted]
-    contested = {name for t in d.trends if t.instead_of for name in t.instead_of.split(_AND)}
-    contested |= {f.cause for f in estimated if not f.is_plausible}
-    if d.verdict == "unexplained":
-        contested |= {f.cause for f in estimated if f.gain.low <= 0.0 or f.definition.changes_on_the_way}
-    contested |= {f.cause for f in estimated if f.cause in _RANGES and f.aliases}
+    contested = {f.cause for f in estimated if _objection(d, f)}
     return [f for f in estimated if f.cause not in contested and f.is_independent_of(contested)]
 
 
@@ -498,28 +476,26 @@ def confirmed_findings(d: Diagnosis) -> list[Finding]:
 
 
 def sentence(d: Diagnosis) -> str:
-    """What to do, in one or two sentences."""
+    """What to do: corrections, terms and effects, what is not written and why, and what is left without a name."""
     contradiction = f" {d.contradictions[0][0].upper()}{d.contradictions[0][1:]}" if d.contradictions else ""
     missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.is_counted]
     if d.verdict == "undecidable":
         cannot = f"{d.model} cannot be diagnosed on this drive: {d.too_little}" if d.too_little else _NOT_SHOWN.format(d.model)
         found = "".join(f" {text[0].upper()}{text[1:]}." for text in missing)
         return f"{cannot}{found}{contradiction} {d.next_drive}"
+    added = [] if d.extension is None else [text for text in (d.extension.describe(), d.extension.describe_refused()) if text]
     if d.verdict == "consistent":
         text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
         tolerated = describe_tolerated(d)
         text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
-        return text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
-    estimated = correctable_findings(d)
+        text = text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
+        return " ".join((text, *(f"{a.removesuffix('.')}." for a in added)))
     confirmed = confirmed_findings(d)
-    orders = [_correction(d, confirmed)] if confirmed else []
-    others = [f for f in estimated if f not in confirmed]
-    if others and d.verdict != "unexplained":
-        orders.append(_not_better(others))
-    ranges = [f for f in d.findings if f.cause in _RANGES and f.aliases]
-    if ranges and d.verdict != "unexplained":
-        orders.append(f"Not written, as other sensors explain it as well: {', '.join(_further(f) for f in ranges)}")
-    parts = [f"{part[0].upper()}{part[1:]}" for part in orders + missing]
+    orders = [*([_correction(d, confirmed)] if confirmed else []), *added]
+    refused = not_written(d)
+    if refused:
+        orders.append(f"Not written: {'; '.join(f'{_further(f)}, as {why}' for f, why in refused)}")
+    parts = [f"{part[0].upper()}{part[1:]}".removesuffix(".") for part in orders + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
     if left:
         unnamed = "Something without a name is left" if parts else f"{d.model} is wrong here, but not in a way that has a name"
@@ -541,12 +517,6 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     if len(findings) > 1:
         text += f". Then {', '.join(_further(f) for f in findings[1:])}"
     return text
-
-
-def _not_better(findings: Sequence[Finding]) -> str:
-    """Findings that are not to be corrected, and why."""
-    listed = ", ".join(_further(f) for f in findings)
-    return f"Not to be corrected, as a robot file with it improves nothing beyond the scatter of the half held out: {listed}"
 
 
 def _further(f: Finding) -> str:
@@ -578,9 +548,6 @@ def _left(d: Diagnosis) -> str:
     contesting = [trend for trend in d.trends if is_contesting(d, trend)]
     if contesting:
         return contesting[0].text
-    implausible = [f"{f.cause} {f.size:+.2g}" for f in d.findings if not f.is_plausible]
-    if implausible:
-        return f"{' and '.join(implausible)} would fit, but no robot has as much"
     rows = [
         f"{name} {row.unattributed_rms:.2g} {row.unit}, noise {row.expected_rms:.2g}, {describe_row(row).removeprefix('unexplained: ')}"
         for name, row in d.discrepancy.items()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.corrected_robot import CorrectedRobot, correct_robot, predictor_after
 from localization.diagnosis.drive import Drive
-from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor
-from localization.diagnosis.findings import HandoverCheck, Replayed
-from localization.diagnosis.linearization import Linearization, make_regression
+from localization.diagnosis.drive_predictor import DrivePredictor
+from localization.diagnosis.gate import HandoverCheck, HeldRows, Replayed, compare_rows, find_supported, folds, reason
+from localization.diagnosis.linearization import TOLERANCE, Linearization, candidate_causes, linearize, make_predictor, make_regression
 from localization.diagnosis.noise import Noise
 from localization.log_replay import Run, replay
 from localization.logs.reader import Log
 from localization.pipeline import Trial
 from motion_models import se2
-from motion_models.calibration.cross_validation import root_mean_gain
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.errors import CgError, ModelError
 from motion_models.registry import make_model
@@ -36,9 +35,6 @@ _LEAD_NS = 4_000_000_000
 _SAME_WINDOW_S = 0.3
 """Windows of two readings of a log that begin so close are one: clocks that are corrected move them by less."""
 _MIN_HALF_WINDOWS = 8
-_BLOCK = 2  # neighbouring windows share their errors: a scan between them, and the floor
-_LEAST_CHANGE = 1e-3
-"""Change of a component over its noise, in the window where it is largest, below which a file does not change it: rounding."""
 _SENSOR_FIELDS = (
     *("wheel_time_offset_s", "gyro_time_offset_s", "gyro_scale", "lidar_offset", "lidar_time_offset_s", "range_scale"),
     "range_bias_m",
@@ -56,6 +52,8 @@ class Reader:
     """A log's windows."""
     _logs: dict[int, tuple[Robot, Log]] = dataclasses.field(default_factory=dict, init=False, repr=False)
     """Logs by the robot's `id()`; the robot is stored as well, so that no other object can get the same id."""
+    _drives: dict[int, tuple[Robot, Drive]] = dataclasses.field(default_factory=dict, init=False, repr=False)
+    """Windows by the robot's `id()`; with the robot as above."""
     _replayed: dict[tuple[int, str, int], tuple[Robot, list[Run]]] = dataclasses.field(default_factory=dict, init=False, repr=False)
     """Runs by robot, model and start; with the robot as above."""
 
@@ -67,7 +65,10 @@ class Reader:
 
     def drive(self, robot: Robot) -> Drive:
         """The windows of the log by ``robot``."""
-        return self.cut(self.log(robot))
+        if id(robot) not in self._drives:
+            drive = self.cut(self.log(robot))
+            self._drives |= {id(robot): (robot, drive), id(drive.robot): (drive.robot, drive)}  # a log's wiring may be another robot's
+        return self._drives[id(robot)][1]
 
     def runs(self, robot: Robot, model: str, start_ns: int) -> list[Run]:
         """The log from ``start_ns`` on by ``robot`` and this model, by each of `_ESTIMATORS`; replayed once."""
@@ -91,39 +92,74 @@ class CandidateRobot:
 
 
 def check_findings(
-    predictor: DrivePredictor, linearization: Linearization, named: Sequence[str], reader: Reader | None = None
+    predictor: DrivePredictor,
+    linearization: Linearization,
+    named: Sequence[str],
+    reader: Reader | None = None,
+    others: Sequence[Reader] = (),
 ) -> HandoverCheck | None:
-    """Correct the robot by the first half of the drive, and check its file on the second half, as `check_written`.
+    """Correct the robot by the first half of the drive, and check its file on the second half, or by all of it on ``others``, as
+    `check_written`.
 
-    ``named`` are the keys of the findings, strongest first. Where the file is not better, the weakest is left out, and the next file is
-    tried. None where the first file would hold none of the findings, for tables, and for drives that are too short.
+    ``named`` are the keys of the findings, strongest first. Only those stay in the file that improve folds of the drive to which they were
+    not fitted each beside all others (leave one out). None where no file would hold them, for tables, and for drives that are too short.
     """
-    first: HandoverCheck | None = None
+    if not named or not _is_long_enough(predictor):
+        return None
     held = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
-    for count in range(len(named), 0, -1):
-        sizes = _first_half_sizes(predictor, linearization, named[:count])
-        if sizes is None:
-            break
-        try:
-            corrected = correct_robot(predictor, sizes)
-        except (CgError, ModelError):  # no robot has the sizes of this half
-            continue
-        found = check_written(predictor, linearization.noise, CandidateRobot(corrected, sizes, held), reader)
-        if found is None:
-            break
-        found = dataclasses.replace(found, corrected=tuple(named[:count]))
-        if found.is_better:
-            return found
-        first = first or found
-    return first
+    rows: dict[tuple[str, ...], HeldRows] = {}
+
+    def check(fewer: tuple[str, ...], more: tuple[str, ...]) -> HandoverCheck | None:
+        for keys in (fewer, more):
+            if keys not in rows:
+                try:
+                    rows[keys] = _cross_predicted(predictor, linearization, keys)
+                except (CgError, ModelError):  # no robot has the sizes of these windows
+                    return None
+        return compare_rows(rows[fewer], rows[more], linearization.noise.sigmas, linearization.noise.weights)
+
+    kept, refused = find_supported(tuple(named), check)
+    why = {key: reason(one) for key, one in refused.items()}
+    harmful = tuple(key for key, one in refused.items() if one is not None and one.worse)
+    tried = kept or tuple(named[:1])
+    sizes = _sizes_on(linearization, tried, np.ones_like(held) if others else ~held)
+    try:
+        candidate = CandidateRobot(correct_robot(predictor, sizes), sizes, held)
+    except (CgError, ModelError) as error:  # no robot has the sizes of this half
+        found = check((), tried)
+        return None if found is None else dataclasses.replace(found, refused={**why, **dict.fromkeys(tried, str(error))}, harmful=harmful)
+    found = check_written(predictor, linearization.noise, candidate, reader, others)
+    if found is None and refused:
+        found = check((), tried)
+    if found is None:
+        return None
+    failure = found.failure if kept else why[tried[0]]
+    return dataclasses.replace(found, corrected=kept, refused=why, harmful=harmful, failure=failure)
 
 
-def check_written(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader | None) -> HandoverCheck | None:
+def _is_long_enough(predictor: DrivePredictor) -> bool:
+    """Whether each half of the drive has as many windows as a diagnosis takes; false for tables."""
+    return predictor.drive.kind == "log" and len(predictor.drive.maneuvers) // 2 >= _MIN_HALF_WINDOWS
+
+
+def _cross_predicted(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> HeldRows:
+    """All windows, each as the causes with keys ``named`` predict it at the sizes of the other folds."""
+    rows = np.empty_like(linearization.rows)
+    for held in folds(len(predictor.drive.maneuvers)):
+        windows = held[predictor.batch.owner]
+        rows[windows] = predictor.discrepancies(with_sizes(_sizes_on(linearization, named, ~held)))[windows]
+    return HeldRows(rows, predictor.batch.measured)
+
+
+def check_written(
+    predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader | None, others: Sequence[Reader] = ()
+) -> HandoverCheck | None:
     """Write the robot file of the ``candidate``, read it again, and predict and replay the windows that are held out with it.
 
     With a ``reader`` the log is read with the file, so that units, clocks, ranges and mounts act as they do in other commands, and is
-    replayed by `odometry` and `ekf`; without one windows are predicted, which is the odometry of a table. Errors of a reference are no part
-    of the check. None where the file changes nothing, or nothing was measured.
+    replayed by `odometry` and `ekf`; without one windows are predicted, which is the odometry of a table. With ``others``, logs of further
+    drives, all of their windows are held out. Errors of a reference are no part of the check. None where the file changes nothing, or
+    nothing was measured.
     """
     if candidate.corrected.robot == predictor.drive.robot:
         return None
@@ -133,6 +169,8 @@ def check_written(predictor: DrivePredictor, noise: Noise, candidate: CandidateR
         path.write_text(robot_toml(relocated(candidate.corrected.robot, path.parent)), encoding="utf-8")
         written = dataclasses.replace(candidate.corrected, robot=load_robot(path))
         candidate = dataclasses.replace(candidate, corrected=written)
+        if others:
+            return _check_on_others(predictor, candidate, others)
         if reader is None:
             return _check_predicted(predictor, noise, candidate)
         return _check_replayed(predictor, noise, candidate, reader)
@@ -144,7 +182,8 @@ def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: Candida
     after = predictor_after(predictor, candidate.corrected, predictor.model.name)
     held = candidate.held[predictor.batch.owner]
     rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
-    found = _compared_rows(rows[0][held], rows[1][held], noise.sigmas[held], noise.weights[held])
+    measured = predictor.batch.measured[held]
+    found = compare_rows(HeldRows(rows[0][held], measured), HeldRows(rows[1][held], measured), noise.sigmas[held], noise.weights[held])
     if found is None or drive.kind == "log":
         return found
     weight = np.array([1.0, 1.0, 0.5 * drive.robot.geometry.track_width_m])
@@ -153,72 +192,100 @@ def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: Candida
     return found if odometry is None else dataclasses.replace(found, replays={"odometry": odometry})
 
 
+class _Reread(NamedTuple):
+    """Held-out windows of a log that was read and replayed with both files."""
+
+    before: HeldRows
+    after: HeldRows
+    sigmas: FloatArray
+    weights: FloatArray
+    squares: dict[str, tuple[FloatArray, FloatArray]]
+    """(W,) squared errors of the windows by estimator, with either file [m^2]."""
+    variances: FloatArray
+    """(W,) of the drive's noise in them [m^2]."""
+
+
 def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader) -> HandoverCheck | None:
     """Windows held out, of the log as it is read and replayed with the file."""
+    reread = _reread(predictor, noise, candidate, reader)
+    return None if reread is None else _compare_reread([reread])
+
+
+def _check_on_others(predictor: DrivePredictor, candidate: CandidateRobot, others: Sequence[Reader]) -> HandoverCheck | None:
+    """All windows of other drives, as they are read and replayed with the file; None where nothing was measured there."""
+    found, names = [], []
+    for reader in others:
+        drive = reader.drive(predictor.drive.robot)
+        if len(drive.maneuvers) < _MIN_HALF_WINDOWS:
+            continue
+        other = make_predictor(drive, predictor.model, predictor.baseline)
+        state = linearize(other, candidate_causes(other, 0), {}, TOLERANCE)
+        held = dataclasses.replace(candidate, held=np.ones(len(drive.maneuvers), dtype=bool))
+        reread = _reread(other, state.noise, held, reader)
+        if reread is not None:
+            found.append(reread)
+            names.append(drive.name)
+    checked = _compare_reread(found) if found else None
+    return None if checked is None else dataclasses.replace(checked, other_drives=tuple(names))
+
+
+def _reread(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader) -> _Reread | None:
+    """The held-out windows of a drive, whose log is read and replayed with the old and the new file; None where nothing is measured."""
     old, new, name = predictor.drive.robot, candidate.corrected.robot, predictor.model.name
-    drive = reader.drive(new)
-    if not drive.maneuvers:
+    before, after = reader.drive(old), reader.drive(new)
+    if not before.maneuvers or not after.maneuvers:
         return None
-    after = DrivePredictor(drive, make_model(name, new), has_inertia=predictor.has_inertia, baseline=predictor.baseline)
-    of_marker = _of_reference(with_sizes(candidate.sizes), drive.is_lidar_reference)
-    first, second = _paired(predictor.drive, drive, candidate.held)
-    weights = noise.weights[first]
-    rows = predictor.discrepancies(of_marker)[first], after.discrepancies(of_marker)[second]
-    found = _compared_rows(*rows, noise.sigmas[first], weights)
-    if found is None or not drive.has_headings:  # chords between positions are no poses to compare with
-        return found
-    start_ns = int(predictor.drive.spans_ns[candidate.held, 0].min()) - _LEAD_NS
-    errors = []
-    for robot, cut, windows in ((old, predictor.drive, first), (new, drive, second)):
-        turn_m = 0.5 * robot.geometry.track_width_m
-        errors.append({run.estimator: _window_error(run, cut, windows, turn_m) for run in reader.runs(robot, name, start_ns)})
+    predictors = [
+        DrivePredictor(drive, make_model(name, robot), has_inertia=predictor.has_inertia, baseline=predictor.baseline)
+        for drive, robot in ((before, old), (after, new))
+    ]
+    of_marker = _of_reference(with_sizes(candidate.sizes), after.is_lidar_reference)
+    first, second = _paired(before, after, candidate.held)
+    held = [
+        HeldRows(p.discrepancies(of_marker)[windows], p.batch.measured[windows])
+        for p, windows in zip(predictors, (first, second), strict=True)
+    ]
+    squares: dict[str, tuple[FloatArray, FloatArray]] = {}
+    if after.has_headings:  # chords between positions are no poses to compare with
+        start_ns = int(before.spans_ns[candidate.held, 0].min()) - _LEAD_NS
+        errors = []
+        for robot, cut, windows in ((old, before, first), (new, after, second)):
+            turn_m = 0.5 * robot.geometry.track_width_m
+            errors.append({run.estimator: _window_error(run, cut, windows, turn_m) for run in reader.runs(robot, name, start_ns)})
+        squares = {estimator: (errors[0][estimator], errors[1][estimator]) for estimator in errors[0]}
     variances = _window_noise(noise, first, 0.5 * old.geometry.track_width_m)
-    compared = {estimator: _compared(errors[0][estimator], errors[1][estimator], variances, weights) for estimator in errors[0]}
-    return dataclasses.replace(found, replays={estimator: one for estimator, one in compared.items() if one is not None})
+    return _Reread(held[0], held[1], noise.sigmas[first], noise.weights[first], squares, variances)
 
 
-def _first_half_sizes(predictor: DrivePredictor, linearization: Linearization, named: Sequence[str]) -> dict[Cause, float] | None:
-    """Sizes of the causes with keys ``named`` by the first half of the drive alone, within the bounds of each; None for tables, and halves
-    with too few windows."""
-    half = len(predictor.drive.maneuvers) // 2
-    if predictor.drive.kind != "log" or half < _MIN_HALF_WINDOWS or not named:
-        return None
-    is_first = np.arange(len(linearization.rows)) < half
-    arrays = linearization.linear, linearization.signatures, linearization.nuisances
-    first = [np.where(is_first.reshape(-1, *(1,) * (a.ndim - 1)), a, np.nan) for a in arrays]
+def _compare_reread(drives: Sequence[_Reread]) -> HandoverCheck | None:
+    """`compare_rows` and replays of all windows of all ``drives``."""
+    before, after = (
+        HeldRows(*(np.concatenate(parts) for parts in zip(*held, strict=True))) for held in zip(*(d[:2] for d in drives), strict=True)
+    )
+    weights, variances = np.concatenate([d.weights for d in drives]), np.concatenate([d.variances for d in drives])
+    found = compare_rows(before, after, np.concatenate([d.sigmas for d in drives]), weights)
+    if found is None or not all(d.squares for d in drives):
+        return found
+    replays = {}
+    for estimator in drives[0].squares:
+        old, new = (np.concatenate([d.squares[estimator][k] for d in drives]) for k in (0, 1))
+        if (one := _compared(old, new, variances, weights)) is not None:
+            replays[estimator] = one
+    return dataclasses.replace(found, replays=replays)
+
+
+def _sizes_on(linearization: Linearization, named: Sequence[str], used: NDArray[np.bool_]) -> dict[Cause, float]:
+    """Sizes of the causes with keys ``named`` by the windows ``used`` (W,) alone, within the bounds of each."""
     chosen = [i for i, cause in enumerate(linearization.causes) if cause.key in named]
+    if not chosen:
+        return {}
+    arrays = linearization.linear, linearization.signatures, linearization.nuisances
+    kept = used[: len(linearization.rows)]
+    part = [np.where(kept.reshape(-1, *(1,) * (a.ndim - 1)), a, np.nan) for a in arrays]
     causes = tuple(linearization.causes[i] for i in chosen)
-    problem = make_regression(first[0], first[1][..., chosen], first[2], linearization.noise, causes, linearization.tolerance)
+    problem = make_regression(part[0], part[1][..., chosen], part[2], linearization.noise, causes, linearization.tolerance)
     sizes = problem.fit(tuple(range(len(causes))))[0]
     return {cause: float(np.clip(size, *cause.bounds)) for cause, size in zip(causes, sizes, strict=True)}
-
-
-def _compared_rows(before: FloatArray, after: FloatArray, sigmas: FloatArray, weights: FloatArray) -> HandoverCheck | None:
-    """Discrepancies ``before`` and ``after`` (M, 6) of windows that were held out; None where nothing was measured in both.
-
-    The gain is the share by which errors over their noise ``sigmas`` (M, 6) shrink in the components that the file changes: the scatter of
-    the others, and of a component that is measured less well, would hide it. Windows count by the ``weights`` (M,) of the noise, as in the
-    fit: one in which the reference jumps is as far off by any file, and would decide alone.
-    """
-    shown = [c for c in range(4) if all(np.isfinite(r[:, c]).any() for r in (before, after))]
-    if not shown:
-        return None
-    before_rms, after_rms = ({CHANNELS[c]: _root_mean(r[:, c] ** 2, weights) for c in shown} for r in (before, after))
-    moved = np.nan_to_num(np.abs(after - before) / sigmas)
-    changed = [c for c in shown if moved[:, c].max() > _LEAST_CHANGE] or shown
-    scale = weights[:, None] / sigmas[:, changed]
-    squares = [np.sum(np.nan_to_num(r[:, changed] * scale) ** 2, axis=1) for r in (before, after)]
-    first, second = (s / max(float(squares[0].mean()), 1e-12) for s in squares)
-    gain = root_mean_gain(first, second, np.arange(len(before)) // _BLOCK, np.random.default_rng(0))
-    old, change = (np.nan_to_num(r[:, changed] * scale) for r in (before, before - after))
-    whole = max(float(np.sum(change**2)), 1e-12)
-    return HandoverCheck(before_rms, after_rms, len(before), gain, shown=(float(np.sum(change * old)) / whole, whole**-0.5))
-
-
-def _root_mean(squares: FloatArray, weights: FloatArray) -> float:
-    """Root of the mean of ``squares`` (n,) where these are known, by the squares of the windows' ``weights`` (n,)."""
-    known = np.isfinite(squares)
-    return math.sqrt(float(np.average(squares[known], weights=weights[known] ** 2)))
 
 
 def _of_sensors(hypothesis: Hypothesis) -> Hypothesis:
@@ -239,7 +306,8 @@ def _compared(before: FloatArray, after: FloatArray, noise: FloatArray, weights:
     known = np.isfinite(before) & np.isfinite(after)
     if not known.any():
         return None
-    return Replayed(*(_root_mean(squares[known], weights[known]) for squares in (before, after, noise)))
+    share = weights[known] ** 2
+    return Replayed(*(float(np.sqrt(np.average(squares[known], weights=share))) for squares in (before, after, noise)))
 
 
 def _paired(before: Drive, after: Drive, held: NDArray[np.bool_]) -> tuple[IntArray, IntArray]:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,7 +27,9 @@ from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
+from localization.diagnosis.model_extension import FoundEffect, FoundTerm
 from localization.diagnosis.noise import FLAT, Noise, reference_noise
+from localization.diagnosis.placebos import LEVEL, Candidates, free, modulated, placebo_p, placebo_statistics
 from localization.diagnosis.result import DiagnosisResult
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
@@ -102,28 +104,56 @@ class CandidateTerm:
     price: float
 
 
-class FoundEffect(NamedTuple):
-    """An effect bound to a time, a place, a wheel's angle, a tilt or a sensor, which no robot file holds."""
+class Regressor:
+    """Least squares on candidates beside what is tolerated, in normal form; columns of candidates have unit length."""
 
-    shape: BoundShape
-    value: float
-    sigma: float
-    stability: float
-    gain: float
-    """Twice the log-likelihood that it gains beside the others."""
+    def __init__(self, y: FloatArray, base: FloatArray, columns: FloatArray) -> None:
+        """Whitened ``y`` (n,); ``base`` (n, b) times its prior sigma; ``columns`` (n, K)."""
+        self.lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+        T = columns / self.lengths
+        factor = np.linalg.cholesky(base.T @ base + np.eye(base.shape[1]))
+        half_t, half_y = np.linalg.solve(factor, base.T @ T), np.linalg.solve(factor, base.T @ y)
+        self.gram, self.moment = T.T @ T - half_t.T @ half_t, T.T @ y - half_t.T @ half_y
+
+    def gain(self, chosen: Sequence[int]) -> float:
+        """Twice the log-likelihood that the ``chosen`` columns gain."""
+        if not chosen:
+            return 0.0
+        i = list(chosen)
+        return float(self.moment[i] @ np.linalg.solve(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)), self.moment[i]))
+
+    def fit(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Coefficients (k,) of the ``chosen`` columns in their own units, and their covariance."""
+        i = list(chosen)
+        cov = np.linalg.inv(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)))
+        scale = 1.0 / self.lengths[i]
+        return cov @ self.moment[i] * scale, cov * np.outer(scale, scale)
+
+    def gains_beside(self, chosen: Sequence[int]) -> FloatArray:
+        """(K,) twice the log-likelihood that each column would gain beside those ``chosen``; 0 where these leave nothing of it."""
+        i = list(chosen)
+        across = np.linalg.solve(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)), self.gram[i]) if i else np.zeros((0, len(self.moment)))
+        score = self.moment - across.T @ self.moment[i]
+        left = np.diagonal(self.gram) - np.sum(across * self.gram[i], axis=0)
+        is_usable = left > _COLLINEAR * np.maximum(np.diagonal(self.gram), 0.05)
+        return np.asarray(np.where(is_usable, score**2 / np.maximum(left, 1e-9), 0.0))
 
 
-@dataclass(frozen=True)
-class FoundTerm:
-    """A term of the drive, with what supports it."""
+class Design(NamedTuple):
+    """Rows and columns of the regression, before whitening."""
 
-    term: Term
-    stability: float
-    """Share of random halves of the drive in which it, or one that this drive does not separate from it, is among the best."""
-    gain: float
-    """Twice the log-likelihood that it gains beside the others."""
-    alike: tuple[str, ...] = ()
-    """Candidates that the drive hardly separates from it, best first."""
+    linear: FloatArray
+    base: FloatArray
+    """(M, 6, b) times prior sigma."""
+    columns: FloatArray
+    """(M, 6, K) causes, then candidates."""
+
+    def problem(self, noise: Noise, used: NDArray[np.bool_] | None = None) -> Regressor:
+        """Whitened, of the windows ``used`` (M,) or all."""
+        y, b, t = noise.whiten(self.linear), noise.whiten(self.base), noise.whiten(self.columns)
+        if used is not None:
+            y, b, t = y[used], b[used], t[used]
+        return Regressor(y.ravel(), b.reshape(y.size, -1), t.reshape(y.size, -1))
 
 
 class Search(NamedTuple):
@@ -138,10 +168,39 @@ class Search(NamedTuple):
     """The drive as it was searched, in the noise that is left beside the terms."""
     effects: tuple[FoundEffect, ...]
     """What is bound to time, place or sensors, strongest first."""
-    removed: FloatArray
-    """(M, 6) what these add to the discrepancies."""
+    effect_columns: FloatArray
+    """(M, 6, e) what each effect of unit size adds to the discrepancies, in their order."""
+    design: Design
+    """What is regressed: the columns of the kept causes, then terms, then effects, all in their order."""
     has_sides: bool = True
     """Whether the drive shows what the terms are in mirrored motions; else terms with other signs there explain it as well."""
+    refused: Mapping[str, str] = {}
+    """Terms and effects by name that are none, and why."""
+
+    @property
+    def removed(self) -> FloatArray:
+        """(M, 6) what the effects add to the discrepancies."""
+        return np.asarray(self.effect_columns @ np.array([e.value for e in self.effects]))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each column of the `design`."""
+        causes = (self.state.causes[i].key for i in self.kept)
+        return (*causes, *(t.term.name for t in self.terms), *(e.shape.name for e in self.effects))
+
+    def only(self, names: Collection[str], refused: Mapping[str, str]) -> Search:
+        """With the causes, terms and effects of these ``names`` alone; the others are ``refused``, with the reason."""
+        is_kept = [name in names for name in self.names]
+        k, n = len(self.kept), len(self.kept) + len(self.terms)
+        return self._replace(
+            kept=tuple(i for i, used in zip(self.kept, is_kept[:k], strict=True) if used),
+            sizes=self.sizes[np.array(is_kept[:k], dtype=bool)],
+            terms=tuple(term for term, used in zip(self.terms, is_kept[k:n], strict=True) if used),
+            effects=tuple(effect for effect, used in zip(self.effects, is_kept[n:], strict=True) if used),
+            effect_columns=self.effect_columns[..., np.array(is_kept[n:], dtype=bool)],
+            design=self.design._replace(columns=self.design.columns[..., np.array(is_kept, dtype=bool)]),
+            refused={**self.refused, **refused},
+        )
 
 
 def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[CandidateTerm, ...]:
@@ -204,43 +263,8 @@ def term_columns(
     return columns
 
 
-class _Regression:
-    """Least squares on candidates beside what is tolerated, in normal form; columns of candidates have unit length."""
-
-    def __init__(self, y: FloatArray, base: FloatArray, columns: FloatArray) -> None:
-        """Whitened ``y`` (n,); ``base`` (n, b) times its prior sigma; ``columns`` (n, K)."""
-        self.lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
-        T = columns / self.lengths
-        factor = np.linalg.cholesky(base.T @ base + np.eye(base.shape[1]))
-        half_t, half_y = np.linalg.solve(factor, base.T @ T), np.linalg.solve(factor, base.T @ y)
-        self.gram, self.moment = T.T @ T - half_t.T @ half_t, T.T @ y - half_t.T @ half_y
-
-    def gain(self, chosen: Sequence[int]) -> float:
-        """Twice the log-likelihood that the ``chosen`` columns gain."""
-        if not chosen:
-            return 0.0
-        i = list(chosen)
-        return float(self.moment[i] @ np.linalg.solve(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)), self.moment[i]))
-
-    def fit(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Coefficients (k,) of the ``chosen`` columns in their own units, and their covariance."""
-        i = list(chosen)
-        cov = np.linalg.inv(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)))
-        scale = 1.0 / self.lengths[i]
-        return cov @ self.moment[i] * scale, cov * np.outer(scale, scale)
-
-    def gains_beside(self, chosen: Sequence[int]) -> FloatArray:
-        """(K,) twice the log-likelihood that each column would gain beside those ``chosen``; 0 where these leave nothing of it."""
-        i = list(chosen)
-        across = np.linalg.solve(self.gram[np.ix_(i, i)] + 1e-9 * np.eye(len(i)), self.gram[i]) if i else np.zeros((0, len(self.moment)))
-        score = self.moment - across.T @ self.moment[i]
-        left = np.diagonal(self.gram) - np.sum(across * self.gram[i], axis=0)
-        is_usable = left > _COLLINEAR * np.maximum(np.diagonal(self.gram), 0.05)
-        return np.asarray(np.where(is_usable, score**2 / np.maximum(left, 1e-9), 0.0))
-
-
 def _best_set(
-    problem: _Regression, prices: FloatArray, limits: FloatArray, start: tuple[int, ...], most: int
+    problem: Regressor, prices: FloatArray, limits: FloatArray, start: tuple[int, ...], most: int
 ) -> tuple[float, tuple[int, ...]]:
     """Set of columns of least cost (prices less gains), by adding, dropping and exchanging one at a time from ``start``; none with a
     coefficient beyond its ``limits`` (K, 2)."""
@@ -273,23 +297,6 @@ def _best_set(
     return least, current
 
 
-class _Design(NamedTuple):
-    """Rows and columns of the regression, before whitening."""
-
-    linear: FloatArray
-    base: FloatArray
-    """(M, 6, b) times prior sigma."""
-    columns: FloatArray
-    """(M, 6, K) causes, then candidates."""
-
-    def problem(self, noise: Noise, used: NDArray[np.bool_] | None = None) -> _Regression:
-        """Whitened, of the windows ``used`` (M,) or all."""
-        y, b, t = noise.whiten(self.linear), noise.whiten(self.base), noise.whiten(self.columns)
-        if used is not None:
-            y, b, t = y[used], b[used], t[used]
-        return _Regression(y.ravel(), b.reshape(y.size, -1), t.reshape(y.size, -1))
-
-
 def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | None:
     """Terms that explain the drive of ``found`` better than its findings do, or what these leave; None where it was not searched."""
     state, predictor = found.linearization, found.predictor
@@ -300,9 +307,10 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
         sizes = {}
         state = dataclasses.replace(linearize(predictor, state.causes, sizes, TOLERANCE), noise=state.noise)
     named, f = tuple(i for i, cause in enumerate(state.causes) if cause in sizes), len(state.causes)
-    shapes, bound = bound_columns(predictor, with_sizes(sizes))
+    bound = bound_columns(predictor, with_sizes(sizes))
+    shapes = bound.shapes
     candidates = candidate_terms(predictor, state.problem.count, len(shapes))
-    design = _make_design(predictor, state, with_sizes(sizes), range(f), candidates, bound)
+    design = _make_design(predictor, state, with_sizes(sizes), range(f), candidates, bound.columns)
     own = 2.0 * math.log(len({cause.group for cause in state.causes})) + math.log(max(state.problem.count, 2))
     least = min(c.price for c in candidates)
     allowed = {cause.key for cause in (state.causes if found.names is None else found.names)}
@@ -331,12 +339,49 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     if any(finding.definition.is_clock for finding in found.diagnosis.findings):
         chosen = _with_clock_for_gains(design.problem(noise), state.causes, candidates, chosen)
     chosen, stability = _supported(design, noise, chosen, f, rng)
+    searched = _searched_candidates(design, noise, prices, f, bound.motions)
+    chosen, placebos = _beyond_placebos(design, noise, (chosen, f), searched, rng)
+    names = [*(Term(c.component, c.expression, 0.0).name for c in candidates), *(s.name for s in shapes)]
+    refused = {names[i - f]: why for i, why in placebos.items()}
     has_sides = not _has_mirrored_rival(design.problem(noise), prices, limits, chosen, dict(enumerate(candidates, f)))
-    return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(has_sides=has_sides)
+    return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(
+        has_sides=has_sides, refused=refused
+    )
+
+
+def _searched_candidates(design: Design, noise: Noise, prices: FloatArray, f: int, motions: FloatArray) -> Candidates:
+    """Terms and bound effects, the columns from ``f`` on; the last ones modulate ``motions`` (M, 6, K)."""
+    columns, of_motions = noise.whiten(design.columns[..., f:]), np.zeros((*design.linear.shape, design.columns.shape[-1] - f))
+    of_motions[..., of_motions.shape[-1] - motions.shape[-1] :] = noise.whiten(motions)
+    return modulated(columns, of_motions, prices[f:])
+
+
+def _beyond_placebos(
+    design: Design, noise: Noise, found: tuple[tuple[int, ...], int], searched: Candidates, rng: np.random.Generator
+) -> tuple[tuple[int, ...], dict[int, str]]:
+    """The ``found`` columns (and the first of a term) without terms and effects that are no better than the best of a placebo search beside
+    the others; and why these are none."""
+    (chosen, f), refused = found, {}
+    y, base = noise.whiten(design.linear).reshape(-1, 1), noise.whiten(design.base).reshape(design.linear.size, -1)
+    columns = noise.whiten(design.columns[..., list(chosen)]).reshape(design.linear.size, -1)
+    while any(i >= f for i in chosen):
+        p: dict[int, float] = {}
+        for i in chosen:
+            if i >= f:
+                others = columns[:, [j != i for j in chosen]]
+                real, placebos = placebo_statistics(y, np.concatenate([base, free(others)], axis=1), searched, rng)
+                p[i] = placebo_p(float(real[i - f, 0]), placebos[:, 0])
+        worst = max(p, key=lambda i: p[i])
+        if p[worst] <= LEVEL:
+            break
+        refused[worst] = f"placebo terms of this drive explain as much (p = {p[worst]:.2g} over the whole search)"
+        columns = columns[:, [j != worst for j in chosen]]
+        chosen = tuple(j for j in chosen if j != worst)
+    return chosen, refused
 
 
 def _with_clock_for_gains(
-    problem: _Regression, causes: Sequence[Cause], candidates: Sequence[CandidateTerm], chosen: tuple[int, ...]
+    problem: Regressor, causes: Sequence[Cause], candidates: Sequence[CandidateTerm], chosen: tuple[int, ...]
 ) -> tuple[int, ...]:
     """``chosen`` with the wheels' clock, which is named, in the place of gains in speed and in turning rate that are alike: to first order
     late stamps are vx = c dv and wz = c dwz.
@@ -353,7 +398,7 @@ def _with_clock_for_gains(
     return tuple(sorted({*chosen, clock} - {*gains})) if 1.0 / _SAME_LAG < ratio < _SAME_LAG else chosen
 
 
-def _noise_beside_terms(predictor: DrivePredictor, state: Linearization, design: _Design, prices: FloatArray) -> Noise:
+def _noise_beside_terms(predictor: DrivePredictor, state: Linearization, design: Design, prices: FloatArray) -> Noise:
     """Noise of a drive of which a part is unexplained, beside that part.
 
     Noise that contains what is unexplained hides it, most where it is largest. So terms are added one by one by the noise that the motion
@@ -362,7 +407,7 @@ def _noise_beside_terms(predictor: DrivePredictor, state: Linearization, design:
     best = _twice_log_determinant(state.noise), state.noise
     stated = reference_noise(predictor, state.linear, state.causes)
     for first in (state.noise, dataclasses.replace(stated, weights=state.noise.weights)):
-        problem, given, terms = design.problem(first), (), []  # type: _Regression, tuple[int, ...], list[int]
+        problem, given, terms = design.problem(first), (), []  # type: Regressor, tuple[int, ...], list[int]
         while len(terms) < _MOST:
             gains = problem.gains_beside(given) - prices
             gains[list(given)] = -math.inf
@@ -383,7 +428,7 @@ def _twice_log_determinant(noise: Noise) -> float:
 
 
 def _has_mirrored_rival(
-    problem: _Regression, prices: FloatArray, limits: FloatArray, chosen: tuple[int, ...], candidates: Mapping[int, CandidateTerm]
+    problem: Regressor, prices: FloatArray, limits: FloatArray, chosen: tuple[int, ...], candidates: Mapping[int, CandidateTerm]
 ) -> bool:
     """Whether for a component whose ``chosen`` terms have one mirror symmetry, as many terms with the other one explain the drive as well.
 
@@ -419,7 +464,7 @@ def _size_limits(state: Linearization) -> FloatArray:
 
 
 def _supported(
-    design: _Design, noise: Noise, chosen: tuple[int, ...], f: int, rng: np.random.Generator
+    design: Design, noise: Noise, chosen: tuple[int, ...], f: int, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], dict[int, float]]:
     """``chosen`` without terms (from column ``f`` on) that random halves of the drive do not show again, or that are within the accuracy of
     columns: they repair what others miss; and the stability of each.
@@ -441,7 +486,7 @@ def _supported(
 
 def _describe(
     predictor: DrivePredictor,
-    design: _Design,
+    design: Design,
     state: Linearization,
     noise: Noise,
     chosen: tuple[int, ...],
@@ -462,15 +507,26 @@ def _describe(
     kept, terms = tuple(i for i in chosen if i < f), [i for i in chosen if f <= i < g]
     plain = tuple(Term(candidates[i - f].component, candidates[i - f].expression, float(start[chosen.index(i)])) for i in terms)
     sizes = np.array([start[n] for n, i in enumerate(chosen) if i < f])
-    removed = design.columns[..., [i for i in chosen if i >= g]] @ np.array([e.value for e in effects])
     last = dataclasses.replace(state, noise=noise)
-    sizes, refined = refine(predictor, last, (kept, sizes, plain), removed)
+    of_effects = [i for i in chosen if i >= g]
+    fit = Fit(kept, sizes, plain, np.array([e.value for e in effects]))
+    fit = refine(predictor, last, fit, design.columns[..., of_effects])
     found = [
         FoundTerm(term, stability[i], gains[i], _alike(problem, i, tuple(j for j in chosen if j != i), names, f))
-        for i, term in zip(terms, refined, strict=True)
+        for i, term in zip(terms, fit.terms, strict=True)
     ]
-    by_gain = tuple(sorted(found, key=lambda t: -t.gain)), tuple(sorted(effects, key=lambda e: -e.gain))
-    return Search(by_gain[0], kept, sizes, last, by_gain[1], removed)
+    effects = [e._replace(value=float(value)) for e, value in zip(effects, fit.effects, strict=True)]
+    order = sorted(range(len(found)), key=lambda n: -found[n].gain), sorted(range(len(effects)), key=lambda n: -effects[n].gain)
+    columns = [*kept, *(terms[n] for n in order[0]), *(of_effects[n] for n in order[1])]
+    return Search(
+        terms=tuple(found[n] for n in order[0]),
+        kept=kept,
+        sizes=fit.sizes,
+        state=last,
+        effects=tuple(effects[n] for n in order[1]),
+        effect_columns=design.columns[..., [of_effects[n] for n in order[1]]],
+        design=design._replace(columns=design.columns[..., columns]),
+    )
 
 
 def _make_design(
@@ -480,11 +536,11 @@ def _make_design(
     causes: Sequence[int],
     candidates: Sequence[CandidateTerm],
     bound: FloatArray,
-) -> _Design:
+) -> Design:
     """Rows, what is tolerated, and columns of ``causes``, of ``candidates`` about ``hypothesis``, and the ``bound`` ones (M, 6, k)."""
     T = term_columns(predictor, hypothesis, candidates)
     S = np.nan_to_num(state.signatures)
-    return _Design(state.linear, _tolerated(state), np.concatenate([S[..., list(causes)], T, bound], axis=-1))
+    return Design(state.linear, _tolerated(state), np.concatenate([S[..., list(causes)], T, bound], axis=-1))
 
 
 def _tolerated(state: Linearization) -> FloatArray:
@@ -493,49 +549,56 @@ def _tolerated(state: Linearization) -> FloatArray:
     return np.concatenate([S, np.nan_to_num(state.nuisances) * FLAT], axis=-1)
 
 
+class Fit(NamedTuple):
+    """Sizes of everything that was found, by some windows."""
+
+    kept: tuple[int, ...]
+    """Indices of the causes."""
+    sizes: FloatArray
+    """(k,) of the causes."""
+    terms: tuple[Term, ...]
+    effects: FloatArray
+    """(e,) of the bound effects."""
+
+
 def refine(
-    predictor: DrivePredictor,
-    state: Linearization,
-    start: tuple[tuple[int, ...], FloatArray, tuple[Term, ...]],
-    removed: FloatArray,
-    used: NDArray[np.bool_] | None = None,
-) -> tuple[FloatArray, tuple[Term, ...]]:
-    """Sizes (k,) of causes and terms with sigmas from a ``start`` (indices of the causes, sizes, terms), on the windows ``used`` (M,) or
-    all, without what bound effects ``removed`` (M, 6).
+    predictor: DrivePredictor, state: Linearization, start: Fit, effect_columns: FloatArray, used: NDArray[np.bool_] | None = None
+) -> Fit:
+    """Sizes and sigmas from a ``start``, on the windows ``used`` (M,) or all, with bound effects of these columns (M, 6, e).
 
     Gauss-Newton: discrepancies by the model with the terms, and columns about the motion that it predicts. First-order columns are off by
     sigmas where a term turns the robot by much: 95 % intervals held 90 % of coefficients, and hold 95 % after two steps.
     """
-    kept, sizes, terms = start
-    if not terms:
-        return sizes, terms
-    causes = [state.causes[i] for i in kept]
+    kept, sizes, terms, effects = start
+    causes, k, n = [state.causes[i] for i in kept], len(kept), len(kept) + len(terms)
+    if not terms and not len(effects):
+        return start
     candidates = [CandidateTerm(t.component, t.expression, 0.0) for t in terms]
     for _ in range(_NEWTON_STEPS):
         hypothesis = with_sizes({cause: float(s) for cause, s in zip(causes, sizes, strict=True)})
-        extended = dataclasses.replace(predictor, model=extended_model(predictor, terms))
-        rows = extended.discrepancies(hypothesis) - removed
+        extended = dataclasses.replace(predictor, model=extended_model(predictor, terms)) if terms else predictor
+        rows = extended.discrepancies(hypothesis)
         S = np.stack([extended.signature(hypothesis, c) for c in causes], axis=-1) if causes else np.zeros((*rows.shape, 0))
-        columns = np.concatenate(
-            [np.nan_to_num(S), term_columns(predictor, hypothesis, candidates, extended.corrected_twist(hypothesis))], -1
-        )
-        linear = rows + columns @ np.r_[sizes, [t.value for t in terms]]
-        values, cov = _Design(linear, _tolerated(state), columns).problem(state.noise, used).fit(range(columns.shape[-1]))
-        sigmas = np.sqrt(np.diagonal(cov))[len(causes) :]
-        sizes = values[: len(causes)]
-        new = zip(terms, values[len(causes) :], sigmas, strict=True)
+        T = np.zeros((*rows.shape, 0))
+        if terms:
+            T = term_columns(predictor, hypothesis, candidates, extended.corrected_twist(hypothesis))
+        columns = np.concatenate([np.nan_to_num(S), T, effect_columns], -1)
+        linear = rows + columns[..., :n] @ np.r_[sizes, [t.value for t in terms]]
+        values, cov = Design(linear, _tolerated(state), columns).problem(state.noise, used).fit(range(columns.shape[-1]))
+        sigmas, sizes, effects = np.sqrt(np.diagonal(cov))[k:n], values[:k], values[n:]
+        new = zip(terms, values[k:n], sigmas, strict=True)
         terms = tuple(dataclasses.replace(t, value=float(value), sigma=float(sigma)) for t, value, sigma in new)
-    return sizes, terms
+    return Fit(kept, sizes, terms, effects)
 
 
-def _alike(problem: _Regression, i: int, others: tuple[int, ...], names: list[str], f: int) -> tuple[str, ...]:
+def _alike(problem: Regressor, i: int, others: tuple[int, ...], names: list[str], f: int) -> tuple[str, ...]:
     """Names of the candidates that would gain nearly as much as column ``i`` beside the ``others``, best first."""
     gains = problem.gains_beside(others)
     near = [j for j in np.argsort(-gains) if j >= f and j != i and gains[j] > gains[i] - _RIVAL_LOG_ODDS]
     return tuple(names[j - f] for j in near[:3])
 
 
-def _stability(design: _Design, noise: Noise, chosen: tuple[int, ...], rng: np.random.Generator) -> dict[int, float]:
+def _stability(design: Design, noise: Noise, chosen: tuple[int, ...], rng: np.random.Generator) -> dict[int, float]:
     """Share of random halves of the drive's blocks in which each of the ``chosen`` columns, or one like it, is the best in its place."""
     blocks = np.arange(len(design.linear)) // 4
     count = int(blocks[-1]) + 1
@@ -544,7 +607,7 @@ def _stability(design: _Design, noise: Noise, chosen: tuple[int, ...], rng: np.r
     for _ in range(_HALVES):
         used = np.isin(blocks, rng.permutation(count)[: max(count // 2, 1)])
         n = int(used.sum()) * y.shape[1]
-        problem = _Regression(y[used].ravel(), b[used].reshape(n, -1), t[used].reshape(n, -1))
+        problem = Regressor(y[used].ravel(), b[used].reshape(n, -1), t[used].reshape(n, -1))
         for i in chosen:
             others = tuple(j for j in chosen if j != i)
             gains = problem.gains_beside(others)
@@ -572,13 +635,7 @@ def merge_terms(own: Sequence[Term], added: Sequence[Term]) -> tuple[Term, ...]:
     return tuple(found.values())
 
 
-def sizes_on(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> tuple[dict[int, float], tuple[Term, ...]]:
-    """Sizes of the kept causes by index, and the terms, as the windows ``used`` (M,) alone have them."""
-    values, terms = refine(predictor, search.state, (search.kept, search.sizes, tuple(t.term for t in search.terms)), search.removed, used)
-    return {i: float(v) for i, v in zip(search.kept, values, strict=True)}, terms
-
-
-def halves(windows: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Two halves of so many windows, (windows,) each: blocks of four in turn, so that both have all kinds of motion."""
-    first = (np.arange(windows) // 4) % 2 == 0
-    return first, ~first
+def fit_on(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> Fit:
+    """Sizes of everything found as the windows ``used`` (M,) alone have them."""
+    start = Fit(search.kept, search.sizes, tuple(t.term for t in search.terms), np.array([e.value for e in search.effects]))
+    return refine(predictor, search.state, start, search.effect_columns, used)

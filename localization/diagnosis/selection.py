@@ -7,12 +7,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Gain
+from localization.diagnosis.gate import FOLD_BLOCK, folds
 from localization.diagnosis.linearization import (
     Linearization,
     Regression,
@@ -28,7 +28,7 @@ _MANY = 1500  # as many numbers must be measured for sets of more than _FEW caus
 _FEW = 4
 _DRAWS = 4000
 _KEPT = 12
-_BLOCK_WINDOWS, _FOLDS, _BOOTSTRAP_DRAWS = 4, 5, 1000
+_BOOTSTRAP_DRAWS = 1000
 
 
 def cost(problem: Regression, groups: list[str], subset: tuple[int, ...]) -> float:
@@ -126,13 +126,6 @@ def p_value(t: float, draws: FloatArray, df: float) -> float:
     return float(min(0.01 * math.exp(-slope * (df * math.log1p(t**2 / df) - q[1])), 1.0))
 
 
-def folds(windows: int) -> list[NDArray[np.bool_]]:
-    """Which of so many ``windows`` are held out together, (windows,) for each fold: every fifth block of 4, as neighbours err alike. No
-    fold where all windows are in one block."""
-    fold = (np.arange(windows) // _BLOCK_WINDOWS) % _FOLDS
-    return [fold == f for f in range(_FOLDS) if (fold == f).any() and (fold != f).any()]
-
-
 def problems_without_a_fold(state: Linearization) -> list[Regression]:
     """The drive without each fold of its windows."""
     y, s, z = (state.noise.whiten(rows) for rows in (state.linear, state.signatures, state.nuisances))
@@ -157,7 +150,7 @@ def heldout_gain(state: Linearization, chosen: tuple[int, ...], others: tuple[in
     for subset in (others, chosen):
         spreads = problem.scale * np.isin(np.arange(len(problem.scale)), subset)
         squares.append(heldout_squares(state.linear, state.signatures, state.nuisances, state.noise, spreads))
-    block = np.arange(len(state.linear)) // _BLOCK_WINDOWS
+    block = np.arange(len(state.linear)) // FOLD_BLOCK
     counts = np.bincount(block, weights=np.isfinite(state.linear).sum(axis=1))
     sums = [np.bincount(block, weights=s) for s in squares]
     rms = [float(np.sqrt(s.sum() / counts.sum())) for s in sums]

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Cause, Spell, in_spell
 from localization.diagnosis.drive_predictor import DrivePredictor
+from localization.diagnosis.gate import folds
 from localization.diagnosis.linearization import Linearization, Regression, regression, without_nuisances
-from localization.diagnosis.selection import cost, folds, price
+from localization.diagnosis.selection import cost, price
 from motion_models.se2 import FloatArray
 
 _OF_WHOLE_DRIVES = ("friction_change", "wheel_radius_drift", "encoder_dropout", "missing_joint_messages")
@@ -44,6 +45,8 @@ _MARGIN = 7.0
 """Twice the log-odds by which a part must be better than the whole drive: odds of 33."""
 _MOST = 3
 """Parts that compete with whole drives in the search."""
+_CG_MOVES_M = 0.005
+"""Spread of the centre of gravity from which on postures are distinguished, as for terms [m]."""
 _SUBSTEPS = 8
 """Moments within a window at which an onset is tried, for its interval."""
 _TAIL = 0.025
@@ -78,7 +81,8 @@ def find_spells(predictor: DrivePredictor, state: Linearization, chosen: tuple[i
         name = state.causes[option.cause].id
         if option.cost < min(least - _MARGIN, options[name].cost if name in options else math.inf):
             options[name] = option
-    best = sorted(options.values())[:_MOST]
+    by_posture = {state.causes[i].id for i in _posture_causes(predictor, state, bases, tried, {o.cause: o.cost for o in options.values()})}
+    best = sorted(option for name, option in options.items() if name not in by_posture)[:_MOST]
     if not best or heldout_lead(predictor, state, chosen, best[0]) <= 0.0:
         return ()
     return tuple(in_spell(state.causes[o.cause], o.spell) for o in best)
@@ -126,6 +130,30 @@ def _options(
     return found
 
 
+def _posture_causes(
+    predictor: DrivePredictor, state: Linearization, bases: Sequence[tuple[int, ...]], tried: Sequence[int], costs: Mapping[int, float]
+) -> list[int]:
+    """Causes of the parts of a drive, with their ``costs``, that explain it as well where they follow the centre of gravity: arms that move
+    once make any posture a time, and another drive has the posture again."""
+    weights = posture_weights(predictor)
+    if not costs or not len(weights):
+        return []
+    count, groups = max(state.problem.count, 2), len({c.group for c in state.causes})
+    gains = _weighted_gains(state, bases, [(i,) for i in tried], weights).max(axis=2)
+    before = [price(count, groups, len(base) + 1) - state.problem.gain(base) for base in bases]
+    least = (np.array(before)[:, None] + 2.0 * math.log(len(weights)) - gains).min(axis=0)
+    return [i for n, i in enumerate(tried) if i in costs and least[n] < costs[i] + _MARGIN]
+
+
+def posture_weights(predictor: DrivePredictor) -> FloatArray:
+    """(n, M) the centre of gravity's x and y in each window, and their distance from the mean, of unit root mean square; of coordinates
+    that move."""
+    batch = predictor.batch
+    means = np.array([batch.cg[inside].mean(axis=0) for inside in batch.intervals()])
+    found = [w for k in (0, 1) if np.std(means[:, k]) > _CG_MOVES_M for w in (means[:, k], means[:, k] - means[:, k].mean())]
+    return np.array([w / np.sqrt(np.mean(w**2)) for w in found])
+
+
 def spell_gains(
     predictor: DrivePredictor,
     state: Linearization,
@@ -135,8 +163,14 @@ def spell_gains(
 ) -> FloatArray:
     """(bases, tried, spells) twice the log-evidence that the causes of each event ``tried`` gain in each part of the drive, beside the
     causes of each of ``bases``; sizes beyond their bounds gain nothing."""
+    return _weighted_gains(state, bases, tried, np.array([predictor.shares(s) for s in spells]))
+
+
+def _weighted_gains(
+    state: Linearization, bases: Sequence[tuple[int, ...]], tried: Sequence[tuple[int, ...]], shares: FloatArray
+) -> FloatArray:
+    """(bases, tried, n) as `spell_gains`, where each of n weights (n, M) modulates the causes."""
     problem, noise = state.problem, state.noise
-    shares = np.array([predictor.shares(s) for s in spells])
     S = noise.whiten(state.signatures).reshape(-1, len(state.causes)) * problem.scale
     y, z = noise.whiten(state.linear).ravel(), noise.whiten(state.nuisances).reshape(S.shape[0], -1)
     without = without_nuisances(z)
@@ -147,9 +181,9 @@ def spell_gains(
         variances[list(base)] = 1.0
         A = S.T @ S + np.diag(1.0 / variances)
         fits.append((A, y - S @ np.linalg.solve(A, S.T @ y)))
-    gains = np.zeros((len(bases), len(tried), len(spells)))
+    gains = np.zeros((len(bases), len(tried), len(shares)))
     for k, event in enumerate(tried):
-        i, shape = list(event), (-1, len(event), len(spells))
+        i, shape = list(event), (-1, len(event), len(shares))
         columns = noise.whiten(state.signatures[..., i, None] * shares.T[:, None, None, :]).reshape(measured, *shape[1:])
         columns = without((columns * problem.scale[i][:, None]).reshape(measured, -1))
         by_spell = columns.reshape(shape).transpose(2, 0, 1)

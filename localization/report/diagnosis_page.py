@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from localization.diagnosis.drive_predictor import CHANNEL_UNITS, CHANNELS
-from localization.diagnosis.extension import EXTEND_ADVICE, EXTENSION_HEADS, Extension, suggests_extension
+from localization.diagnosis.extension import EXTEND_ADVICE, suggests_extension
 from localization.diagnosis.findings import (
     Diagnosis,
     describe_outliers,
@@ -18,6 +18,7 @@ from localization.diagnosis.findings import (
     is_contesting,
     unit_of,
 )
+from localization.diagnosis.model_extension import EXTENSION_HEADS, Extension
 from localization.diagnosis.result import DiagnosisResult
 from localization.report import page as html
 from localization.report.diagnosis_charts import COMPONENTS, diagnosis_charts, motion_in_windows
@@ -46,21 +47,19 @@ _TERMS = {
 }
 
 
-def write_diagnosis_report(
-    path: str | Path, found: DiagnosisResult, extension: Extension | None = None, is_interactive: bool = True
-) -> None:
-    """Write the page, with the terms of an ``extension``. Raises `OutputError` if there is such a file already or it cannot be written."""
-    html.write_new(path, diagnosis_page(found, extension, is_interactive).encode())
+def write_diagnosis_report(path: str | Path, found: DiagnosisResult, is_interactive: bool = True) -> None:
+    """Write the page. Raises `OutputError` if there is such a file already or it cannot be written."""
+    html.write_new(path, diagnosis_page(found, is_interactive).encode())
 
 
-def diagnosis_page(found: DiagnosisResult, extension: Extension | None = None, is_interactive: bool = True) -> str:
+def diagnosis_page(found: DiagnosisResult, is_interactive: bool = True) -> str:
     """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     d = found.diagnosis
     sections = [
         html.Section("Findings", _findings(d)),
-        html.Section("Terms", _terms(extension)),
+        html.Section("Terms", _terms(d.extension)),
         html.Section("Components", _components(d)),
-        html.Section("Next", [html.Paragraph(text) for text in _next_steps(found, extension)]),
+        html.Section("Next", [html.Paragraph(text) for text in _next_steps(found)]),
         html.Section("Explore", diagnosis_charts(found)),
         *_figures(found),
         html.Section("Corrected robot: before and after", _handover(d)),
@@ -112,15 +111,15 @@ def _findings(d: Diagnosis) -> list[html.Block]:
 
 
 def _terms(extension: Extension | None) -> list[html.Block]:
-    if extension is None:
+    if extension is None or not (extension.terms or extension.effects):
         return []
     rows = [[html.Cell(row[0]), html.Cell(row[1], is_code=True), *(html.Cell(text) for text in row[2:])] for row in extension.table()]
     return [html.Table([html.Cell(head.capitalize()) for head in EXTENSION_HEADS], rows)]
 
 
-def _next_steps(found: DiagnosisResult, extension: Extension | None) -> list[str]:
+def _next_steps(found: DiagnosisResult) -> list[str]:
     """The next drive, and the search for terms where it is worth its time and was not made."""
-    is_suggested = extension is None and suggests_extension(found)
+    is_suggested = found.diagnosis.extension is None and suggests_extension(found)
     advice = f"{EXTEND_ADVICE[0].upper()}{EXTEND_ADVICE[1:]}"
     return [text for text in (found.diagnosis.next_drive, advice if is_suggested else "") if text]
 

@@ -85,7 +85,7 @@ def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> No
     ],
 )
 def test_replay_corrected_robot_drifts_less(given: str, effect: dict[str, float], tmp_path: Path) -> None:
-    """VaultBot's arms hold its centre of gravity: a payload and a shift go into the file's [arms]."""
+    """A payload goes into the file's [arms], which hold VaultBot's centre of gravity, and a shift into the offset of every source."""
     log = bag(tmp_path / "drive.mcap", effect, 1, given)
     out = tmp_path / "out"
     assert main(["diagnose", str(log), "--robot", given, "--out", str(out)]) == 0
@@ -112,7 +112,7 @@ def test_diagnose_robot_that_cannot_be_replayed_keeps_old_values(tmp_path: Path,
     content = json.loads((out / "diagnosis.json").read_text())
     assert "wheel_radius_scale" in [f["cause"] for f in content["findings"]]
     assert not content["handover"]["is_better"]
-    assert "the corrected robot cannot be replayed: no command runs with it" in content["notes"]
+    assert content["handover"]["refusal"] == "the corrected robot cannot be replayed: no command runs with it"
     assert "Correct " not in content["sentence"]
     assert load_robot(out / "robot.toml").geometry == load_robot("husky_a200").geometry
 

@@ -11,7 +11,8 @@ import pytest
 
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_log
-from localization.diagnosis.extension import ExtendedResult, Extension, extend
+from localization.diagnosis.extension import ExtendedResult, extend
+from localization.diagnosis.model_extension import Extension
 from localization.logs import open_log
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot

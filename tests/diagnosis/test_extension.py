@@ -18,7 +18,7 @@ from localization.commands.diagnose import Diagnose
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_table
 from localization.diagnosis.extension import ExtendedResult, extend
-from localization.diagnosis.findings import HandoverCheck
+from localization.diagnosis.gate import HandoverCheck
 from localization.diagnosis.missing_terms import find_terms
 from motion_models.calibration.maneuvers import Maneuver, windows_text
 from motion_models.registry import make_model

@@ -55,4 +55,5 @@ def test_check_findings_half_with_a_size_of_no_robot_is_within_bounds() -> None:
     state = linearize(predictor, (CAUSES["split_friction"],), {}, TOLERANCE)
     found = check_findings(predictor, dataclasses.replace(state, linear=4.0 * state.signatures[..., 0]), ["split_friction"])
     assert found is not None
-    assert found.corrected == ("split_friction",)
+    assert found.corrected == ()  # nor do the measured windows show it
+    assert "split_friction" in found.refused

@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from localization.diagnosis.causes.cause import Spell, in_spell
+from localization.diagnosis.causes import CAUSES
+from localization.diagnosis.causes.cause import Hypothesis, Spell, in_spell
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
+from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.findings import Finding
 from localization.diagnosis.linearization import TOLERANCE, candidate_causes, linearize, make_predictor
 from localization.diagnosis.result import DiagnosisResult
@@ -27,6 +29,7 @@ from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import TOUR, bag
 from tests.helpers.diagnosis_windows import drive_of_windows, windows
+from tests.helpers.law_drives import law_drive, measured_under
 
 MODEL, COUNT = "skid_steer", 40
 _PICKED_UP_BEFORE, _PICKED_UP_NS = 7, 34_000_000_000
@@ -145,3 +148,21 @@ def test_diagnose_payload_taken_up_on_the_way_is_payload_from_then(tmp_path: Pat
     low, high = finding.definition.spell_95[0]
     assert low <= (_PICKED_UP_NS - int(drive.spans_ns[0, 0])) * 1e-9 <= high
     assert found.sentence.startswith("Correct payload from t = ")
+
+
+@pytest.mark.parametrize(("moves_m", "is_spell"), [(0.0, True), (0.025, False)])
+def test_find_spells_posture_wins_against_time(moves_m: float, is_spell: bool) -> None:
+    """Wheels whose radii differ by the side of the centre of gravity, whose arms move once: from then on, and in that posture."""
+    plain = law_drive("vaultbot", windows=48)
+    middle = plain.robot.center_of_gravity
+    at = [middle + np.array([0.0, moves_m * (i >= 24)]) for i in range(48)]
+    drive = dataclasses.replace(
+        plain, maneuvers=tuple(dataclasses.replace(m, cg=np.tile(cg, (len(m.dt), 1))) for m, cg in zip(plain.maneuvers, at, strict=True))
+    )
+    model = make_model("friction", drive.robot)
+    cause = CAUSES["wheel_radius_difference"]
+    begins = Spell(float(drive.starts_s[24]))
+    measured = measured_under(drive, model, in_spell(cause, begins).inject(Hypothesis(), 0.02), np.random.default_rng(3))
+    predictor = DrivePredictor(measured, model, has_inertia=False)
+    found = find_spells(predictor, linearize(predictor, (cause, CAUSES["wheel_radius_scale"]), {}, TOLERANCE), ())
+    assert bool([c for c in found if c.id == cause.id]) == is_spell

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from localization.diagnosis.bound_effects import BoundShape
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Hypothesis, Setting, with_sizes
 from localization.diagnosis.diagnose import TOLERANCE, diagnose
@@ -20,15 +22,17 @@ from localization.diagnosis.findings import (
     Diagnosis,
     Finding,
     Gain,
-    HandoverCheck,
     RowStatus,
     Trend,
     confirmed_findings,
     correctable_findings,
     describe_row,
+    not_written,
     sentence,
 )
+from localization.diagnosis.gate import HandoverCheck
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, make_regression
+from localization.diagnosis.model_extension import Extension, FoundEffect, FoundTerm
 from localization.diagnosis.noise import given_noise
 from localization.diagnosis.verdict import (
     _information_apart,
@@ -47,6 +51,7 @@ from motion_models.calibration.regressions import read_rotation_table, rotations
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from motion_models.terms import Term, parse_expression
 from tests.helpers.law_drives import law_drive
 
 pytestmark = pytest.mark.xdist_group("verdict")
@@ -125,7 +130,6 @@ def diagnosis(findings: tuple[Finding, ...], trends: tuple[Trend, ...], table: d
         *("log", "robot", "friction", "scan matching", decide(findings, tuple(marked.values()), 0.0), marked, findings, trends),
         left_share=0.0,
         next_drive="",
-        sentence="",
     )
 
 
@@ -233,7 +237,7 @@ def test_correctable_findings_are_none_beside_sizes_that_no_robot_has() -> None:
     table = {"yaw": row("attributed")}
     large = finding(size=0.25)
     assert correctable_findings(diagnosis((large,), (), table)) == []
-    assert "would fit, but no robot has as much" in sentence(diagnosis((large,), (), table))
+    assert "as no robot has as much" in sentence(diagnosis((large,), (), table))
     assert correctable_findings(diagnosis((finding(),), (trend(0.2, "track_width"),), table)) == []
     assert correctable_findings(diagnosis((finding(),), (), table)) == [finding()]
 
@@ -291,7 +295,7 @@ def test_correctable_findings_keep_what_the_contested_one_hardly_moves() -> None
     assert "Correct" not in sentence(d)  # unexplained, and nothing shows that it improves windows held out
     d = dataclasses.replace(d, gain=Gain(2.0, 1.0, 0.5, 0.4, 0.6))
     assert sentence(d).startswith("Correct lidar_yaw")
-    assert "track_width -0.25 would fit, but no robot has as much" in sentence(d)
+    assert "as no robot has as much" in sentence(d)
 
 
 @pytest.mark.parametrize(
@@ -355,3 +359,34 @@ def test_noise_of_a_few_windows_is_more_than_the_references() -> None:
     assert noise_excess(state, stated[:, :3], known, 0) == pytest.approx(np.sqrt(np.mean(sigmas[:, 0] ** 2)))
     assert noise_excess(state, stated[:, :3], ~noisy, 0) == pytest.approx(1.0)
     assert noise_excess(state, None, known, 0) == 1.0
+
+
+_SHAPE = BoundShape("wz", "turning in the floor's patch", "place", "1")
+_TERM = FoundTerm(Term("vy", parse_expression("wz*abs(wz)"), -0.12, 0.01), 1.0, 90.0)
+
+
+@pytest.mark.parametrize("verdict_row", ["attributed", "unexplained", "noise"])
+@pytest.mark.parametrize("size", [0.012, 0.25])
+@pytest.mark.parametrize("extension", [None, ((_TERM,), ()), ((), (FoundEffect(_SHAPE, 0.06, 0.01, 1.0, 90.0),))])
+@pytest.mark.parametrize("why", ["", "held-out windows get worse: yaw 0.1 -> 0.2 rad"])
+def test_headline_denies_nothing_that_a_table_states(
+    verdict_row: RowStatus, size: float, extension: tuple[Any, Any] | None, why: str
+) -> None:
+    """Every finding, term and effect is in the sentence; what is not written says why; a row that grows corrects nothing."""
+    check = HandoverCheck({"yaw": 0.2}, {"yaw": 0.1}, 18, Interval(0.5, 0.4, 0.6), corrected=("track_width",), shown=(1.0, 0.1))
+    check = dataclasses.replace(check, failure=why)
+    found = finding(size=size)
+    d = dataclasses.replace(diagnosis((found,), (), {"yaw": row(verdict_row)}), handover=check, gain=GAIN)
+    if extension is not None:
+        d = dataclasses.replace(d, extension=Extension("friction", extension[0], (), check, extension[1]))
+    text = d.sentence
+    assert "not in a way that has a name" not in text
+    assert "track_width" in text
+    assert ("Correct track_width" in text) == (found in confirmed_findings(d))
+    assert (found in confirmed_findings(d)) != (found in [f for f, _ in not_written(d)])
+    assert all(reason and reason in text for _, reason in not_written(d))
+    if why:
+        assert "Correct" not in text
+    for item in () if d.extension is None else (*d.extension.terms, *d.extension.effects):
+        assert (str(item.term.expression) if isinstance(item, FoundTerm) else item.shape.along) in text
+    assert d.to_dict()["sentence"] == text
