@@ -100,6 +100,8 @@ class Fit:
 
     evidence: float
     """Tempered log likelihood of the track, with the scale at its best."""
+    share: float
+    """Share of the samples that is independent, by what is left of the positions."""
     scale: float
     """Length of the track's ways over the path's."""
     lever: complex
@@ -151,8 +153,28 @@ def make_track(t: FloatArray, positions: FloatArray, yaws: FloatArray | None) ->
 
 
 def unrelated_evidence(track: Track) -> float:
-    """Tempered log likelihood of a track whose motion is another's: each coordinate has its own size."""
-    return _wide_evidence(track, np.ones(len(track.t), bool))
+    """Tempered log likelihood of a track whose motion is another's: straight on at a steady speed in each window, or anything."""
+    t = track.t - _window_means(track.t, track.window)[track.window]
+
+    def from_line(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = values - _window_means(values, track.window)[track.window]
+        slope = _window_sums(off * t, track.window) / np.maximum(_window_sums(t * t, track.window), 1e-9)
+        return off - slope[track.window] * t, off
+
+    rest, off = from_line(track.positions)
+    sigma = np.hypot(track.noise, _RELATIVE * np.abs(off) + 1e-3 * track.wide)
+    evidence = mixture(np.r_[rest.real, rest.imag], np.r_[sigma, sigma], track.wide)
+    if track.yaws is None:
+        return evidence
+    rest, off = from_line(track.yaws)
+    return evidence + mixture(rest, np.sqrt(track.yaw_noise**2 + _FLOOR_RAD**2 + (_RELATIVE_TURN * off) ** 2), track.wide_yaw)
+
+
+def _independent_share(rest: ComplexArray) -> float:
+    """Share of the samples ``rest`` (n,) that is independent: (1 - r) / (1 + r) with the correlation r of neighbours (Bayley & Hammersley
+    1946), at most `TEMPER`. Errors of GPS and of an estimate's heading last for seconds."""
+    r = float((rest[1:].conj() * rest[:-1]).real.sum()) / max(float((np.abs(rest) ** 2).sum()), 1e-12)
+    return min(TEMPER, max((1.0 - r) / (1.0 + r), 0.01))
 
 
 def fit(track: Track, path: Path, delay_s: float, rate: float = 0.0) -> Fit:
@@ -161,7 +183,7 @@ def fit(track: Track, path: Path, delay_s: float, rate: float = 0.0) -> Fit:
     enough = np.bincount(track.window[known], minlength=track.count)[track.window] >= _MIN_OF_WINDOW
     known &= enough
     if known.sum() < 2 * _MIN_OF_WINDOW:
-        return Fit(_wide_evidence(track, np.ones(len(track.t), bool)), 1.0, 0.0, None, 0.0)
+        return Fit(_wide_evidence(track, np.ones(len(track.t), bool)), TEMPER, 1.0, 0.0, None, 0.0)
     window = np.unique(track.window[known], return_inverse=True)[1]
     measured, ahead = track.positions[known], np.exp(1j * theta[known])
     of_track, of_path, of_ahead = (values - _window_means(values, window)[window] for values in (measured, p[known], ahead))
@@ -170,11 +192,12 @@ def fit(track: Track, path: Path, delay_s: float, rate: float = 0.0) -> Fit:
     rest = of_track - scale * phase[window] * point
     sigma = np.sqrt(track.noise**2 + (scale * _FLOOR_M) ** 2 + (_RELATIVE * np.abs(scale * point)) ** 2)
     evidence = mixture(np.r_[rest.real, rest.imag], np.r_[sigma, sigma], track.wide)
+    share = _independent_share(rest)
     evidence += _wide_evidence(track, ~known) - 0.5 * abs(lever / _LEVER_SIGMA_M) ** 2
     if track.yaws is None:
-        return Fit(evidence, scale, lever, None, 0.0)
+        return Fit(evidence, share, scale, lever, None, 0.0)
     turned, yaw, aligned = _of_headings(track, track.yaws[known] - theta[known], theta[known], window, phase, np.abs(scale * point))
-    return Fit(evidence + turned, scale, lever, yaw, aligned)
+    return Fit(evidence + turned, share, scale, lever, yaw, aligned)
 
 
 def _of_headings(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import Row
+from localization.evidence.alternatives.alternative import TEMPER, Row
 from localization.evidence.paths import Fit, Path, Track, fit, lags, unrelated_evidence, yaw_log_prior
 from motion_models.se2 import FloatArray
 
@@ -33,12 +33,14 @@ _SCALE_SIGMA, _FACTOR_SIGMA = 0.08, 2.0
 _LATENCY_SIGMA_S, _CLOCK_S = 0.07, 0.1
 """Standard deviation of the latencies of GPS receivers and mocap bridges, which reach 0.2 s [s]. A clock that is off by a longer delay x is
 rarer as 1 / x^2, as many delays are tried."""
-_COARSE_S, _FINE_S, _LONG_S = 0.25, 0.02, 60.0
-"""Steps of the search of delays, and the longest that is always searched [s]; beyond, half of the path must be covered."""
+_RATE_SIGMA = 0.01
+"""Standard deviation of the rates of clocks that are wrong: stamps of simulators that lag, and of counters of a wrong period."""
+_COARSE_S, _FINE_S = 0.25, 0.02
+"""Steps of the search of delays [s]."""
 _MIN_COVERED = 0.5
+"""Part of the shorter of track and path that the other covers at all delays that are searched."""
 _RATE_SPAN_S, _MIN_DRIFT_S, _MIN_RATE_DRIVE_S = 2.5, 0.15, 40.0
 """Difference of the delays of both halves of a drive that is searched, least one that is tried, and shortest drive [s]."""
-_MIN_WAY_M = 2.0
 
 Transform = Callable[[Track], Track]
 
@@ -60,18 +62,20 @@ class Candidate:
 
 def alternatives(track: Track, paths: Sequence[Path], has_times: bool = True) -> list[Candidate]:
     """All candidates against each of ``paths``, any of which may be right."""
-    share = -math.log(len(paths))
-    found = [Candidate(_ODDS["unrelated"] + unrelated_evidence(track), (_unrelated(),))]
+    fitted = []
     for transform, rows in _axes(track.yaws is not None):
         of_axes = transform(track)
         for path in paths:
             for delay, rate in _clocks(of_axes, path, has_times):
-                fitted = fit(of_axes, path, delay, rate)
-                clock = (*_clock_rows(delay, has_times), *_rate_rows(rate))
-                for more, extra in _scales_and_yaws(fitted):
-                    all_rows = (*rows, *clock, *more)
-                    score = share + fitted.evidence + extra + sum(row.log_odds for row in all_rows)
-                    found.append(Candidate(score, all_rows, fitted, delay))
+                clock = (*_clock_rows(delay, has_times), *_rate_rows(rate, track.t[-1] - track.t[0]))
+                fitted.append((fit(of_axes, path, delay, rate), (*rows, *clock), delay))
+    independent = max(fitted, key=lambda each: each[0].evidence)[0].share / TEMPER
+    found = [Candidate(_ODDS["unrelated"] + independent * unrelated_evidence(track), (_unrelated(),))]
+    for of_fit, rows, delay in fitted:
+        for more, extra in _scales_and_yaws(of_fit):
+            all_rows = (*rows, *more)
+            score = independent * of_fit.evidence + extra + sum(row.log_odds for row in all_rows) - math.log(len(paths))
+            found.append(Candidate(score, all_rows, of_fit, delay))
     return found
 
 
@@ -140,14 +144,18 @@ def _clock_rows(delay_s: float, has_times: bool) -> tuple[Row, ...]:
     return (Row("clock.reference", text, max(clock, of_leap, latency), value=delay_s, remedy=undo, is_fault=is_fault),)
 
 
-def _rate_rows(rate: float) -> tuple[Row, ...]:
+def _rate_rows(rate: float, duration_s: float) -> tuple[Row, ...]:
+    """A delay that grows: a latency that changes, or a clock of another rate, whichever is more probable of that growth."""
     if not rate:
         return ()
+    drift = abs(rate) * duration_s
+    latency, clock = -0.5 * (drift / (math.sqrt(2.0) * _LATENCY_SIGMA_S)) ** 2, _ODDS["rate"] - 0.5 * (rate / _RATE_SIGMA) ** 2
     text = (
         f"its clock runs {abs(rate):.2%} {'faster' if rate > 0.0 else 'slower'} than that of the sensors: in both halves of the drive it has"
         " other offsets"
     )
-    return (Row("clock.reference_rate", text, _ODDS["rate"], value=rate, remedy="Synchronize the clocks, or scale its stamps."),)
+    remedy = "Synchronize the clocks, or scale its stamps."
+    return (Row("clock.reference_rate", text, max(latency, clock), value=rate, remedy=remedy, is_fault=clock > latency),)
 
 
 def _unrelated() -> Row:
@@ -160,23 +168,27 @@ def _unrelated() -> Row:
 
 def _clocks(track: Track, path: Path, has_times: bool) -> list[tuple[float, float]]:
     """Delays [s] and rates that the evidence is computed for: none, the best near none, the best of all, and one that grows."""
-    found = [(0.0, 0.0)]
     near = np.arange(-0.3, 0.3 + 1e-9, _FINE_S)
-    found.append((_best(near, lags(track, path, near)), 0.0))
+    found = [(0.0, 0.0), (_finest(track, path, _best(near, lags(track, path, near))), 0.0)]
     if not has_times:
         return found
     all_lags = _searched(track, path)
     if len(all_lags) > 1:
         coarse = _best(all_lags, lags(track, path, all_lags))
         around = coarse + np.arange(-_COARSE_S, _COARSE_S + 1e-9, _FINE_S)
-        delay = _best(around, lags(track, path, around))
+        delay = _finest(track, path, _best(around, lags(track, path, around)))
         found.append((delay, 0.0))
         found += _growing(track, path, delay)
     return list(dict.fromkeys(found))
 
 
+def _finest(track: Track, path: Path, delay_s: float) -> float:
+    """The delay of the most evidence about ``delay_s``."""
+    return max((round(delay_s + k * 0.04, 3) for k in range(-3, 4)), key=lambda delay: fit(track, path, delay).evidence)
+
+
 def _searched(track: Track, path: Path) -> FloatArray:
-    """Delays [s] at which half of the track or of the path is covered by the other, and those up to `_LONG_S` that leave some of both."""
+    """Delays [s] at which half of the shorter of track and path is covered by the other."""
     shorter = min(track.t[-1] - track.t[0], path.t[-1] - path.t[0])
     least, most = track.t[0] - path.t[-1] + _MIN_COVERED * shorter, track.t[-1] - path.t[0] - _MIN_COVERED * shorter
     return np.arange(least, most + 1e-9, max(_COARSE_S, (most - least) / 4000.0))
