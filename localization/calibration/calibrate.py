@@ -11,12 +11,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from localization.calibration.dead_reckoning import check_reference
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, TrackMotionReference
 from localization.calibration.position_reference import PositionMotionReference
-from localization.calibration.wheel_signals import read_signals
 from localization.calibration.windows import WindowConfig, cut
 from localization.errors import EvaluationError
+from localization.evaluation.reference_check import check_reference
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack
 from localization.evidence import open_log_as_declared
@@ -208,7 +207,7 @@ def _track(log: Log, reference: str | None) -> ReferenceTrack:
     found = load_reference(log, name)
     if not isinstance(found, ReferenceTrack):
         raise EvaluationError(f"'{name}' holds relations; calibration needs a trajectory (TUM) or a topic.")
-    check_reference(log, read_signals(log), found)
+    check_reference(log, found)
     return found
 
 

@@ -13,13 +13,11 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
-from localization.calibration.dead_reckoning import dead_reckon, disjoint_message
 from localization.calibration.log_survey import survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
 from localization.calibration.robot_setup import draft_robot, finish_robot
-from localization.calibration.wheel_signals import read_signals
-from localization.errors import LogError
-from localization.evaluation.reference_check import compare_reference
+from localization.errors import EvaluationError, LogError
+from localization.evaluation.reference_check import compare_with_log
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
 from localization.events import Event
@@ -38,8 +36,6 @@ CheckVerdict = Literal["ok", "contradiction", "cannot be seen", "note"]
 
 _REPLAYED_S = 80.0
 """Length of the drive that the filter is run on [s]: a minute of driving and what stands before it."""
-_REFERENCE_S = 600.0
-"""Length of the drive that a reference is compared with where the first minute is too even [s]."""
 _SAME_SCALE = 0.15
 """Relative difference of a radius from the measured one: tyres under load and slip straight ahead change it by up to 7 %, and motion from
 scan to scan errs by some percent."""
@@ -308,18 +304,14 @@ def _reference_row(log: Log, given: str | None) -> CheckRow:
     found = load_reference(log, topic)
     if isinstance(found, Relations):
         return CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")
-    signals = read_signals(log)
-    path = None if signals is None else dead_reckon(log, signals)
-    if path is not None and (apart := disjoint_message(log, path, found)):
-        return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", apart)
-    compared = None if path is None else compare_reference([path], found)
-    if compared is None and signals is not None:
-        run = _replayed(log, log.robot, "odometry", _REFERENCE_S)
-        compared = None if run is None else compare_reference([run.trajectory], found)
-    if compared is None:
+    try:
+        compared = compare_with_log(log, found)
+    except EvaluationError as error:
+        return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", str(error))
+    if compared.verdict == "undecidable":
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)
-    second = f"speed and turns of the sensors: correlation {compared.unshifted:.2f}, way {compared.scale:.4g} times theirs"
-    advice = " ".join(text.removeprefix(f"{found.source}: ") for text in compared.sentences(found.source, found.has_times))
+    second = f"way and turns of the sensors: way {compared.scale:.4g} times theirs" if compared.scale > 0.0 else "another motion"
+    advice = " ".join(text.removeprefix(f"{found.source}: ") for text in compared.sentences)
     return CheckRow("reference", topic, second, "contradiction" if advice else "ok", advice)
 
 

@@ -17,8 +17,8 @@ from localization.evaluation.consistency import (
     stretch_consistency,
 )
 from localization.evaluation.metrics import Accuracy, evaluate
-from localization.evaluation.reference_check import reference_contradictions
 from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evidence.references import compare_reference
 from localization.log_replay import Run
 
 _LEVER_SIGMA_M = 0.3
@@ -46,7 +46,7 @@ class Result:
     scatter_nees: ScatterConsistency | None = None
     """NEES with the scatter of a reference without covariances, where `nees_mean` is above its band."""
     contradictions: tuple[str, ...] = ()
-    """What of the reference contradicts the sensors (`reference_contradictions`): no verdict follows from the scores."""
+    """What of the reference contradicts the sensors (`compare_reference`): no verdict follows from the scores."""
 
     def __repr__(self) -> str:
         error = None if self.accuracy is None else self.accuracy.ate_rmse_m
@@ -105,7 +105,7 @@ def score(runs: Sequence[Run], reference: ReferenceTrack | Relations | None) -> 
     """
     contradictions: tuple[str, ...] = ()
     if isinstance(reference, ReferenceTrack):
-        contradictions = reference_contradictions([run.trajectory for run in runs], reference)
+        contradictions = compare_reference(reference, [run.trajectory for run in runs]).sentences
     return [_score(run, reference, contradictions) for run in runs]
 
 

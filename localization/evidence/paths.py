@@ -5,8 +5,8 @@ In a window of some seconds, positions P_j (complex, x + i y) of a reference of 
     P_j = c_w + s exp(i phi_w) (p_j + exp(i theta_j) l) + n_j,        j in window w,
 
 with the estimate's positions p_j and headings theta_j at the delayed time. c_w and phi_w are profiled by window, so that the frame of the
-reference and the drift of the estimate do not count (Umeyama 1991, in the complex plane); the scale s and the lever arm l are common. Headings
-psi_j differ from the estimate's by a constant in each window, which is phi_w where the tracked body points ahead.
+reference and the drift of the estimate do not count (Umeyama 1991, in the complex plane); the scale s and the lever arm l are common.
+Headings psi_j differ from the estimate's by a constant in each window, which is phi_w where the tracked body points ahead.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def position_noise(positions: FloatArray) -> float:
 def make_path(trajectory: Trajectory, origin_ns: int) -> Path:
     """Poses of ``trajectory``."""
     x, y, yaw = trajectory.poses.T
-    return Path((trajectory.stamps_ns - origin_ns) * 1e-9, x + 1j * y, np.unwrap(yaw))
+    return Path(np.asarray((trajectory.stamps_ns - origin_ns) * 1e-9, dtype=float), x + 1j * y, np.unwrap(yaw))
 
 
 def make_track(t: FloatArray, positions: FloatArray, yaws: FloatArray | None) -> Track | None:
@@ -152,22 +152,39 @@ def make_track(t: FloatArray, positions: FloatArray, yaws: FloatArray | None) ->
     return None
 
 
-def unrelated_evidence(track: Track) -> float:
-    """Tempered log likelihood of a track whose motion is another's: straight on at a steady speed in each window, or anything."""
+def fit_curve(track: Track, path: Path, degree: int) -> Fit:
+    """A motion of the track's own: in each window a curve of time of this ``degree``; 1 is straight on at a steady speed.
+
+    Each coefficient beyond those of a path's fit has a price of one (Schwarz 1978, for the few independent samples of a window).
+    """
     t = track.t - _window_means(track.t, track.window)[track.window]
+    powers = np.stack([(t / max(float(t.max()), 1e-9)) ** k for k in range(degree + 1)], axis=1)
 
-    def from_line(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        off = values - _window_means(values, track.window)[track.window]
-        slope = _window_sums(off * t, track.window) / np.maximum(_window_sums(t * t, track.window), 1e-9)
-        return off - slope[track.window] * t, off
+    def left(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rest = np.empty_like(values)
+        for number in range(track.count):
+            rows = track.window == number
+            rest[rows] = values[rows] - powers[rows] @ np.linalg.lstsq(powers[rows], values[rows], rcond=None)[0]
+        return rest, values - _window_means(values, track.window)[track.window]
 
-    rest, off = from_line(track.positions)
+    rest, off = left(track.positions)
     sigma = np.hypot(track.noise, _RELATIVE * np.abs(off) + 1e-3 * track.wide)
     evidence = mixture(np.r_[rest.real, rest.imag], np.r_[sigma, sigma], track.wide)
-    if track.yaws is None:
-        return evidence
-    rest, off = from_line(track.yaws)
-    return evidence + mixture(rest, np.sqrt(track.yaw_noise**2 + _FLOOR_RAD**2 + (_RELATIVE_TURN * off) ** 2), track.wide_yaw)
+    scale = _spread(track.positions, track.window) / max(_spread(path.at(track.t)[0], track.window), 1e-9)
+    if track.yaws is not None:
+        turned, of_yaw = left(track.yaws)
+        sigma = np.sqrt(track.yaw_noise**2 + _FLOOR_RAD**2 + (_RELATIVE_TURN * of_yaw) ** 2)
+        evidence += mixture(turned, sigma, track.wide_yaw)
+    return Fit(evidence, _independent_share(rest), scale, 0.0, None, 0.0)
+
+
+def curve_price(track: Track, degree: int) -> float:
+    """Price of the coefficients of `fit_curve` beyond a rotation in each window, by coordinate."""
+    return track.count * (2.0 * degree - 1.0 + (0 if track.yaws is None else degree))
+
+
+def _spread(positions: ComplexArray, window: IntArray) -> float:
+    return float(np.sqrt(np.mean(np.abs(positions - _window_means(positions, window)[window]) ** 2)))
 
 
 def _independent_share(rest: ComplexArray) -> float:
@@ -288,5 +305,3 @@ def _window_means(values: np.ndarray, window: IntArray) -> np.ndarray:
 
 def _unit(values: ComplexArray) -> ComplexArray:
     return np.asarray(values / np.maximum(np.abs(values), 1e-12))
-
-

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from motion_models.se2 import FloatArray
 
 _MIN_WAY_M, _WAY_RESOLUTION_M = 2.0, 0.05
 """Way of a path that is compared, at this resolution."""
+_MIN_DURATION_S = 20.0
+"""Two windows: in less, a curve of its own explains any motion."""
 _NAMED = 0.01
 """Least probability of a set-up that is named beside others."""
 _STEP_S = 0.1
@@ -46,22 +49,44 @@ class ReferenceSetUp:
     """Why nothing could be compared."""
 
 
-def compare_reference(
-    name: str, stamps_ns: IntArray, positions: FloatArray, yaws: FloatArray | None, paths: Sequence[Trajectory], has_times: bool = True
-) -> ReferenceSetUp:
-    """How the reference ``name`` is given, by the motion of ``paths``, any of which may be right.
+class ReferenceSamples(Protocol):
+    """Poses or positions of the robot by a reference system."""
 
-    ``stamps_ns`` (n,) increasing, ``positions`` (n, 2), ``yaws`` (n,) or None; ``has_times``: False where its times were spread over the
-    log's.
-    """
+    @property
+    def source(self) -> str:
+        """Topic or file."""
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """(n,) increasing."""
+
+    @property
+    def positions(self) -> FloatArray:
+        """(n, 2)"""
+
+    @property
+    def yaws(self) -> FloatArray | None:
+        """(n,) [rad], or None where there are positions only."""
+
+    @property
+    def has_times(self) -> bool:
+        """False where its times were spread over the log's."""
+
+
+def compare_reference(reference: ReferenceSamples, paths: Sequence[Trajectory]) -> ReferenceSetUp:
+    """How the ``reference`` is given, by the motion of ``paths``, any of which may be right."""
+    name = reference.source
     usable = [path for path in paths if len(path) > 3 and path.distance(_WAY_RESOLUTION_M) > _MIN_WAY_M]
     if not usable:
         return ReferenceSetUp("undecidable", reason=f"{name}: the robot hardly moves by its sensors: drive 5 m with turns both ways.")
     origin_ns = int(usable[0].stamps_ns[0])
-    track = make_track((stamps_ns - origin_ns) * 1e-9, positions, yaws)
+    begin, end = (max(path.stamps_ns[i] for path in usable) if i == 0 else min(path.stamps_ns[i] for path in usable) for i in (0, -1))
+    if min(end - begin, reference.stamps_ns[-1] - reference.stamps_ns[0]) < _MIN_DURATION_S * 1e9:
+        return ReferenceSetUp("undecidable", reason=f"{name}: less than {_MIN_DURATION_S:g} s: drive on, with turns both ways.")
+    track = make_track(np.asarray((reference.stamps_ns - origin_ns) * 1e-9, dtype=float), reference.positions, reference.yaws)
     if track is None:
         return ReferenceSetUp("undecidable", reason=f"{name}: too few samples, or more noise than motion: drive further, with turns.")
-    found = alternatives(track, [make_path(path, origin_ns) for path in usable], has_times)
+    found = alternatives(track, [make_path(path, origin_ns) for path in usable], reference.has_times)
     return _decide(name, found)
 
 
@@ -92,26 +117,23 @@ def _first(pair: tuple[float, Candidate]) -> float:
     return pair[0]
 
 
-def paths_of(sources: Sequence[Source], robot: Robot, first_ns: int) -> list[Trajectory]:
-    """Paths by the ``sources`` of a log as ``robot`` has them: ways by wheels, driver or LiDAR, turns by any; unknown counts as standing.
-
-    ``first_ns``: where the sources' times begin.
-    """
-    ways, turns = list[tuple[float, FloatArray]](), list[FloatArray]()
-    if not sources:
-        return []
-    edges = np.arange(min(source.t[0] for source in sources), max(source.t[-1] for source in sources), _STEP_S)
+def paths_of(sources: Sequence[Source], robot: Robot) -> list[Trajectory]:
+    """Paths by the ``sources`` of a log as ``robot`` has them: ways by wheels, driver or LiDAR, turns by any, of both fields
+    of messages that have two; unknown is standing."""
+    ways, turns = list[FloatArray](), list[FloatArray]()
+    used = [source for source in sources if source.kind != "reference"]
+    edges = np.arange(min((s.t[0] for s in used), default=0.0), max((s.t[-1] for s in used), default=0.0), _STEP_S)
     if len(edges) < 3:
         return []
-    for source in sources:
+    for source in used:
         rates, second = source.rates(edges), source.rates(edges, of_second=True)
-        by_file = MAKERS[source.kind](source, rates, second, robot)[0]
-        if by_file.way is not None:
-            ways.append((0.0, by_file.way))
-        if by_file.turn is not None:
-            turns.append(by_file.turn)
-    stamps = first_ns + np.round(edges * 1e9).astype(np.int64)
-    return [Trajectory(stamps, _integrated(way, turn)) for _, way in ways for turn in turns]
+        both = (rates,) if source.second is None else (rates, second)
+        for own in both:
+            by_file = MAKERS[source.kind](source, own, second, robot)[0]
+            ways += [] if by_file.way is None else [by_file.way]
+            turns += [] if by_file.turn is None else [by_file.turn]
+    stamps = used[0].first_ns + np.round(edges * 1e9).astype(np.int64)
+    return [Trajectory(stamps, _integrated(way, turn)) for way in ways for turn in turns]
 
 
 def _integrated(way: FloatArray, turn: FloatArray) -> FloatArray:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from localization.evidence.alternatives.alternative import TEMPER, Row
-from localization.evidence.paths import Fit, Path, Track, fit, lags, unrelated_evidence, yaw_log_prior
+from localization.evidence.paths import Fit, Path, Track, curve_price, fit, fit_curve, lags, yaw_log_prior
 from motion_models.se2 import FloatArray
 
 _ODDS = {
@@ -22,6 +23,7 @@ _ODDS = {
     "clock": math.log(2e-4),
     "rate": math.log(1e-4),
     "unrelated": math.log(1e-5),
+    "even": math.log(0.03),
 }
 """Prior odds by kind (`docs/theory/set-up.md`); of clocks, at `_CLOCK_S`."""
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "kilometres": 0.001, "feet": 1.0 / 0.3048, "inches": 1.0 / 0.0254}
@@ -39,6 +41,8 @@ _COARSE_S, _FINE_S = 0.25, 0.02
 """Steps of the search of delays [s]."""
 _MIN_COVERED = 0.5
 """Part of the shorter of track and path that the other covers at all delays that are searched."""
+_DEGREES = (1, 3)
+"""Of the curve of a window that is straight on, and of one with a turn: the track's own motion."""
 _RATE_SPAN_S, _MIN_DRIFT_S, _MIN_RATE_DRIVE_S = 2.5, 0.15, 40.0
 """Difference of the delays of both halves of a drive that is searched, least one that is tried, and shortest drive [s]."""
 
@@ -65,12 +69,15 @@ def alternatives(track: Track, paths: Sequence[Path], has_times: bool = True) ->
     fitted = []
     for transform, rows in _axes(track.yaws is not None):
         of_axes = transform(track)
-        for path in paths:
-            for delay, rate in _clocks(of_axes, path, has_times):
-                clock = (*_clock_rows(delay, has_times), *_rate_rows(rate, track.t[-1] - track.t[0]))
-                fitted.append((fit(of_axes, path, delay, rate), (*rows, *clock), delay))
-    independent = max(fitted, key=lambda each: each[0].evidence)[0].share / TEMPER
-    found = [Candidate(_ODDS["unrelated"] + independent * unrelated_evidence(track), (_unrelated(),))]
+        for delay, rate in _clocks(of_axes, max(paths, key=partial(_nearest, of_axes)), has_times):
+            clock = (*_clock_rows(delay, has_times), *_rate_rows(rate, track.t[-1] - track.t[0]))
+            fitted += [(fit(of_axes, path, delay, rate), (*rows, *clock), delay) for path in paths]
+    even, own = (fit_curve(track, paths[0], degree) for degree in _DEGREES)
+    independent = max([own, even, *(each[0] for each in fitted)], key=lambda each: each.evidence).share / TEMPER
+    prices = [curve_price(track, degree) / independent for degree in _DEGREES]
+    fitted.append((replace(even, evidence=even.evidence - prices[0]), (_even(),), 0.0))
+    of_own = independent * (own.evidence - prices[1])
+    found = [Candidate(_ODDS["unrelated"] + of_own, (_unrelated(),))]
     for of_fit, rows, delay in fitted:
         for more, extra in _scales_and_yaws(of_fit):
             all_rows = (*rows, *more)
@@ -79,12 +86,18 @@ def alternatives(track: Track, paths: Sequence[Path], has_times: bool = True) ->
     return found
 
 
+def _nearest(track: Track, path: Path) -> float:
+    """The most likelihood of a delay that a path has on a coarse grid: all paths have one clock, which the best one shows."""
+    delays = _searched(track, path)
+    return float(lags(track, path, delays[:: max(len(delays) // 40, 1)]).max()) if len(delays) else -math.inf
+
+
 def _axes(has_yaws: bool) -> Iterator[tuple[Transform, tuple[Row, ...]]]:
     """What undoes each choice of axes."""
     mirrored = Row(
         "reference.mirrored",
-        "its path turns opposite to the sensors': its axes are mirrored, as of NED (x north, y east) or a left-handed system, or the robot's"
-        " left and right wheels are swapped",
+        "its path turns opposite to the sensors': its axes are mirrored, as of NED (x north, y east) or a left-handed system, or the"
+        " robot's left and right wheels are swapped",
         _ODDS["axes"],
         remedy="If the wheels are right, swap x and y, or invert y and the heading.",
     )
@@ -117,7 +130,9 @@ def _scales_and_yaws(fitted: Fit) -> Iterator[tuple[tuple[Row, ...], float]]:
         scales.append(((row,), _log_normal(log_scale - math.log(size), _SCALE_SIGMA)))
     text = f"its scale is {fitted.scale:.3g}: its way is that many times the sensors'"
     remedy = "Divide its positions by that factor, or correct the wheels' radius if that is the wrong one."
-    scales.append(((Row("reference.factor", text, _ODDS["factor"], value=fitted.scale, remedy=remedy),), _log_normal(log_scale, _FACTOR_SIGMA)))
+    scales.append(
+        ((Row("reference.factor", text, _ODDS["factor"], value=fitted.scale, remedy=remedy),), _log_normal(log_scale, _FACTOR_SIGMA))
+    )
     for scale_rows, of_scale in scales:
         for yaw_rows, of_yaw in yaws:
             yield (*scale_rows, *yaw_rows), of_scale + of_yaw
@@ -151,8 +166,8 @@ def _rate_rows(rate: float, duration_s: float) -> tuple[Row, ...]:
     drift = abs(rate) * duration_s
     latency, clock = -0.5 * (drift / (math.sqrt(2.0) * _LATENCY_SIGMA_S)) ** 2, _ODDS["rate"] - 0.5 * (rate / _RATE_SIGMA) ** 2
     text = (
-        f"its clock runs {abs(rate):.2%} {'faster' if rate > 0.0 else 'slower'} than that of the sensors: in both halves of the drive it has"
-        " other offsets"
+        f"its clock runs {abs(rate):.2%} {'faster' if rate > 0.0 else 'slower'} than that of the sensors: in both halves of the drive it"
+        " has other offsets"
     )
     remedy = "Synchronize the clocks, or scale its stamps."
     return (Row("clock.reference_rate", text, max(latency, clock), value=rate, remedy=remedy, is_fault=clock > latency),)
@@ -164,6 +179,11 @@ def _unrelated() -> Row:
         " not set"
     )
     return Row("reference.unrelated", text, 0.0)
+
+
+def _even() -> Row:
+    """A drive that shows nothing but its speed."""
+    return Row("reference.even", "it is straight on at a steady speed", _ODDS["even"], is_fault=False)
 
 
 def _clocks(track: Track, path: Path, has_times: bool) -> list[tuple[float, float]]:
@@ -217,8 +237,6 @@ def _growing(track: Track, path: Path, delay_s: float) -> list[tuple[float, floa
 
 
 def _part(track: Track, which: np.ndarray) -> Track | None:
-    from dataclasses import replace
-
     if which.sum() < 10:
         return None
     yaws = None if track.yaws is None else track.yaws[which]
