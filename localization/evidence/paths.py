@@ -183,6 +183,11 @@ def curve_price(track: Track, degree: int) -> float:
     return track.count * (2.0 * degree - 1.0 + (0 if track.yaws is None else degree))
 
 
+def wide_evidence(track: Track) -> float:
+    """Tempered log likelihood of a track of which nothing is known but its size."""
+    return _wide_evidence(track, np.ones(len(track.t), bool))
+
+
 def _spread(positions: ComplexArray, window: IntArray) -> float:
     return float(np.sqrt(np.mean(np.abs(positions - _window_means(positions, window)[window]) ** 2)))
 

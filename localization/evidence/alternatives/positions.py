@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from localization.evidence.alternatives.alternative import TEMPER, Row
-from localization.evidence.paths import Fit, Path, Track, curve_price, fit, fit_curve, lags, yaw_log_prior
+from localization.evidence.paths import Fit, Path, Track, curve_price, fit, fit_curve, lags, wide_evidence, yaw_log_prior
 from motion_models.se2 import FloatArray
 
 _ODDS = {
@@ -75,8 +75,10 @@ def alternatives(track: Track, paths: Sequence[Path], has_times: bool = True) ->
     even, own = (fit_curve(track, paths[0], degree) for degree in _DEGREES)
     independent = max([own, even, *(each[0] for each in fitted)], key=lambda each: each.evidence).share / TEMPER
     prices = [curve_price(track, degree) / independent for degree in _DEGREES]
+    # another motion is explained by chance: a likelihood ratio of e^g over none has at most the probability e^-g (Ville 1939)
+    by_chance = max(0.0, max(f.evidence for f, rows, _ in fitted if not any(row.is_fault for row in rows)) - wide_evidence(track))
+    of_own = independent * (own.evidence - prices[1] - by_chance)
     fitted.append((replace(even, evidence=even.evidence - prices[0]), (_even(),), 0.0))
-    of_own = independent * (own.evidence - prices[1])
     found = [Candidate(_ODDS["unrelated"] + of_own, (_unrelated(),))]
     for of_fit, rows, delay in fitted:
         for more, extra in _scales_and_yaws(of_fit):
