@@ -22,7 +22,7 @@ _ARM_KG_PER_M = (12.0, 1.0)
 """Median of an arm's mass over its reach [kg/m] and sigma of its logarithm. By their makers' data sheets: UR5 22, Panda 21, xArm 6 17,
 Kinova Gen3 lite 7; arms of hobby servos weigh about 3."""
 _BASE_KG_PER_M2 = (124.0, 0.55)
-"""The same for a base's mass over track times wheelbase [kg/m^2]: the shipped robots' (a test)."""
+"""Median of a base's mass over track times wheelbase [kg/m^2] and sigma of its logarithm: the shipped robots' (a test)."""
 
 
 @dataclass(frozen=True)
