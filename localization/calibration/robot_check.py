@@ -221,7 +221,7 @@ def _set_up_rows(set_up: SetUp) -> list[CheckRow]:
         advice = f"{set_up.reason} {_TURN_AND_STRAIGHT[0].upper()}{_TURN_AND_STRAIGHT[1:]}, with gyro or LiDAR."
         return [CheckRow("signs, units and mounts", "as in the robot file", "", "cannot be seen", advice)]
     if set_up.sentences:
-        return [_contradiction("sensors", text) for text in set_up.sentences]
+        return [_refuted("sensors", text) for text in set_up.sentences]
     rows = []
     for quantity, (source, names) in _QUANTITIES.items():
         against = [value for key, value in set_up.against.items() if key in {f"{source}.{name}" for name in names}]
@@ -238,7 +238,7 @@ def _odds(log_factor: float) -> str:
     return "over 1000 to 1" if log_factor > math.log(1000.0) else f"{math.exp(max(log_factor, 0.0)):.0f} to 1"
 
 
-def _contradiction(quantity: str, text: str) -> CheckRow:
+def _refuted(quantity: str, text: str) -> CheckRow:
     advice = text.replace(CORRECTED, "In the robot file:")
     return CheckRow(quantity, "as in the robot file", "all sources beside each other", "contradiction", advice)
 

@@ -99,7 +99,7 @@ def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own
     unresolved = [(p, choice) for p, choice, rows in kept if any(row.correct is None or row.family not in families for row in rows)]
     corrected = _with_mixture_noise(corrected, stacks, unresolved)
     keys = changed_entries(robot, _correct(robot, common))
-    sentences = (*_sentences(sources, common, robot, kept), *_ambiguity(sources, kept, rest))
+    sentences = (*_correction_warnings(sources, common, robot, kept), *_ambiguity_warnings(sources, kept, rest))
     return SetUp("certain" if is_certain else "ambiguous", corrected, hypotheses, sentences, keys, is_gyro_used, by_file=by_file)
 
 
@@ -126,15 +126,19 @@ def _aligned(
     corrected, others = _correct(robot, rows), sorted({row.text for _, _, r in kept for row in r if row.source == "clock"} - {clock.text})
     late_s = abs(clock.value or 0.0)
     keys = changed_entries(robot, corrected)
+    text = _alignment_warning(sources, clock, others, keys)
+    corrected = replace(corrected, clock=replace(corrected.clock, sigma_s=max(corrected.clock.sigma_s, late_s)))
+    return SetUp("ambiguous", corrected, hypotheses, (*_correction_warnings(sources, common, robot, kept), text), keys, by_file=by_file)
+
+
+def _alignment_warning(sources: Sequence[Source], clock: Row, others: Sequence[str], keys: Mapping[str, str]) -> str:
     written = "; ".join(f"{key} = {value}" for key, value in keys.items() if key.startswith("clock."))
     names = " and ".join(source.name for source in sources)
-    text = (
-        f"{names}: their stamps are {late_s:.2f} s apart, and nothing in the log shows whose clock is off"
+    return (
+        f"{names}: their stamps are {abs(clock.value or 0.0):.2f} s apart, and nothing in the log shows whose clock is off"
         f" ({_topic(sources, clock)}: {clock.text}; or {', '.join(others)}). {CORRECTED} {written}, or synchronize the clocks."
         " The covariance has the way in that time."
     )
-    corrected = replace(corrected, clock=replace(corrected.clock, sigma_s=max(corrected.clock.sigma_s, late_s)))
-    return SetUp("ambiguous", corrected, hypotheses, (*_sentences(sources, common, robot, kept), text), keys, by_file=by_file)
 
 
 def _faults(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -175,7 +179,7 @@ def _with_mixture_noise(robot: Robot, stacks: Sequence[Stack], unresolved: Seque
     return replace(robot, wheel_noise=noise)
 
 
-def _sentences(
+def _correction_warnings(
     sources: Sequence[Source], common: Sequence[Row], robot: Robot, kept: Sequence[tuple[float, Choice, tuple[Row, ...]]]
 ) -> list[str]:
     found = []
@@ -191,7 +195,7 @@ def _sentences(
     return found
 
 
-def _ambiguity(
+def _ambiguity_warnings(
     sources: Sequence[Source], kept: Sequence[tuple[float, Choice, tuple[Row, ...]]], rest: Sequence[tuple[Row, ...]]
 ) -> list[str]:
     if not rest:
