@@ -170,7 +170,9 @@ def fit_curve(track: Track, path: Path, degree: int) -> Fit:
     rest, off = left(track.positions)
     sigma = np.hypot(track.noise, _RELATIVE * np.abs(off) + 1e-3 * track.wide)
     evidence = mixture(np.r_[rest.real, rest.imag], np.r_[sigma, sigma], track.wide)
-    scale = _spread(track.positions, track.window) / max(_spread(path.at(track.t)[0], track.window), 1e-9)
+    p, _, known = path.at(track.t)
+    window = np.unique(track.window[known], return_inverse=True)[1]
+    scale = _spread(track.positions[known], window) / max(_spread(p[known], window), 1e-9) if known.any() else 1.0
     if track.yaws is not None:
         turned, of_yaw = left(track.yaws)
         sigma = np.sqrt(track.yaw_noise**2 + _FLOOR_RAD**2 + (_RELATIVE_TURN * of_yaw) ** 2)
