@@ -310,7 +310,7 @@ def _reference_row(log: Log, given: str | None) -> CheckRow:
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", str(error))
     if compared.verdict == "undecidable":
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)
-    second = f"way and turns of the sensors: way {compared.scale:.4g} times theirs" if compared.scale > 0.0 else "another motion"
+    second = f"speed and turns of the sensors: way {compared.scale:.4g} times theirs" if compared.scale > 0.0 else "another motion"
     advice = " ".join(text.removeprefix(f"{found.source}: ") for text in compared.sentences)
     return CheckRow("reference", topic, second, "contradiction" if advice else "ok", advice)
 
