@@ -19,7 +19,10 @@ from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray, Twist2
 
 _SCAN_WAIT_NS = 1_000_000_000
-"""Wait for the first scan after the first wheel sample [ns]; later, the drive starts by wheels alone. Scanners have 2 Hz or more."""
+"""Wait for the first scan after the first wheel sample [ns]; later, the drive starts by wheels alone."""
+
+_WAIT_PERIODS = 1.5
+"""For how many periods of the wheels a scan waits for their next sample, where that is longer than the settings' time."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +34,10 @@ class StepConfig(Settings):
     no_lidar_step_s: Positive = 0.05
     """Shortest step in a log without a LiDAR [s]; it ends at the last stamp that wheels and gyro have both reached."""
     wait_s: float = 0.3
-    """How long a scan waits for the wheel samples around it before it is used without them, and wheels for the gyro [s]."""
+    """How long a scan waits for the wheel samples around it before it is used without them, and wheels for the gyro [s]; at least 1.5
+    periods of the wheels."""
     max_hold_s: float = 0.5
-    """How long the last wheel rates are held when no more come [s]."""
+    """How long the last wheel rates are held when no more come [s]; at least two periods of the wheels."""
     lost_speed_m_s: Positive = 0.5
     """Sigma of the unknown constant speed while wheel data are missing [m/s]."""
     lost_rate_rad_s: Positive = 0.5
@@ -69,7 +73,6 @@ class Synchronizer:
         """Scans that wait."""
         self._velocity = UnknownVelocity(c.unknown_sigma)  # in gaps of the wheel data
         self._has_lidar = has_lidar
-        self._wait_ns = round(c.wait_s * 1e9)
         self._start_ns: int | None = None  # of the next step
         self._now_ns = -(1 << 62)  # newest stamp of all events
         self._clock_offset_ns = 0
@@ -85,6 +88,11 @@ class Synchronizer:
         self._clock_offset_ns = round(clock_offset_s * 1e9)
         if is_pose_measured:
             self._velocity.lasted_s = 0.0
+
+    @property
+    def _wait_ns(self) -> int:
+        """How long a scan waits for the wheels: the next sample is due within a period [ns]."""
+        return round(max(self.config.wait_s, _WAIT_PERIODS * self.wheels.buffer.period_s) * 1e9)
 
     def insert(self, event: Event) -> None:
         """Store ``event`` in the buffer of its sensor."""
@@ -138,7 +146,12 @@ class Synchronizer:
             end_ns = min(end_ns, self._now_ns)  # wheels stamped too early must not overtake a scan that is still to come
             step_ns = round(self.config.max_step_s * 1e9)
             least_ns = step_ns if is_last else step_ns + self._wait_ns
-            return None if end_ns - self._start_ns < least_ns else self._start_ns + step_ns
+            if end_ns - self._start_ns < least_ns:
+                return None
+            step_end_ns = self._start_ns + step_ns + self._clock_offset_ns
+            sample_ns = self.wheels.buffer.end_of_interval(step_end_ns)  # within a longer interval the motion is not known as well
+            is_within = sample_ns is not None and self.wheels.buffer.period_s > self.config.max_step_s
+            return (sample_ns if is_within and sample_ns is not None else step_end_ns) - self._clock_offset_ns
         # the gyro's clock may be ahead of the wheels': holding its last rate would hide the offset between the two clocks
         gyro_ns = self.inertial.gyro.newest_ns
         if gyro_ns is not None and not is_last and self._now_ns <= gyro_ns + self._wait_ns:
@@ -157,14 +170,15 @@ class Synchronizer:
         """The wheels' motion, the gyro's turn and the scan of ``interval``."""
         start_ns, end_ns, scan = interval
         shift, attitude = self._clock_offset_ns, self.inertial.attitude
-        dt, rates, cg, missing = self.wheels.buffer.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
-        tilt = None if attitude is None else attitude.advance(end_ns, dt, rates)
+        window = self.wheels.buffer.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
+        rates, missing = window.rates, window.missing
+        tilt = None if attitude is None else attitude.advance(end_ns, window.dt, rates)
         if scan is not None and attitude is not None and tilt is not None:
             scan = self.scans.ground.leave_out(scan, attitude.curvature)
-        motion, d_clock, last = self.wheels.integrate(start_ns + shift, dt, rates, cg, tilt)
+        motion, d_clock, last = self.wheels.integrate(start_ns + shift, window, tilt)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
             rates, last = self.wheels.twist_at(end_ns + shift)
-        is_standing = bool(len(dt)) and missing == 0.0 and not rates.any()
+        is_standing = bool(len(window.dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
         turn, body_turn, gravity = self.inertial.measure(start_ns, end_ns, by_wheels=float(motion.delta[2]), scan=scan)
         if missing:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import bisect
-from math import isfinite
+from collections import deque
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,10 @@ from localization.events import CgSample, WheelSample
 from motion_models.se2 import FloatArray
 
 _NS = 1e-9
+_HELD_PERIODS = 2.0
+"""For how many periods of the wheels the last rates are held, where that is longer than the settings' time: one sample was lost."""
+_PERIODS = 51
+"""Last intervals between samples, of which the period is the median: pauses among them do not count."""
 
 
 class WheelInterval(NamedTuple):
@@ -28,6 +33,22 @@ class WheelInterval(NamedTuple):
     """y of the centre of gravity [m]."""
     has_angles: bool
     """The rates are differences of angles, and give all of the motion in the interval."""
+
+
+class WheelWindow(NamedTuple):
+    """Rates of the wheels over a time, in pieces of constant rates."""
+
+    dt: FloatArray
+    """(n,) duration of each piece [s]."""
+    rates: FloatArray
+    """(n, 2) left and right [rad/s]."""
+    cg: FloatArray
+    """(n, 2) centre of gravity [m]."""
+    inside: FloatArray
+    """(n, 3) where each piece is in its interval between two samples: length of that and start of the piece in it [s], and 1 where angles
+    at both ends measure its whole motion, else 0."""
+    missing: float
+    """Time without data [s]."""
 
 
 class WheelBuffer:
@@ -51,10 +72,16 @@ class WheelBuffer:
         """Up to when rates are known; None before two samples."""
         self._ends: list[int] = []
         self._intervals: list[WheelInterval] = []
+        self._lengths_ns: deque[int] = deque(maxlen=_PERIODS)
 
     def __len__(self) -> int:
         """Stored intervals."""
         return len(self._intervals)
+
+    @property
+    def period_s(self) -> float:
+        """Median time from sample to sample [s]; 0 before the second."""
+        return sorted(self._lengths_ns)[(len(self._lengths_ns) - 1) // 2] * _NS if self._lengths_ns else 0.0
 
     def set_cg(self, sample: CgSample) -> None:
         """Set the CG of the samples to come."""
@@ -83,6 +110,7 @@ class WheelBuffer:
         if not (isfinite(left) and isfinite(right)):
             return
         self._ends.append(sample.stamp_ns)
+        self._lengths_ns.append(sample.stamp_ns - last.stamp_ns)
         self.rates_known_until_ns = sample.stamp_ns
         x, y = self.cg.tolist()
         self._intervals.append(WheelInterval(last.stamp_ns, left, right, x, y, has_angles))
@@ -90,43 +118,57 @@ class WheelBuffer:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
             del self._ends[:n], self._intervals[:n]
 
+    def _hold_ns(self, max_hold_s: float) -> int:
+        """For how long the last rates are held [ns]."""
+        return round(max(max_hold_s, _HELD_PERIODS * self.period_s) / _NS)
+
+    def end_of_interval(self, stamp_ns: int) -> int | None:
+        """Stamp of the sample that ends the interval around ``stamp_ns`` [ns]; None past the newest."""
+        i = bisect.bisect_left(self._ends, stamp_ns)
+        return self._ends[i] if i < len(self._ends) and self._intervals[i].start_ns <= stamp_ns else None
+
     def at(self, stamp_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray]:
-        """Rates (n, 2) and CG (n, 2) of the interval at ``stamp_ns``, else of the next or the last one; n = 0 if it begins more than
-        ``max_hold_s`` away."""
+        """Rates (n, 2) and CG (n, 2) of the interval at ``stamp_ns``, else of the next or the last one; n = 0 where that is farther away
+        than rates are held."""
         i = min(bisect.bisect_right(self._ends, stamp_ns), len(self._ends) - 1)
-        is_known = i >= 0 and abs(self._intervals[i].start_ns - stamp_ns) <= max_hold_s / _NS
+        is_known = i >= 0 and self._is_known_at(i, stamp_ns, self._hold_ns(max_hold_s))
         table = np.array(self._intervals[i][1:5] if is_known else ()).reshape(-1, 4)
         return table[:, :2], table[:, 2:]
 
-    def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Intervals (n,) [s], rates (n, 2), CG (n, 2) from ``start_ns`` to ``end_ns``, and the seconds without data.
+    def _is_known_at(self, i: int, stamp_ns: int, hold_ns: int) -> bool:
+        start_ns, end_ns, has_angles = self._intervals[i].start_ns, self._ends[i], self._intervals[i].has_angles
+        known_until_ns = end_ns + hold_ns if has_angles or stamp_ns > end_ns else start_ns + hold_ns
+        return start_ns - hold_ns <= stamp_ns <= known_until_ns
 
-        Without a sample, rates hold for at most ``max_hold_s``, be it past the newest sample or between two of them. Angles on both sides
-        of a longer gap still give the mean rates in it, but not how they were spread: it counts as unknown, unless no wheel moved.
+    def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> WheelWindow:
+        """Rates from ``start_ns`` to ``end_ns``.
+
+        Angles at both ends of an interval measure its motion, however long it is. Rates hold for at most ``max_hold_s``, or two periods of
+        the wheels, be it past the newest sample or between two of them.
         """
-        hold_ns = round(max_hold_s / _NS)
-        rows: list[tuple[float, float, float, float, float]] = []
+        hold_ns = self._hold_ns(max_hold_s)
+        rows: list[tuple[float, ...]] = []
         known, covered = start_ns, 0.0
         for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):
             interval, end = self._intervals[i], min(self._ends[i], end_ns)
             if interval.start_ns >= end_ns:
                 break
-            is_at_rest = interval.has_angles and interval.left == interval.right == 0.0
-            held_until = end if is_at_rest else min(end, interval.start_ns + hold_ns)
-            begin, end = max(interval.start_ns, known), end if interval.has_angles else held_until
+            begin, end = max(interval.start_ns, known), end if interval.has_angles else min(end, interval.start_ns + hold_ns)
             if end <= begin:
                 continue
-            rows.append(((end - begin) * _NS, *interval[1:5]))
-            covered += max(held_until - begin, 0) * _NS
+            inside = (self._ends[i] - interval.start_ns) * _NS, (begin - interval.start_ns) * _NS, float(interval.has_angles)
+            rows.append(((end - begin) * _NS, *interval[1:5], *inside))
+            covered += (end - begin) * _NS
             known = end
         if known < end_ns and self._ends:
-            hold = min(end_ns, self._ends[-1] + hold_ns) - max(known, self._ends[-1])
+            begin = max(known, self._ends[-1])
+            hold = min(end_ns, self._ends[-1] + hold_ns) - begin
             if hold > 0:
-                rows.append((hold * _NS, *self._intervals[-1][1:5]))
+                rows.append((hold * _NS, *self._intervals[-1][1:5], inf, (begin - self._ends[-1]) * _NS, 0.0))
                 covered += hold * _NS
-        table = np.array(rows).reshape(-1, 5)
+        table = np.array(rows).reshape(-1, 8)
         missing = max((end_ns - start_ns) * _NS - covered, 0.0)
-        return table[:, 0], table[:, 1:3], table[:, 3:5], missing if missing > 1e-6 else 0.0
+        return WheelWindow(table[:, 0], table[:, 1:3], table[:, 3:5], table[:, 5:], missing if missing > 1e-6 else 0.0)
 
 
 def _mean_of_known(one: float, other: float) -> float:

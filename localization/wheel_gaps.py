@@ -1,4 +1,4 @@
-"""Times without wheel data: the robot moves on with an unknown velocity."""
+"""What wheels do not show: how the velocity changes between two samples, and the motion while no samples come."""
 
 from __future__ import annotations
 
@@ -6,8 +6,15 @@ import math
 
 import numpy as np
 
+from localization.lidar import FORGETTING
+from localization.wheel_buffer import WheelWindow
+from motion_models.compiled import kernel
 from motion_models.se2 import Cov3, FloatArray, Twist2
 
+_SAME_S = 1e-6
+"""Difference of stamps that is rounding [s]."""
+_CHANGES_WITHIN_S = 1.0
+"""Time in which a velocity changes by the unknown twist's sigma, until the log has shown it [s]: prior with the weight of one interval."""
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 """Upper bounds of the variances of x, y and yaw; yaw: that of a uniform distribution from -pi to pi [rad^2]."""
 _MIN_REPORTED_S = 0.05
@@ -17,6 +24,73 @@ _PAUSED = (
     "Where no other sensor has data either, the recorder was paused, or the computer's clock was set forward: `skidloc info` has the gaps;"
     " if it was the clock, cut the log there."
 )
+
+
+class VelocityWithinIntervals:
+    """Error of taking the wheels' mean rates between two samples as constant: `add` each step's pieces, then `cov`.
+
+    The velocity is a random walk of density q (white acceleration; Bar-Shalom, Li & Kirubarajan 2001, sec. 6.2.2). Where the ends of an
+    interval of length T are measured, the way from its start is off by e(t) with
+
+        var e(t) = q t^2 (T - t)^2 / (3 T)      (T / 2: q T^3 / 48),      e(t) = u t (T - t) to first order, u ~ N(0, q / (3 T)),
+
+    which is zero at both ends. Mean rates of successive intervals differ by var q (T_1 + T_2) / 3: the log itself measures q. It is at most
+    that of a velocity that varies by the unknown twist's sigma s within the interval, q T / 6 < s^2. An error of the yaw moves a robot that
+    drives at speed v sideways by v int e(t) dt. Rates without angles are off by a velocity of variance q T / 12 besides.
+    """
+
+    def __init__(self, unknown_sigma: Twist2) -> None:
+        """``unknown_sigma`` (3,) of a twist that no wheel shows."""
+        self._unknown = np.asarray(unknown_sigma)[[0, 2]]
+        self._learned = np.array([*(self._unknown**2 / _CHANGES_WITHIN_S), 1.0, 0.0, 0.0, 0.0])
+        """Sums of squared differences (2) and their weight; length of the last interval, its speed and its turn rate."""
+
+    def add(self, window: WheelWindow, twists: FloatArray) -> None:
+        """The pieces of a step and their twists (n, 3)."""
+        _learn(window.inside, window.dt, twists, self._learned)
+
+    def cov(self, window: WheelWindow, twists: FloatArray) -> Cov3:
+        """(3, 3) of the motion of a step, in the body frame at its end: the turn of a step turns its own errors little."""
+        cov = np.zeros((3, 3))
+        _add_cov(window.inside, window.dt, twists, self._learned, self._unknown, cov)
+        return cov
+
+
+@kernel
+def _learn(inside: FloatArray, dt: FloatArray, twists: FloatArray, learned: FloatArray) -> None:
+    """Add the differences between successive intervals, each where it ends."""
+    for i in range(len(dt)):
+        length, last = inside[i, 0], learned[3]
+        if inside[i, 1] + dt[i] < length - _SAME_S or math.isinf(length):
+            continue
+        if last > 0.0:
+            learned[0] = FORGETTING * learned[0] + 3.0 * (twists[i, 0] - learned[4]) ** 2 / (length + last)
+            learned[1] = FORGETTING * learned[1] + 3.0 * (twists[i, 2] - learned[5]) ** 2 / (length + last)
+            learned[2] = FORGETTING * learned[2] + 1.0
+        learned[3], learned[4], learned[5] = length, twists[i, 0], twists[i, 2]
+
+
+@kernel
+def _add_cov(inside: FloatArray, dt: FloatArray, twists: FloatArray, learned: FloatArray, unknown: FloatArray, cov: FloatArray) -> None:
+    """Add the covariance (3, 3) of each piece."""
+    for i in range(len(dt)):
+        start, end, speed, rate, has_angles = inside[i, 1], inside[i, 1] + dt[i], twists[i, 0], twists[i, 2], inside[i, 2] > 0.0
+        if speed == 0.0 and rate == 0.0:
+            continue  # at rest
+        T = inside[i, 0] if has_angles else min(inside[i, 0], end)
+        q_way = min(learned[0] / learned[2], 6.0 * max(unknown[0], abs(speed)) ** 2 / T)
+        q_turn = min(learned[1] / learned[2], 6.0 * max(unknown[1], abs(rate)) ** 2 / T)
+        grown = end * (T - end) - start * (T - start)  # of t (T - t)
+        area = T * (end**2 - start**2) / 2.0 - (end**3 - start**3) / 3.0 - start * (T - start) * dt[i]
+        by_way, by_turn, side = q_way / (3.0 * T), q_turn / (3.0 * T), speed * area
+        cov[0, 0] += by_way * grown**2
+        cov[1, 1] += by_turn * side**2
+        cov[2, 2] += by_turn * grown**2
+        cov[1, 2] += by_turn * side * grown
+        cov[2, 1] += by_turn * side * grown
+        if not has_angles:
+            cov[0, 0] += q_way * T / 12.0 * dt[i] ** 2
+            cov[2, 2] += q_turn * T / 12.0 * dt[i] ** 2
 
 
 class UnknownVelocity:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from localization.attitude import Tilt
 from localization.motion_on_slopes import MotionOnSlopes
-from localization.wheel_buffer import WheelBuffer
+from localization.wheel_buffer import WheelBuffer, WheelWindow
+from localization.wheel_gaps import VelocityWithinIntervals
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.extended_model import SampleSeries, in_series, needs_series
@@ -25,6 +28,7 @@ class WheelMotion:
         self.model, self.params, self._needs_series = model, model.nominal, needs_series(model)
         self.buffer = WheelBuffer(robot.center_of_gravity)
         self._noise, self._max_hold_s = noise_vector(robot.wheel_noise), max_hold_s
+        self._within = VelocityWithinIntervals(unknown_sigma)
         self.on_slopes = MotionOnSlopes(robot, self._noise, unknown_sigma) if has_slopes else None
 
     def twist_at(self, stamp_ns: int) -> tuple[FloatArray, Twist2]:
@@ -32,14 +36,13 @@ class WheelMotion:
         rates, cg = self.buffer.at(stamp_ns, self._max_hold_s)
         return rates, self.model.twist(rates, cg, self.params).value.sum(axis=0)
 
-    def integrate(
-        self, start_ns: int, dt: FloatArray, rates: FloatArray, cg: FloatArray, tilt: Tilt | None
-    ) -> tuple[Motion, FloatArray, FloatArray]:
-        """Motion of the wheels over the intervals, its derivative by the wheels' clock (3,), and the twist (3,) at the end.
+    def integrate(self, start_ns: int, window: WheelWindow, tilt: Tilt | None) -> tuple[Motion, FloatArray, FloatArray]:
+        """Motion of the wheels over the ``window`` from ``start_ns`` on, its derivative by their clock (3,), and the twist (3,) at the end.
 
         A window that is late by c has motion exp(-c twist_before) delta exp(c twist_end): the derivative is the twist just before the end
         less that just before the start, expressed in the body frame at the end. It is not zero where each window has one wheel sample.
         """
+        dt, rates, cg = window.dt, window.rates, window.cg
         if not len(dt):
             return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
         before, before_cg = self.buffer.at(start_ns - 1, self._max_hold_s)
@@ -55,5 +58,7 @@ class WheelMotion:
             motion = integrate_twists(dt, inside, self._noise)
         else:
             twist, motion = self.on_slopes.integrate(model, self.params, dt, rates, cg, tilt)
+        self._within.add(window, twist.value[n:])
+        motion = replace(motion, cov=motion.cov + self._within.cov(window, twist.value[n:]))
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last

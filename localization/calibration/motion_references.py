@@ -85,12 +85,12 @@ class Wheels:
 
     def motion(self, start_ns: int, end_ns: int) -> Motion:
         """Motion from start to end; the last rates hold for `HOLD_S`."""
-        dt, rates, cg, _ = self.buffer.window(start_ns, end_ns, HOLD_S)
+        dt, rates, cg, *_ = self.buffer.window(start_ns, end_ns, HOLD_S)
         return preintegrate(self.model, dt, rates, cg, self.model.nominal, self.noise)
 
     def is_standing(self, start_ns: int, end_ns: int) -> bool:
         """Whether no wheel moved."""
-        dt, rates, _, _ = self.buffer.window(start_ns, end_ns, HOLD_S)
+        dt, rates, *_ = self.buffer.window(start_ns, end_ns, HOLD_S)
         return len(dt) > 0 and bool(_stands(rates).all())
 
     def standstill(self, start_ns: int, end_ns: int) -> tuple[int, int] | None:
@@ -101,9 +101,9 @@ class Wheels:
         """
         shift = round(_MAX_CLOCK_SHIFT_S / _NS)
         begin = start_ns - 2 * shift
-        if self.buffer.window(begin, start_ns, HOLD_S)[3]:
+        if self.buffer.window(begin, start_ns, HOLD_S).missing:
             begin = start_ns
-        dt, rates, _, missing = self.buffer.window(begin, end_ns, HOLD_S)
+        dt, rates, _, _, missing = self.buffer.window(begin, end_ns, HOLD_S)
         if missing:
             return None
         stamps = begin + np.r_[0, np.round(np.cumsum(dt) / _NS)].astype(np.int64)

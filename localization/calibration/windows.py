@@ -146,7 +146,7 @@ def _window(
     edges = (span.start_ns - around, span.start_ns, middle_ns, span.end_ns, span.end_ns + around)
     parts = []
     for begin, end in itertools.pairwise(edges):
-        dt, rates, cg, missing = history.window(begin, end, HOLD_S)
+        dt, rates, cg, _, missing = history.window(begin, end, HOLD_S)
         if missing and begin < end:
             if span.start_ns <= begin < span.end_ns:
                 return None

@@ -106,7 +106,7 @@ class Predictor:
         begin_ns, end_ns = self.last.stamp_ns + self._clock_offset_ns, wheels.rates_known_until_ns
         if end_ns <= begin_ns:
             return None
-        dt, rates, cg, missing = wheels.window(begin_ns, end_ns, self._config.max_hold_s)
+        dt, rates, cg, _, missing = wheels.window(begin_ns, end_ns, self._config.max_hold_s)
         if not len(dt):
             return None
         by_model = self._model.twist(rates, cg, self._params)
