@@ -172,7 +172,7 @@ class EkfFusion(Estimator):
         if sensor is None:
             return state, None, NOTHING_MISSED
         if step.scan is None:
-            sensor.add_no_scan(step.end_ns, step.is_scan_excluded)
+            sensor.add_no_scan(step)
             return state, None, NOTHING_MISSED
         self.counts_by_name["scans"] += 1
         self._is_scan_pending = True

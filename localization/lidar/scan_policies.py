@@ -8,6 +8,7 @@ import numpy as np
 
 from localization.events import Scan, Step
 from localization.lidar.scan_matcher import LidarConfig
+from motion_models import se2
 from motion_models.se2 import FloatArray
 
 MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
@@ -44,19 +45,25 @@ class MovedRobot:
     def __init__(self, config: LidarConfig) -> None:
         self._config = config
         self._mapped_shares: dict[str, float] = {}  # of the last scan in each frame
+        self._since = np.zeros(3)  # motion by the wheels since the last scan
         self._at_ns: int | None = None
+
+    def add_no_scan(self, step: Step) -> None:
+        """A step that ends without a scan."""
+        self._since = se2.compose(self._since, step.predicted.delta)
 
     def begin(self, scan: Scan) -> None:
         """``scan`` begins a submap: all of it is mapped."""
+        self._since = np.zeros(3)
         self._mapped_shares = {scan.frame_id: 1.0}
 
     def is_moved(self, step: Step, scan: Scan, mapped_share: float, *, is_matched: bool) -> bool:
-        """Whether the robot was moved in ``step``, by the ``mapped_share`` of the points of its ``scan`` now and before."""
+        """Whether the robot was moved since the last scan, by the ``mapped_share`` of the points of ``scan`` of ``step`` and before."""
         before, c = self._mapped_shares.get(scan.frame_id, 0.0), self._config
         self._mapped_shares[scan.frame_id] = mapped_share
+        (x, y, yaw), self._since = se2.compose(self._since, step.predicted.delta), np.zeros(3)
         if is_matched or step.is_scan_partial or before <= c.search_below or mapped_share >= c.lost_below:
             return False
-        x, y, yaw = step.predicted.delta
         if math.hypot(x, y) >= c.key_distance_m or abs(yaw) >= c.key_angle_rad:
             return False
         self._at_ns = step.end_ns

@@ -90,10 +90,11 @@ class ScanMatchingSensor:
             return None, "moved"
         return found, "lost" if found is None else ""
 
-    def add_no_scan(self, stamp_ns: int, is_excluded: bool) -> None:
+    def add_no_scan(self, step: Step) -> None:
         """A step without a scan: none is at hand, and the LiDAR may be silent, or a check left the scan out."""
         self._scan = None
-        self.lost.add(stamp_ns, "excluded") if is_excluded else self.lost.add_no_scan(stamp_ns)
+        self.moved.add_no_scan(step)
+        self.lost.add(step.end_ns, "excluded") if step.is_scan_excluded else self.lost.add_no_scan(step.end_ns)
 
     def refine(self, match: ScanMatch, twist: Twist2) -> ScanMatch:
         """``match`` again, its sweep deskewed with ``twist`` (3,); the same where that moves no point."""
@@ -127,7 +128,7 @@ class ScanMatchingSensor:
         assert self._matcher is not None
         if self._kiss is not None:
             self._kiss.insert(self._scan.points, pose)
-        return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
+        return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov, self.lidar_position())
 
     def begin_submap(self) -> None:
         """Drop the submap: the next scan begins another one."""

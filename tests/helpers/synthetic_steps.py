@@ -64,8 +64,8 @@ class PoseSensor:
     def intra_scan_slip_cov(self, match, slip_rate):
         return np.zeros((3, 3))
 
-    def add_no_scan(self, stamp_ns, is_excluded):
-        self.lost.add_no_scan(stamp_ns)
+    def add_no_scan(self, step):
+        self.lost.add_no_scan(step.end_ns)
 
     def is_key(self, pose):
         return False

@@ -69,6 +69,15 @@ def test_is_moved_of_a_robot_that_drives_or_keeps_the_map_is_false(way: float, s
     assert moved.cov(step(1)) is None
 
 
+def test_is_moved_counts_the_way_since_the_last_scan() -> None:
+    """Sparse scans: steps without one lie between."""
+    moved = MovedRobot(LidarConfig())
+    moved.begin(scan(0))
+    for k in range(3):
+        moved.add_no_scan(step(k, 0.2))
+    assert not moved.is_moved(step(3), scan(1), 0.1, is_matched=False)
+
+
 def test_is_moved_tells_frames_apart() -> None:
     """A second LiDAR sees another part of the map than the first."""
     moved = MovedRobot(LidarConfig())
