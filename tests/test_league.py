@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from motion_models import se2
-from tests.league import page
+from tests.league import joined, page, tuning
 from tests.league.__main__ import main
 from tests.league.evalio_pipelines import PIPELINES
 from tests.league.logs import find_logs, peer_arrays
@@ -98,3 +98,34 @@ def test_robot_localization_drives_the_arc_of_its_odometry(monkeypatch):
     body = se2.compose(se2.compose([0.2, 0.0, 0.3], poses), se2.inverse(np.array([0.2, 0.0, 0.3])))
     np.testing.assert_allclose(se2.between(found[100], found[-1]), se2.between(body[100], body[-1]), atol=0.5 * 0.05 * 0.2 * 5.0)
     assert covariances[-1, 0, 0] > covariances[20, 0, 0] > 0.0
+
+
+def test_peer_of_finished_trajectories_joins_by_a_folder(tmp_path):
+    (tmp_path / "csail.tum").write_text("1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n")
+    (system,) = joined.parse([f"mine={tmp_path}"])
+    target = tmp_path / "out"
+    assert not joined.take_trajectory(system, "csail", target)
+    with np.load(f"{target}.npz") as arrays:
+        np.testing.assert_allclose(arrays["poses"], [[0, 0, 0], [1, 0, 0]], atol=1e-12)
+    assert "fr079.tum: missing" in joined.take_trajectory(system, "fr079", target)
+
+
+@pytest.mark.parametrize(
+    ("word", "message"), [("nothing", "give NAME=PATH"), ("a=/no/such", "no folder /no/such"), ("a=.", "no .tum file")]
+)
+def test_peer_that_is_none_ends_with_what_is_wrong(word, message):
+    with pytest.raises(SystemExit, match=message):
+        joined.parse([word])
+
+
+def test_peer_that_does_not_compile_names_the_first_error(tmp_path):
+    (tmp_path / "run_open_karto.cpp").write_text("int main() { return missing; }")
+    with pytest.raises(SystemExit, match=r"was not built: .*missing|no g\+\+"):
+        joined.build("open_karto", (tmp_path,), tmp_path)
+
+
+def test_settings_of_a_large_grid_are_drawn_within_the_budget():
+    grid = {"a": (1.0, 2.0, 3.0), "b": (0.0, 1.0)}
+    assert len(tuning.draw(grid, 40)) == 6
+    assert tuning.draw(grid, 4) == tuning.draw(grid, 4)
+    assert len({tuning.name_with("x", settings) for settings in tuning.draw(grid, 4)}) == 4

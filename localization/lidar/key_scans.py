@@ -113,7 +113,7 @@ class KeyScans:
         """(N,) whether the nearest key scans measured free space where the scan ``points`` (N, 2) lies from ``pose`` (3,)."""
         drawn = np.asarray(se2.transform(pose, points))
         near = sorted(self.keys, key=lambda key: math.hypot(key.pose[0] - pose[0], key.pose[1] - pose[1]))[:_VIEWS]
-        return np.any([key.is_free(drawn, _FREE_CELLS * self.cell) for key in near], axis=0)
+        return np.asarray(np.any([key.is_free(drawn, _FREE_CELLS * self.cell) for key in near], axis=0))
 
     def insert(self, pose: Pose2, points: Points2, map_cov: Cov3 | None, lidar: FloatArray = _ORIGIN) -> tuple[float, float]:
         """Draw the scan ``points`` (N, 2) of the body frame from ``pose`` (3,); returns its shares, as `measure_shares` does.

@@ -1,21 +1,27 @@
-"""Run skidloc and its peers on the same logs, with the defaults of each, and judge them by evo and smfeval.
+"""Run skidloc and its peers on the same logs, with the defaults of each or tuned on another log, and judge them by evo and smfeval.
 
 python -m tests.league [--log fr079,csail,aces,hills-trees,hills-grass] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
+    [--peer NAME=PATH ...] [--tune LOG] [--budget 40]
 
 Peers are installed into .league/, an environment of their own, from tests/league/requirements.txt; what cannot be installed or crashes
 is a row with the reason, and is tried again by the next run. What has been run is kept in the output folder and is not run again: delete a
 file to run it anew. All of it takes some ten minutes. MRPT is of Debian (`apt install mrpt-apps mrpt-common`). The page
 league.html has tables, plots and settings; league.json the numbers. CPU seconds are those of the estimate alone, of all its threads,
-without reading the log. `--folder` adds NAME.mcap with NAME.toml and a reference NAME.tum, .csv, .txt or .relations beside it.
+without reading the log. `--peer` adds a system that is built from sources in PATH, or a folder of finished LOG.tum files (`joined`).
+`--tune` gives each peer with settings of its own a row more on every other log: those settings that were best on LOG, of at most
+`--budget` drawn from its grid. skidloc is never tuned: its rows are its defaults. `--folder` adds NAME.mcap with NAME.toml and a
+reference NAME.tum, .csv, .txt or .relations beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import operator
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +30,7 @@ import numpy as np
 from localization.evaluation.metrics import relation_errors
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.trajectory import Trajectory
-from tests.league import page
+from tests.league import joined, page, tuning
 from tests.league.hills import HILLS, SECONDS
 from tests.league.logs import find_logs, peer_arrays
 from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE, System
@@ -32,6 +38,7 @@ from tests.studies.buildings import REFERENCE_SIGMA, SHORT_S, Building, Drive
 
 _ENVIRONMENT = Path(".league")
 _TIMEOUT_S = 3600.0
+NO_SETTINGS: Mapping[str, float] = {}
 _ALL = (*SYSTEMS, *SYSTEMS_IN_SPACE)
 
 
@@ -58,16 +65,27 @@ def _python() -> Path:
     return _ENVIRONMENT / "bin" / "python"
 
 
-def run_system(system: System, log: str, out: Path, folder: Path | None) -> str:
-    """Run ``system`` on ``log`` unless its result is there. Returns why it failed, or an empty string."""
-    target = out / log / system.name
+def run_system(system: System, log: str, out: Path, folder: Path | None, settings: Mapping[str, float] = NO_SETTINGS) -> str:
+    """Run ``system`` on ``log`` unless its result is there. Returns why it failed, or an empty string. ``settings`` that are not its
+    defaults are part of the result's name."""
+    target = out / log / tuning.name_with(system.name, settings)
     if target.with_name(f"{system.name}.json").exists():
         return ""
-    if system.in_space is not None:
+    pairs = [f"{name}={value:g}" for name, value in settings.items()]
+    if system.folders and not system.tuned:
+        return joined.take_trajectory(system, log, target)
+    if system.folders:
+        try:
+            program = joined.build(system.name, system.folders, out)
+        except SystemExit as reason:
+            return str(reason)
+        script = PEERS / "source.py"
+        command = [sys.executable, str(script), str(out / log / "drive.npz"), str(target), system.name, str(program), *pairs]
+    elif system.in_space is not None:
         peers = next((_ENVIRONMENT / "lib").glob("python*/site-packages"), _ENVIRONMENT)
         command = [sys.executable, "-m", "tests.league.hills", log, system.in_space, str(peers), str(target)]
     elif system.peer:
-        command = [str(_python()), str(PEERS / f"{system.peer}.py"), str(out / log / "drive.npz"), str(target)]
+        command = [str(_python()), str(PEERS / f"{system.peer}.py"), str(out / log / "drive.npz"), str(target), *pairs]
     else:
         command = [
             sys.executable,
@@ -109,8 +127,8 @@ def judge(estimate: Path, reference: Path | Relations) -> dict[str, Any]:
     return {"ate_m": float(found.translation_m.mean()), "rpe_m": float(found.translation_m[found.spans_s < SHORT_S].mean())}
 
 
-def rows_of(log: str, building: Building, systems: Sequence[System], out: Path, folder: Path | None) -> list[dict[str, Any]]:
-    """A row for each kind of poses of each system on one log."""
+def prepare_log(log: str, building: Building, out: Path) -> tuple[Path | Relations, float]:
+    """The reference of a log for the judge, and its length [s]; what peers are given is written into ``out``."""
     drive = building.open()
     (out / log).mkdir(parents=True, exist_ok=True)
     if not (out / log / "drive.npz").exists():
@@ -118,21 +136,45 @@ def rows_of(log: str, building: Building, systems: Sequence[System], out: Path, 
     reference: Path | Relations = drive.reference if isinstance(drive.reference, Relations) else out / log / "reference.npz"
     if isinstance(reference, Path):
         write_reference(drive, reference)
-    seconds = (drive.events[-1].stamp_ns - drive.events[0].stamp_ns) * 1e-9
+    return reference, (drive.events[-1].stamp_ns - drive.events[0].stamp_ns) * 1e-9
+
+
+def rows_of(
+    log: str, building: Building, systems: Sequence[tuple[System, tuning.Tuned | None]], out: Path, folder: Path | None
+) -> list[dict[str, Any]]:
+    """A row for each kind of poses of each system on one log."""
+    reference, seconds = prepare_log(log, building, out)
     rows: list[dict[str, Any]] = []
-    for system in systems:
-        reason = run_system(system, log, out, folder)
-        print(f"{log}: {system.name}: {reason or 'done'}", flush=True)
+    floor = {} if isinstance(reference, Relations) else {"floor_m": math.hypot(*REFERENCE_SIGMA[:2])}
+    for system, tuned in systems:
+        settings = NO_SETTINGS if tuned is None else tuned.settings
+        name, file = system.name + ("" if tuned is None else f", tuned on {tuned.log}"), tuning.name_with(system.name, settings)
+        reason = run_system(system, log, out, folder, settings)
+        print(f"{log}: {name}: {reason or 'done'}", flush=True)
         if reason:
-            rows.append({"log": log, "system": system.name, "failure": reason})
+            rows.append({"log": log, "system": name, "failure": reason})
             continue
-        cost = json.loads((out / log / f"{system.name}.json").read_text())
-        usage = {"cpu_per_s": cost["cpu_s"] / seconds, "memory_mb": cost["memory_mb"]}
+        cost = json.loads((out / log / f"{file}.json").read_text())
+        usage = {"cpu_per_s": cost["cpu_s"] / seconds, "memory_mb": cost["memory_mb"]} if math.isfinite(cost["cpu_s"]) else {}
         for kind in ("", " live"):
-            estimate = out / log / f"{system.name}{kind}.npz"
+            estimate = out / log / f"{file}{kind}.npz"
             if estimate.exists():
-                rows.append({"log": log, "system": system.name + kind, **judge(estimate, reference), **usage})
+                rows.append({"log": log, "system": name + kind, **judge(estimate, reference), **usage, **floor})
     return rows
+
+
+def tune(system: System, log: str, reference: Path | Relations, out: Path, budget: int) -> tuning.Tuned | None:
+    """The settings of ``system`` with the least error on ``log``, of at most ``budget``; None where all fail."""
+    scores: dict[str, tuple[float, Mapping[str, float]]] = {}
+    for settings in tuning.draw(system.tuned, budget):
+        if not run_system(system, log, out, None, settings):
+            name = tuning.name_with(system.name, settings)
+            scores[name] = judge(out / log / f"{name}.npz", reference)["ate_m"], settings
+    if not scores:
+        return None
+    least, settings = min(scores.values(), key=operator.itemgetter(0))
+    print(f"{log}: {system.name}: least error {least:.3f} m of {len(scores)} settings: {settings}", flush=True)
+    return tuning.Tuned(log, settings)
 
 
 def rows_in_space(log: str, systems: Sequence[System], out: Path) -> list[dict[str, Any]]:
@@ -157,6 +199,9 @@ def _arguments(words: Sequence[str] | None, logs: Sequence[str]) -> argparse.Nam
     parser.add_argument("--log", type=lambda text: text.split(","), default=list(logs))
     parser.add_argument("--system", type=lambda text: text.split(","), default=[system.name for system in _ALL])
     parser.add_argument("--folder", type=Path)
+    parser.add_argument("--peer", action="append", default=[], metavar="NAME=PATH")
+    parser.add_argument("--tune", metavar="LOG")
+    parser.add_argument("--budget", type=int, default=40)
     parser.add_argument("--out", type=Path, default=Path("league-out"))
     return parser.parse_args(words)
 
@@ -171,9 +216,17 @@ def main(words: Sequence[str] | None = None) -> None:
     for given, known, what in ((options.log, (*logs, *HILLS), "log"), (options.system, names, "system")):
         if unknown := [name for name in given if name not in known]:
             raise SystemExit(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}.")
+    if options.tune is not None and options.tune not in logs:
+        raise SystemExit(f"no log {options.tune} to tune on; there are {', '.join(logs)}.")
     systems, in_space = ([system for system in each if system.name in options.system] for each in (SYSTEMS, SYSTEMS_IN_SPACE))
+    systems += joined.parse(options.peer)
     prepare_environment()
-    rows = [row for log in options.log if log in logs for row in rows_of(log, logs[log], systems, options.out, options.folder)]
+    entries: list[tuple[System, tuning.Tuned | None]] = [(system, None) for system in systems]
+    if options.tune is not None:
+        reference, _ = prepare_log(options.tune, logs[options.tune], options.out)
+        best = [(system, tune(system, options.tune, reference, options.out, options.budget)) for system in systems if system.tuned]
+        entries += [(system, found) for system, found in best if found is not None]
+    rows = [row for log in options.log if log in logs for row in rows_of(log, logs[log], entries, options.out, options.folder)]
     rows += [row for log in options.log if log in HILLS for row in rows_in_space(log, in_space, options.out)]
     (options.out / "league.json").write_text(json.dumps(rows, indent=1))
     page.write(rows, [*systems, *in_space], options.out)

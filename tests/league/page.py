@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
+from math import hypot
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ _COLUMNS: Mapping[str, tuple[str, str]] = {
     "cpu_per_s": ("CPU [s per s of log]", "{:.4f}"),
     "memory_mb": ("memory [MB]", "{:.0f}"),
 }
+_MISSING = "<td>–</td>"  # noqa: RUF001
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 1000px; margin: 2em auto; padding: 0 1em; color-scheme: light dark }
 table { border-collapse: collapse; width: 100% }
@@ -39,7 +41,8 @@ def write(rows: Sequence[Mapping[str, Any]], systems: Sequence[System], out: Pat
     given = "".join(f"<tr><td>{html.escape(system.name)}</td><td>{html.escape(system.what)}</td></tr>" for system in systems)
     head = f"<meta charset=utf-8><meta name=viewport content='width=device-width'><title>League</title><style>{_STYLE}</style>"
     about = (
-        "Each system with its own defaults on the same logs. Errors by evo at the reference's instants; covariances by smfeval, with the"
+        "Each system with its own defaults on the same logs; peers also with the settings that were best on another log, named in the row;"
+        " skidloc's are its defaults throughout. Errors by evo at the reference's instants; covariances by smfeval, with the"
         " reference's noise added; relations, which evo does not have, by skidloc. One drive is one sample."
     )
     table = f"<h2>What each system is given</h2><div class=scroll><table class=given>{given}</table></div>"
@@ -49,10 +52,12 @@ def write(rows: Sequence[Mapping[str, Any]], systems: Sequence[System], out: Pat
 
 def _log_section(log: str, rows: Sequence[Mapping[str, Any]]) -> str:
     scored = [row for row in rows if "ate_m" in row]
-    best = {key: min((row[key] for row in scored if key in row), default=0.0) for key in ("ate_m", "rpe_m")}
+    floor = max((row.get("floor_m", 0.0) for row in scored), default=0.0)
+    best = {key: hypot(min((row[key] for row in scored if key in row), default=0.0), floor) for key in ("ate_m", "rpe_m")}
     head = "".join(f"<th>{html.escape(title)}</th>" for title, _ in _COLUMNS.values())
     body = "".join(_table_row(row, best) for row in rows)
-    sentence = f"<p>{html.escape(_summary(scored))}</p>" if scored else ""
+    noise = f" A pose of the reference is off by {floor:.3f} m itself: errors that differ by less, in squares, are ties." if floor else ""
+    sentence = f"<p>{html.escape(_summary(scored) + noise)}</p>" if scored else ""
     plot = svg(f"league-{log}", 9.0, 4.5, lambda figure: _draw(figure.subplots(), scored))
     return f"<h2>{html.escape(log)}</h2>{sentence}<div class=scroll><table><tr><th>system</th>{head}</tr>{body}</table></div>{plot}"
 
@@ -80,10 +85,14 @@ def _table_row(row: Mapping[str, Any], best: Mapping[str, float]) -> str:
     if "failure" in row:
         return f"<tr><td>{name}</td><td colspan={len(_COLUMNS)} style='text-align:left'>{html.escape(row['failure'])}</td></tr>"
     cells = (
-        f"<td class={'best' if row.get(key) == best.get(key, -1.0) else 'value'}>{form.format(row[key]) if key in row else '–'}</td>"  # noqa: RUF001
+        _cell(form.format(row[key]), is_best=row[key] <= best.get(key, -1.0)) if key in row else _MISSING
         for key, (_, form) in _COLUMNS.items()
     )
     return f"<tr><td>{name}</td>{''.join(cells)}</tr>"
+
+
+def _cell(text: str, *, is_best: bool) -> str:
+    return f"<td class={'best' if is_best else 'value'}>{text}</td>"
 
 
 def _draw(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 PEERS = Path(__file__).parent / "peers"
@@ -23,6 +23,10 @@ class System:
     matcher: str = "submap"
     in_space: str | None = None
     """With a 3D LiDAR on hills: its name in `tests.studies.hills`, empty for skidloc."""
+    folders: tuple[Path, ...] = ()
+    """Of a system that the user has added (`joined`)."""
+    tuned: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """Settings that are tuned on one log, with their values."""
 
 
 EVALIO: Mapping[str, str] = {
@@ -35,6 +39,11 @@ EVALIO: Mapping[str, str] = {
 }
 """Sensors of the pipelines that evalio has compiled, by name."""
 
+_KISS: Mapping[str, Sequence[float]] = {"voxel": (0.05, 0.1, 0.2, 0.4, 0.8), "threshold": (0.25, 0.5, 1.0, 2.0), "range": (20.0, 80.0)}
+"""Voxel and first threshold [m], and the longest range that is used [m]."""
+_GICP: Mapping[str, Sequence[float]] = {"downsampling": (0.05, 0.1, 0.25), "voxel": (0.25, 0.5, 1.0, 2.0), "keys": (0.0, 10.0, 40.0)}
+"""Voxels of the scan and of the model [m], and frames after which the model's voxels are dropped (0: never)."""
+
 SYSTEMS: Sequence[System] = (
     System("wheels", "wheel odometry, diff_drive", estimator="odometry"),
     System(
@@ -45,11 +54,11 @@ SYSTEMS: Sequence[System] = (
     System("skidloc ekf", "wheels and LiDAR, live", estimator="ekf"),
     System("skidloc graph", "wheels and LiDAR, live and smoothed", estimator="graph"),
     System("skidloc ekf with KISS-ICP", "wheels and LiDAR, live, KISS-ICP as matcher", estimator="ekf", matcher="kiss"),
-    System("KISS-ICP", "LiDAR alone; its own defaults, 3D pipeline on planar scans", peer="kiss"),
+    System("KISS-ICP", "LiDAR alone; its own defaults, 3D pipeline on planar scans", peer="kiss", tuned=_KISS),
     System("KISS-SLAM", "LiDAR alone; its own defaults, final poses", peer="kiss_graph"),
-    System("KISS-ICP + wheels", "LiDAR, each registration started from wheel odometry", peer="kiss_wheels"),
+    System("KISS-ICP + wheels", "LiDAR, each registration started from wheel odometry", peer="kiss_wheels", tuned=_KISS),
     System("GenZ-ICP", "LiDAR alone; its interface takes no initial guess", peer="genz"),
-    System("small_gicp + wheels", "LiDAR, scan to model as in its examples, started from wheel odometry", peer="gicp"),
+    System("small_gicp + wheels", "LiDAR, scan to model as in its examples, started from wheel odometry", peer="gicp", tuned=_GICP),
     System("Karto (yag_slam)", "wheels and LiDAR, slam_toolbox's matcher and graph: final poses", peer="karto"),
     System("MRPT icp-slam", "wheels and LiDAR, point map of its example icp-slam_demo_classic.ini: live poses", peer="mrpt"),
 )

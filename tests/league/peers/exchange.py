@@ -91,6 +91,12 @@ def run(register: Callable[[Drive], FloatArray]) -> None:
     write(out, drive.stamps_ns, body, seconds)
 
 
+def setting(name: str, default: float) -> float:
+    """The value of ``NAME=VALUE`` behind the two paths of the command line, as for settings that are tuned."""
+    given = dict(word.split("=", 1) for word in sys.argv[3:] if "=" in word)
+    return float(given.get(name, default))
+
+
 def arguments() -> tuple[Drive, str]:
     """The drive and OUT of the command line."""
     return Drive.load(Path(sys.argv[1])), sys.argv[2]

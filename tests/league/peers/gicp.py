@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import small_gicp
-from exchange import Drive, FloatArray, planar, run
+from exchange import Drive, FloatArray, planar, run, setting
 
 _DOWNSAMPLING_M, _VOXEL_M = 0.25, 1.0
 
 
 def register(drive: Drive) -> FloatArray:
     """(N, 3) poses of the LiDAR."""
-    target = small_gicp.GaussianVoxelMap(_VOXEL_M)
+    target, downsampling_m = small_gicp.GaussianVoxelMap(setting("voxel", _VOXEL_M)), setting("downsampling", _DOWNSAMPLING_M)
+    if keys := int(setting("keys", 0)):
+        target.set_lru(horizon=keys, clear_cycle=1)
     pose, poses = np.eye(4), []
     for points, prediction in zip(drive.scans(), drive.predictions(), strict=True):
-        source, _ = small_gicp.preprocess_points(points, _DOWNSAMPLING_M)
+        source, _ = small_gicp.preprocess_points(points, downsampling_m)
         pose = pose @ prediction
         if poses and source.size():
             pose = small_gicp.align(target, source, pose).T_target_source
