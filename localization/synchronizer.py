@@ -73,6 +73,7 @@ class Synchronizer:
         """Scans that wait."""
         self._velocity = UnknownVelocity(c.unknown_sigma)  # in gaps of the wheel data
         self._has_lidar = has_lidar
+        self._wait_ns = round(c.wait_s * 1e9)
         self._start_ns: int | None = None  # of the next step
         self._now_ns = -(1 << 62)  # newest stamp of all events
         self._clock_offset_ns = 0
@@ -89,16 +90,12 @@ class Synchronizer:
         if is_pose_measured:
             self._velocity.lasted_s = 0.0
 
-    @property
-    def _wait_ns(self) -> int:
-        """How long a scan waits for the wheels: the next sample is due within a period [ns]."""
-        return round(max(self.config.wait_s, _WAIT_PERIODS * self.wheels.buffer.period_s) * 1e9)
-
     def insert(self, event: Event) -> None:
         """Store ``event`` in the buffer of its sensor."""
         self._now_ns = max(self._now_ns, event.stamp_ns)
         if isinstance(event, WheelSample):
             self.wheels.buffer.insert(event)
+            self._wait_ns = round(max(self.config.wait_s, _WAIT_PERIODS * self.wheels.buffer.period_s) * 1e9)
             if self._start_ns is None and not self._has_lidar and not self.scans.waiting:
                 self._start_ns = event.stamp_ns
         elif isinstance(event, ImuSample):

@@ -73,15 +73,12 @@ class WheelBuffer:
         self._ends: list[int] = []
         self._intervals: list[WheelInterval] = []
         self._lengths_ns: deque[int] = deque(maxlen=_PERIODS)
+        self.period_s = 0.0
+        """Median time from sample to sample [s]; 0 before the second."""
 
     def __len__(self) -> int:
         """Stored intervals."""
         return len(self._intervals)
-
-    @property
-    def period_s(self) -> float:
-        """Median time from sample to sample [s]; 0 before the second."""
-        return sorted(self._lengths_ns)[(len(self._lengths_ns) - 1) // 2] * _NS if self._lengths_ns else 0.0
 
     def set_cg(self, sample: CgSample) -> None:
         """Set the CG of the samples to come."""
@@ -111,16 +108,13 @@ class WheelBuffer:
             return
         self._ends.append(sample.stamp_ns)
         self._lengths_ns.append(sample.stamp_ns - last.stamp_ns)
+        self.period_s = sorted(self._lengths_ns)[(len(self._lengths_ns) - 1) // 2] * _NS
         self.rates_known_until_ns = sample.stamp_ns
         x, y = self.cg.tolist()
         self._intervals.append(WheelInterval(last.stamp_ns, left, right, x, y, has_angles))
         if self._ends[0] < sample.stamp_ns - 2 * self._keep_ns:
             n = bisect.bisect_left(self._ends, sample.stamp_ns - self._keep_ns)
             del self._ends[:n], self._intervals[:n]
-
-    def _hold_ns(self, max_hold_s: float) -> int:
-        """For how long the last rates are held [ns]."""
-        return round(max(max_hold_s, _HELD_PERIODS * self.period_s) / _NS)
 
     def end_of_interval(self, stamp_ns: int) -> int | None:
         """Stamp of the sample that ends the interval around ``stamp_ns`` [ns]; None past the newest."""
@@ -131,14 +125,13 @@ class WheelBuffer:
         """Rates (n, 2) and CG (n, 2) of the interval at ``stamp_ns``, else of the next or the last one; n = 0 where that is farther away
         than rates are held."""
         i = min(bisect.bisect_right(self._ends, stamp_ns), len(self._ends) - 1)
-        is_known = i >= 0 and self._is_known_at(i, stamp_ns, self._hold_ns(max_hold_s))
+        is_known, hold_ns = False, round(max(max_hold_s, _HELD_PERIODS * self.period_s) / _NS)
+        if i >= 0:
+            start_ns, end_ns, has_angles = self._intervals[i].start_ns, self._ends[i], self._intervals[i].has_angles
+            known_until_ns = end_ns + hold_ns if has_angles or stamp_ns > end_ns else start_ns + hold_ns
+            is_known = start_ns - hold_ns <= stamp_ns <= known_until_ns
         table = np.array(self._intervals[i][1:5] if is_known else ()).reshape(-1, 4)
         return table[:, :2], table[:, 2:]
-
-    def _is_known_at(self, i: int, stamp_ns: int, hold_ns: int) -> bool:
-        start_ns, end_ns, has_angles = self._intervals[i].start_ns, self._ends[i], self._intervals[i].has_angles
-        known_until_ns = end_ns + hold_ns if has_angles or stamp_ns > end_ns else start_ns + hold_ns
-        return start_ns - hold_ns <= stamp_ns <= known_until_ns
 
     def window(self, start_ns: int, end_ns: int, max_hold_s: float) -> WheelWindow:
         """Rates from ``start_ns`` to ``end_ns``.
@@ -146,7 +139,7 @@ class WheelBuffer:
         Angles at both ends of an interval measure its motion, however long it is. Rates hold for at most ``max_hold_s``, or two periods of
         the wheels, be it past the newest sample or between two of them.
         """
-        hold_ns = self._hold_ns(max_hold_s)
+        hold_ns = round(max(max_hold_s, _HELD_PERIODS * self.period_s) / _NS)
         rows: list[tuple[float, ...]] = []
         known, covered = start_ns, 0.0
         for i in range(bisect.bisect_right(self._ends, start_ns), len(self._ends)):

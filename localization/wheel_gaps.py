@@ -27,7 +27,7 @@ _PAUSED = (
 
 
 class VelocityWithinIntervals:
-    """Error of taking the wheels' mean rates between two samples as constant: `add` each step's pieces, then `cov`.
+    """Error of taking the wheels' mean rates between two samples as constant: `add` each step's pieces.
 
     The velocity is a random walk of density q (white acceleration; Bar-Shalom, Li & Kirubarajan 2001, sec. 6.2.2). Where the ends of an
     interval of length T are measured, the way from its start is off by e(t) with
@@ -45,13 +45,11 @@ class VelocityWithinIntervals:
         self._learned = np.array([*(self._unknown**2 / _CHANGES_WITHIN_S), 1.0, 0.0, 0.0, 0.0])
         """Sums of squared differences (2) and their weight; length of the last interval, its speed and its turn rate."""
 
-    def add(self, window: WheelWindow, twists: FloatArray) -> None:
-        """The pieces of a step and their twists (n, 3)."""
-        _learn(window.inside, window.dt, twists, self._learned)
-
-    def cov(self, window: WheelWindow, twists: FloatArray) -> Cov3:
-        """(3, 3) of the motion of a step, in the body frame at its end: the turn of a step turns its own errors little."""
+    def add(self, window: WheelWindow, twists: FloatArray) -> Cov3:
+        """Learn from the pieces of a step and their twists (n, 3): covariance (3, 3) of the motion of the step, in the body frame at its
+        end, as the turn of a step turns its own errors little."""
         cov = np.zeros((3, 3))
+        _learn(window.inside, window.dt, twists, self._learned)
         _add_cov(window.inside, window.dt, twists, self._learned, self._unknown, cov)
         return cov
 

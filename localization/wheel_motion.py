@@ -58,7 +58,6 @@ class WheelMotion:
             motion = integrate_twists(dt, inside, self._noise)
         else:
             twist, motion = self.on_slopes.integrate(model, self.params, dt, rates, cg, tilt)
-        self._within.add(window, twist.value[n:])
-        motion = replace(motion, cov=motion.cov + self._within.cov(window, twist.value[n:]))
+        motion = replace(motion, cov=motion.cov + self._within.add(window, twist.value[n:]))
         first, last = twist.value[0], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last

@@ -114,13 +114,13 @@ def write_reference(drive: Drive, path: Path) -> None:
 
 
 def judge(estimate: Path, reference: Path | Relations) -> dict[str, Any]:
-    """Scores by `peers/judge.py`; of relations, which evo does not have, mean errors of all and of those under 20 s."""
+    """Scores, or a failure: by `peers/judge.py`; of relations, which evo does not have, mean errors of all and of those under 20 s."""
     if isinstance(reference, Path):
         done = subprocess.run(
             [str(_python()), str(PEERS / "judge.py"), str(estimate), str(reference)], capture_output=True, text=True, check=False
         )
         if done.returncode:
-            raise SystemExit(f"the judge failed on {estimate}:\n{done.stderr}")
+            return {"failure": f"not judged: {(done.stderr.strip().splitlines() or ['the judge ended without a word'])[-1]}"}
         return dict(json.loads(done.stdout))
     with np.load(estimate) as arrays:
         found = relation_errors(Trajectory(arrays["stamps_ns"], arrays["poses"]), reference)
@@ -169,7 +169,9 @@ def tune(system: System, log: str, reference: Path | Relations, out: Path, budge
     for settings in tuning.draw(system.tuned, budget):
         if not run_system(system, log, out, None, settings):
             name = tuning.name_with(system.name, settings)
-            scores[name] = judge(out / log / f"{name}.npz", reference)["ate_m"], settings
+            score = judge(out / log / f"{name}.npz", reference)
+            if "failure" not in score:
+                scores[name] = score["ate_m"], settings
     if not scores:
         return None
     least, settings = min(scores.values(), key=operator.itemgetter(0))
