@@ -9,7 +9,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from localization.lidar.registration import CORRELATED_BEAMS, OUTLIER_SIGMAS
 from motion_models import se2
@@ -25,8 +24,6 @@ _MAX_CANDIDATES = 200_000
 _APART_CELLS = 6
 """A pose is another one, and not the flank of the best, from so many cells away on."""
 _MIN_YAW_STEP_RAD = 2e-3
-_PLACES = 3
-"""Poses apart from each other that a search returns, at most."""
 OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
 """-log of the odds that the prior is an outlier."""
 _SEARCH_FACTOR = 9.0
@@ -63,8 +60,6 @@ class SearchResult:
     """The best score of a pose elsewhere."""
     margin: float
     """Logarithm of the ratio of both poses' likelihoods."""
-    places: FloatArray
-    """(k, 3) poses apart from each other, the most probable first; the first is `pose`."""
 
 
 def draw_image(points: Points2, cell: float) -> LikelihoodImage:
@@ -124,16 +119,6 @@ def find_place(image: LikelihoodImage, points: Points2, prior: Pose2, wide: Floa
     return best.pose if best.margin >= OUTLIER_COST else None  # the place is unknown
 
 
-def find_places(image: LikelihoodImage, points: Points2, prior: Pose2, wide: FloatArray, cov: Cov3) -> FloatArray:
-    """(k, 3) the best poses apart from each other, the arguments as of `find_place`; where the prior is wider than the window of a search,
-    that one alone, or none if it is ambiguous."""
-    limit = search_limit(cov)
-    best = search(image, points, prior, wide, limit)
-    if (limit <= _SEARCH_LIMIT).all():
-        return best.places
-    return best.places[: int(best.margin >= OUTLIER_COST)]  # the place is unknown
-
-
 def search_limit(cov: Cov3) -> FloatArray:
     """(3,) half the window of a search at most [m, m, rad], for a prior with ``cov`` (3, 3)."""
     return np.asarray(np.minimum(np.maximum(_SEARCH_LIMIT, 3.0 * np.sqrt(np.diagonal(cov))), _WIDEST_SEARCH))
@@ -150,22 +135,14 @@ def _count(half: FloatArray, yaws: int, step: float) -> float:
 
 def _pick(prior: Pose2, shifts: FloatArray, scores: FloatArray, n: int, information: FloatArray, step: FloatArray) -> SearchResult:
     log_likelihood = n / CORRELATED_BEAMS * np.log(np.maximum(scores, 1e-6))
-    posterior = log_likelihood - 0.5 * np.einsum("ki,ij,kj->k", shifts, information, shifts)
-    best = int(np.argmax(posterior))
-    is_elsewhere = _is_apart(shifts - shifts[best], step)
+    best = int(np.argmax(log_likelihood - 0.5 * np.einsum("ki,ij,kj->k", shifts, information, shifts)))
+    away = shifts - shifts[best]
+    is_elsewhere = (np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]) | (
+        np.abs(se2.wrap_angle(away[:, 2])) > _APART_CELLS * step[2]
+    )
     rival = float(scores[is_elsewhere].max()) if is_elsewhere.any() else 0.0
-    places, is_left = [best], is_elsewhere
-    while len(places) < _PLACES and is_left.any():
-        places.append(int(np.argmax(np.where(is_left, posterior, -math.inf))))
-        is_left = is_left & _is_apart(shifts - shifts[places[-1]], step)
     margin = n / CORRELATED_BEAMS * math.log(max(float(scores[best]), 1e-6) / max(rival, 1e-6))
-    return SearchResult(prior + shifts[best], float(scores[best]), rival, margin, prior + shifts[places])
-
-
-def _is_apart(away: FloatArray, step: FloatArray) -> NDArray[np.bool_]:
-    """(K,) whether poses that are ``away`` (K, 3) from another one are not on its flank; ``step`` (3,) of the search."""
-    is_off: NDArray[np.bool_] = np.hypot(away[:, 0], away[:, 1]) > _APART_CELLS * step[0]
-    return np.asarray(is_off | (np.abs(se2.wrap_angle(away[:, 2])) > _APART_CELLS * step[2]))
+    return SearchResult(prior + shifts[best], float(scores[best]), rival, margin)
 
 
 def _turned_points(points: Points2, prior: Pose2, yaws: FloatArray) -> FloatArray:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from localization.lidar.correlative_search import LikelihoodImage, draw_image
 from localization.lidar.submap import VoxelGrid, make_grid, measure_shares
@@ -19,13 +16,6 @@ _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
 _MAPPED_INFORMATION = 1e2
 """Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/rad^2]."""
-_BEARINGS = 360
-"""Bins of a key scan's free space: planar scanners have 0.25 to 1 deg from beam to beam."""
-_FREE_CELLS = 4.0
-"""How far behind a point the beams of a key scan have to end for that point to lie in free space [cells]."""
-_VIEWS = 8
-"""Key scans whose free space is compared with a scan: those nearest to it."""
-_ORIGIN = np.zeros(2)
 
 
 @dataclass(frozen=True)
@@ -55,35 +45,12 @@ class KeyScan:
     """(3,) from which it was drawn."""
     map_cov: Cov3
     """(3, 3) covariance of the submap's error around it, before it was drawn; a right perturbation."""
-    lidar: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """(2,) of the LiDAR in the body frame [m]."""
-
-    @cached_property
-    def _free_m(self) -> FloatArray:
-        """(B,) how far the space is free by bearing from the LiDAR [m]: the nearest point of each bin and of its neighbours, 0 where there
-        is none in one of them."""
-        off = self.points - se2.transform(self.pose, self.lidar)
-        nearest = np.full(_BEARINGS, np.inf)
-        np.minimum.at(nearest, _bearing(off), np.hypot(off[:, 0], off[:, 1]))
-        least = np.minimum(nearest, np.minimum(np.roll(nearest, 1), np.roll(nearest, -1)))
-        is_known = np.isfinite(nearest) & np.isfinite(np.roll(nearest, 1)) & np.isfinite(np.roll(nearest, -1))
-        return np.where(is_known, least, 0.0)
-
-    def is_free(self, points: Points2, margin_m: float) -> NDArray[np.bool_]:
-        """(N,) whether beams went through ``points`` (N, 2) of the odometry frame, and ended ``margin_m`` behind or farther."""
-        off = points - se2.transform(self.pose, self.lidar)
-        return np.asarray(np.hypot(off[:, 0], off[:, 1]) + margin_m < self._free_m[_bearing(off)])
 
     def drift_variance(self, pose: Pose2, map_cov: Cov3, range_m: float) -> float:
         """Variance [m^2] by which points at ``range_m`` have drifted from this scan to the submap around ``pose`` (3,)."""
         A = se2.adjoint(se2.inverse(se2.between(self.pose, pose)))
         grown = map_cov - A @ self.map_cov @ A.T
         return float(grown[0, 0] + grown[1, 1] + range_m**2 * grown[2, 2])
-
-
-def _bearing(off: FloatArray) -> NDArray[np.intp]:
-    """(N,) bins of the bearings of ``off`` (N, 2)."""
-    return np.asarray((np.arctan2(off[:, 1], off[:, 0]) / math.tau % 1.0 * _BEARINGS).astype(np.intp) % _BEARINGS)
 
 
 class KeyScans:
@@ -109,21 +76,15 @@ class KeyScans:
         """(M, 2) in the odometry frame [m]."""
         return np.vstack([key.points for key in self.keys]) if self.keys else np.empty((0, 2))
 
-    def is_free(self, points: Points2, pose: Pose2) -> NDArray[np.bool_]:
-        """(N,) whether the nearest key scans measured free space where the scan ``points`` (N, 2) lies from ``pose`` (3,)."""
-        drawn = np.asarray(se2.transform(pose, points))
-        near = sorted(self.keys, key=lambda key: math.hypot(key.pose[0] - pose[0], key.pose[1] - pose[1]))[:_VIEWS]
-        return np.asarray(np.any([key.is_free(drawn, _FREE_CELLS * self.cell) for key in near], axis=0))
-
-    def insert(self, pose: Pose2, points: Points2, map_cov: Cov3 | None, lidar: FloatArray = _ORIGIN) -> tuple[float, float]:
+    def insert(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> tuple[float, float]:
         """Draw the scan ``points`` (N, 2) of the body frame from ``pose`` (3,); returns its shares, as `measure_shares` does.
 
-        ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit. ``lidar`` (2,) in the body frame [m].
+        ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit.
         """
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._range_noise_m)
         shares = measure_shares(self.grid, scan)
-        key = KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov, lidar)
+        key = KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)
         self.keys = [*self._fitting_keys(pose, points, map_cov), key]
         self.grid, self._image = self._make_grid(), None
         return shares

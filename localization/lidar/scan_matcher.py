@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import operator
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
 from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
-from localization.lidar.correlative_search import OUTLIER_COST, find_places, prior_outlier_cov
+from localization.lidar.correlative_search import OUTLIER_COST, find_place, prior_outlier_cov
 from localization.lidar.key_scans import KeyScanError, KeyScans, key_scan_noise
-from localization.lidar.registration import CORRELATED_BEAMS, Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
+from localization.lidar.registration import Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
 from localization.lidar.submap import voxel_means
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
@@ -23,14 +21,7 @@ _CELL_OF_RANGE = 0.02
 """Voxel of a submap, as a share of the first scan's median range: in five buildings and six rooms 3 % is as robust and less precise."""
 FORGETTING = 0.98
 """Factor per measurement of older statistics of residuals, innovations and slip: they are means over the last 50."""
-_NO_OFFSET, _AT_BODY = np.zeros(3), np.zeros(2)
-_FREE_COST = 3.0
-"""-log of the share of beams that end where the map is known to be free: one in twenty, on people, doors, moved chairs (beam model of
-Thrun, Burgard & Fox 2005, sec. 6.3)."""
-_MIN_MARGIN = 4.6
-"""-log of the odds of the next place against the best, from which on the best is taken: 1 in 100."""
-_SAME_YAW_RAD = 0.02
-"""Poses of one minimum differ by less [rad]: it is found to 0.002 deg."""
+_NO_OFFSET = np.zeros(3)
 MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
@@ -113,50 +104,22 @@ class ScanMatcher:
         converges, agrees = is_narrow(taken_off), mahalanobis(prior, fit.pose, cov) < 2.0 * OUTLIER_COST
         fits = converges and fit.overlap >= self._config.search_below
         if not (fits and agrees):
-            start = self._places(points, prior, cov, offset) if not fits else fit.pose[None]
-            found = self._better_place(points, prior, cov, offset, (fit, converges), start)
-            if found is not None:
-                return found
+            added = prior_outlier_cov(cov) + np.outer(offset, offset)
+            start: Pose2 | None = fit.pose
+            if not fits:
+                start = find_place(self.submap.image, voxel_means(points, self.submap.cell), prior, cov + added, cov)
+            if start is not None and not converges and mahalanobis(prior, start, cov) < 2.0 * OUTLIER_COST:
+                added = np.zeros((3, 3))  # within a prior that is wide itself
+            found = None if start is None else align_points(self.submap.grid, points, prior, cov + added, start, self.submap.cell)
+            least = MIN_PLACE_OVERLAP  # the place may not be mapped
+            if is_narrow(cov):
+                least, ahead = self._config.lost_below, se2.retract(prior, offset)
+                goes_on = align_points(self.submap.grid, points, prior, cov + added, ahead, self.submap.cell)
+                if goes_on.overlap >= self._config.search_below and (found is None or _is_better(goes_on, found, prior, cov)):
+                    found = goes_on
+            if found is not None and found.overlap >= least and (not converges or _is_better(found, fit, prior, cov)):
+                return self._result(found, added)
         return self._result(fit, np.zeros((3, 3))) if converges and fit.overlap >= self._config.lost_below else None
-
-    def _places(self, points: Points2, prior: Pose2, cov: Cov3, offset: Tangent2) -> FloatArray:
-        """(k, 3) where a search puts the scan; none where the place is unknown, and several are about as probable."""
-        wide = cov + prior_outlier_cov(cov) + np.outer(offset, offset)
-        return find_places(self.submap.image, voxel_means(points, self.submap.cell), prior, wide, cov)
-
-    def _better_place(
-        self, points: Points2, prior: Pose2, cov: Cov3, offset: Tangent2, near: tuple[Alignment, bool], starts: FloatArray
-    ) -> ScanMatch | None:
-        """The most probable place that Gauss-Newton reaches from one of ``starts`` (k, 3); None where that is the one ``near`` the prior,
-        or where another one is hardly less probable. ``near``: the fit, and whether it converges from all of the prior."""
-        fit, converges = near
-        outlier, found = prior_outlier_cov(cov) + np.outer(offset, offset), list[tuple[float, Alignment, Cov3]]()
-        least = MIN_PLACE_OVERLAP  # the place may not be mapped
-        if is_narrow(cov):
-            least = self._config.lost_below
-            ahead = align_points(self.submap.grid, points, prior, cov + outlier, se2.retract(prior, offset), self.submap.cell)
-            if ahead.overlap >= self._config.search_below:
-                found.append((self._total_cost(ahead, points, prior, cov), ahead, outlier))
-        for start in starts:
-            is_within = not converges and mahalanobis(prior, start, cov) < 2.0 * OUTLIER_COST  # of a prior that is wide itself
-            added = np.zeros((3, 3)) if is_within else outlier
-            place = align_points(self.submap.grid, points, prior, cov + added, start, self.submap.cell)
-            if place.overlap >= least:
-                found.append((self._total_cost(place, points, prior, cov), place, added))
-        if not found:
-            return None
-        cost, best, added = min(found, key=operator.itemgetter(0))
-        rivals = [(self._total_cost(fit, points, prior, cov), fit)] if converges else [(c, place) for c, place, _ in found]
-        apart = [c - cost for c, place in rivals if converges or _are_apart(place, best, self.submap.cell)]
-        margin = 0.0 if converges else _MIN_MARGIN
-        return self._result(best, added) if min(apart, default=math.inf) > margin else None
-
-    def _total_cost(self, fit: Alignment, points: Points2, prior: Pose2, cov: Cov3) -> float:
-        """-log probability of ``fit``, where the prior may be an outlier: of beams, of those that end where key scans measured free space,
-        and of the prior."""
-        contradicted = int(self.submap.is_free(points, fit.pose).sum())
-        beams = fit.cost + _FREE_COST * contradicted / CORRELATED_BEAMS
-        return beams + min(mahalanobis(prior, fit.pose, cov) / 2.0, OUTLIER_COST)
 
     def refine(self, points: Points2, prior: Pose2, cov: Cov3, match: ScanMatch) -> ScanMatch | None:
         """``match`` again, for the same scan deskewed anew."""
@@ -181,10 +144,9 @@ class ScanMatcher:
         R = np.linalg.inv(H.sum(axis=0) + OPEN_INFORMATION)
         return np.asarray(R @ pull @ R)
 
-    def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None, lidar: FloatArray = _AT_BODY) -> KeyScanError:
-        """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit.
-        ``lidar`` (2,) where it was measured, in the body frame [m]."""
-        share, new = self.submap.insert(pose, points, map_cov, lidar)
+    def insert_key_scan(self, pose: Pose2, points: Points2, map_cov: Cov3 | None = None) -> KeyScanError:
+        """Draw a scan from ``pose`` (3,). ``map_cov`` (3, 3) of the submap's error there: with it, old scans stay while they fit."""
+        share, new = self.submap.insert(pose, points, map_cov)
         fit = linearize(self.submap.grid, points, pose)
         if len(self.submap.keys) == 1:  # sums over neighbours cancel here: the surfaces are of the scan's own points
             self._residuals += np.array([fit.sum_squares, fit.sum_squares, fit.n_inliers])
@@ -214,7 +176,10 @@ def choose_cell(config: LidarConfig, points: Points2) -> float:
     return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), 2.0 * config.range_noise_m)
 
 
-def _are_apart(one: Alignment, other: Alignment, cell: float) -> bool:
-    """Whether two poses are not the same minimum."""
-    x, y, yaw = se2.between(one.pose, other.pose)
-    return math.hypot(x, y) > cell or abs(yaw) > _SAME_YAW_RAD
+def _is_better(found: Alignment, fit: Alignment, prior: Pose2, cov: Cov3) -> bool:
+    """Whether the pose that was ``found`` is more probable than ``fit``, where the prior may be an outlier."""
+    return _total_cost(found, prior, cov) < _total_cost(fit, prior, cov)
+
+
+def _total_cost(fit: Alignment, prior: Pose2, cov: Cov3) -> float:
+    return fit.cost + min(mahalanobis(prior, fit.pose, cov) / 2.0, OUTLIER_COST)

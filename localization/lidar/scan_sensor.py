@@ -128,7 +128,7 @@ class ScanMatchingSensor:
         assert self._matcher is not None
         if self._kiss is not None:
             self._kiss.insert(self._scan.points, pose)
-        return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov, self.lidar_position())
+        return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
 
     def begin_submap(self) -> None:
         """Drop the submap: the next scan begins another one."""

@@ -134,7 +134,7 @@ def _match_without_new_place(original: Callable[..., Any], self: ScanMatcher, *r
 
 
 _NO_SEARCH = (
-    _attribute(scan_matcher, "find_places", lambda *a: np.empty((0, 3))),
+    _attribute(scan_matcher, "find_place", lambda *a: None),
     _attribute(registration, "_BASIN", math.inf),
 )
 _ASSUMED_NOISE = (_attribute(ScanMatcher, "_residual_variance", 1.0), _attribute(ScanMatcher, "_block_variance", 1.0))
@@ -150,9 +150,10 @@ PATCHES: Mapping[str, Patch] = {
         "measure",
         lambda original, self, step, prior, cov, offset: original(self, step, prior, cov, np.zeros(3)),
     ),
-    "rival test of the search": _attribute(scan_matcher, "_MIN_MARGIN", 0.0),
-    "free space of key scans": _attribute(scan_matcher, "_FREE_COST", 0.0),
-    "total cost (more points fit, instead)": _attribute(ScanMatcher, "_total_cost", lambda self, fit, *rest: -fit.overlap),
+    "rival test of the search": _attribute(correlative_search, "_MAX_RIVAL", math.inf),
+    "total cost (more points fit, instead)": _attribute(
+        scan_matcher, "_is_better", lambda found, fit, prior, cov: found.overlap > fit.overlap
+    ),
     "prior as possible outlier": lambda: _together(
         _attribute(scan_matcher, "OUTLIER_COST", math.inf), _attribute(correlative_search, "OUTLIER_COST", math.inf)
     ),
