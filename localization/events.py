@@ -165,7 +165,7 @@ class Turn:
     rate_variance: float = 0.0
     """[rad^2/s^2], by the scatter of the last samples."""
     scatter_variance: float = 0.0
-    """Of the angle, by the scatter of the last samples as white noise [rad^2]; 0 where that is not known."""
+    """Variance of the angle, by the scatter of the last samples as white noise [rad^2]; 0 where that is not known."""
     rate_age_s: float = 0.0
     """Time from the newest sample to the end, where that is later: the rate is the sample's [s]."""
 

@@ -65,15 +65,15 @@ class Track:
         return int(self.window[-1]) + 1
 
     def mirrored(self) -> Track:
-        """Of an axis with the opposite sign."""
+        """Path of an axis with the opposite sign."""
         return replace(self, positions=self.positions.conj(), yaws=None if self.yaws is None else -self.yaws)
 
     def turned_opposite(self) -> Track:
-        """Of headings that count clockwise."""
+        """Path of headings that count clockwise."""
         return replace(self, yaws=None if self.yaws is None else -self.yaws)
 
     def inverted(self) -> Track:
-        """Of each pose's inverse."""
+        """Path of each pose's inverse."""
         assert self.yaws is not None
         return replace(self, positions=-self.positions * np.exp(-1j * self.yaws), yaws=-self.yaws)
 
@@ -292,7 +292,7 @@ def lags(track: Track, path: Path, candidates: FloatArray) -> FloatArray:
 
 
 def _wide_evidence(track: Track, which: BoolArray) -> float:
-    """Of the samples ``which`` (n,), as a motion that is another's, over all levels of the noise alike."""
+    """Evidence of the samples ``which`` (n,), as a motion that is another's, over all levels of the noise alike."""
     spread = (track.positions - _window_means(track.positions, track.window)[track.window])[which]
     found = -0.5 * (np.abs(spread) / track.wide) ** 2 - 2.0 * math.log(track.wide)
     if track.yaws is None:

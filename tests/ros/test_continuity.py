@@ -8,7 +8,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from tests.ros.test_live_wiring import LIVE
 
 from localization.estimators import PriorMap
 from localization.log_replay import replay
@@ -27,8 +26,8 @@ from localization.ros.settings import LiveRun, NodeConfig
 from localization.ros.transports.transport import Received
 from motion_models import se2
 from motion_models.registry import make_model
+from tests.helpers.entrance_drives import Publishing, Vehicle, write
 from tests.helpers.entrance_drives import drive as robot_drive
-from tests.helpers.entrance_drives import write
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, stamp_of, track
 from tests.ros.test_operator_commands import pose_message
 
@@ -191,7 +190,8 @@ def topic_name(topic: str) -> str:
 @pytest.mark.extended
 def test_tf_of_a_node_that_finds_its_wheels_reversed_has_no_jump(tmp_path: Path):
     """The drive is read again from its start on, beside what comes now."""
-    vehicle, how, words, _ = LIVE["right side reversed"]
+    vehicle, words = Vehicle(seed=5), "joints.reversed"
+    how = Publishing(lambda a, r: (a * [1, 1, -1, -1], r * [1, 1, -1, -1]))
     robot, reports = vehicle.robot(), []
     transport = TimedTransport(write(tmp_path / "log.mcap", vehicle, robot_drive(vehicle), how))
     run = LiveRun(robot, lambda has_lidar: Trial(make_model("skid_steer", robot), "odometry"), node=NodeConfig(wait_s=0.0))

@@ -9,8 +9,8 @@ from localization.core.state import State
 from motion_models import se2
 
 _SIGMA = np.array([1e-5, 1e-5, 1e-5])
-"""Of a step at rest [m, m, rad]: a robot on tyres sways by more, but about one place, and noise of this size adds up to .3 mm in a minute
-of 20 steps a second."""
+"""Standard deviations of a step at rest [m, m, rad]: a robot on tyres sways by more, but about one place, and noise of this size adds up
+to .3 mm in a minute of 20 steps a second."""
 
 
 def measure_standstill(state: State) -> Measurement:

@@ -28,7 +28,7 @@ class BiasAtRest(NamedTuple):
     """A bias by the time at rest that was not yet used to measure it."""
 
     prior_variance: float
-    """Of the prior that holds, where it is wider than the filter's [rad^2/s^2]; else 0."""
+    """Variance of the prior that holds, where it is wider than the filter's [rad^2/s^2]; else 0."""
     rate: float
     """Mean of the gyro's rate in the standstill before this step [rad/s]."""
     variance: float

@@ -18,8 +18,10 @@ OUTLIER = 0.1
 """Share of bins in which a source slips, is matched to the wrong place or is lost."""
 LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0)
 """Factors on all noise, of which each log has one, equally probable before: from a simulator to a worn robot on gravel."""
-STILL_M_S, STILL_RAD_S = 0.02, 0.03
-"""Noise of sources at rest: what is smaller is no motion."""
+STILL_M_S = 0.02
+"""Noise of speeds at rest [m/s]: what is smaller is no motion."""
+STILL_RAD_S = 0.03
+"""Noise of yaw rates at rest [rad/s]."""
 WAY_M_S = 0.5
 """Prior standard deviation of a robot's forward speed [m/s]: that of the drives of `tests/data`."""
 TURN_RAD_S = 0.6

@@ -42,7 +42,7 @@ _COARSE_S, _FINE_S = 0.25, 0.02
 _MIN_COVERED = 0.5
 """Part of the shorter of track and path that the other covers at all delays that are searched."""
 _DEGREES = (1, 3)
-"""Of the curve of a window that is straight on, and of one with a turn: the track's own motion."""
+"""Degrees of the curve that is left to the track's own errors, in a window that is straight on and in one with a turn."""
 _RATE_SPAN_S, _MIN_DRIFT_S, _MIN_RATE_DRIVE_S = 2.5, 0.15, 40.0
 """Difference of the delays of both halves of a drive that is searched, least one that is tried, and shortest drive [s]."""
 
