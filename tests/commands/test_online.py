@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import math
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,8 @@ from localization.logs import open_log
 from localization.ros.diagnostics import ERROR, WARN, Status
 from localization.trajectory import read_tum
 from motion_models.robot_file import load_robot, robot_toml
+from tests.helpers.entrance_drives import Publishing, Vehicle, drive, write
 from tests.helpers.extended import cases
-from tests.helpers.hostile_mounts import rear_lidar_described_at_the_front
 from tests.helpers.online import LogTransport, drive_log, run_node
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
@@ -68,7 +69,7 @@ def test_terminal_view_before_the_first_estimate_names_what_it_needs():
 
 
 WRONG = {
-    "H11-lidar-yaw-180": "the yaw of 'laser' is wrong by 180 deg",
+    "H11-lidar-yaw-180": "the LiDAR is turned by 180 deg",
     "H06-right-side-inverted": "joints.reversed = [",
     "H13-wheel-rates-in-rpm": "joints.rate_unit_rad_s = 0.10472",
 }
@@ -87,8 +88,9 @@ def test_online_of_a_log_corrects_what_contradicts_the_robot_file(case, tmp_path
 
 
 def test_online_of_a_log_with_a_turned_lidar_writes_what_replay_does(tmp_path):
-    """LiDAR at the rear, described at the front: turned by 180 deg, and elsewhere."""
-    log, vehicle, motion = rear_lidar_described_at_the_front(tmp_path)
+    vehicle = Vehicle(0.11, 0.4, 0.3, 0.55, scan_hz=8.0, beams=180, seed=78)
+    motion = drive(vehicle)
+    log = write(tmp_path / "log.mcap", vehicle, motion, Publishing(lidar_yaw=math.pi))
     robot = tmp_path / "robot.toml"
     robot.write_text(robot_toml(vehicle.robot()))
     options = ["--robot", str(robot), "--out"]

@@ -70,7 +70,7 @@ def test_try_without_lengths_names_the_options_and_leaves_nothing(tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_try_of_the_husky_writes_one_page_with_all_parts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "page"
     assert main(["try", str(HUSKY_BAG), "--robot", "husky_a200", "--out", str(out)]) == 0

@@ -187,7 +187,7 @@ def topic_name(topic: str) -> str:
     return topic.replace("~", "/skidloc")
 
 
-@pytest.mark.extended
+@pytest.mark.slow  # its messages wait by the clock of the wall: beside other work their order differs
 def test_tf_of_a_node_that_finds_its_wheels_reversed_has_no_jump(tmp_path: Path):
     """The drive is read again from its start on, beside what comes now."""
     vehicle, words = Vehicle(seed=5), "joints.reversed"

@@ -25,7 +25,7 @@ SMALL = ["--config.windows", "3", "--config.held-windows", "6", "--config.budget
 SPOILS = {"mu": ("mu", 0.5), "servo": ("servo_gain", 0.2)}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPOILS)
 def test_spoiled_number_is_named_first_or_among_its_rivals(name: str) -> None:
     robot = load_robot("husky_a200")
