@@ -125,13 +125,14 @@ def test_setting_of_400_digits_on_the_command_line_is_refused(log: Path, tmp_pat
 def test_json_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "there.json").write_text("x")
     (tmp_path / "file").write_text("x")
+    (tmp_path / "log.bag").write_text("x")
     for target in (tmp_path / "there.json", tmp_path / "file" / "a.json", tmp_path / ("n" * 300)):
-        for command in (("info", "gone.bag"), ("cg",), ("simulate", "rotation_grid", "--out", tmp_path / "o.mcap")):
+        for command in (("info", tmp_path / "log.bag"), ("cg",), ("simulate", "rotation_grid", "--out", tmp_path / "o.mcap")):
             assert run(*command, "--json", target) == 2
             assert "output '" in capsys.readouterr().err
-    assert run("replay", "gone.bag", "--robot", "vaultbot", "--out", tmp_path / "o", "--json", tmp_path / "o" / "metrics.json") == 2
+    assert run("replay", tmp_path / "log.bag", "--robot", "vaultbot", "--out", tmp_path / "o", "--json", tmp_path / "o" / "metrics.json") == 2
     assert "one lies in the other" in capsys.readouterr().err
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "there.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "log.bag", "there.json"]
 
 
 def test_folder_in_which_no_file_can_be_made_is_refused_before_the_run() -> None:
@@ -209,10 +210,13 @@ def test_escapes_in_a_log_are_not_printed(tmp_path: Path, capsys: pytest.Capture
     assert "owned" in shown.out
 
 
-def test_unexpected_os_errors_are_printed_without_traceback(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unexpected_os_errors_are_printed_without_traceback(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail(*_: object) -> None:
         raise OSError(5, "Input/output error", "/dev/disk")
 
     monkeypatch.setattr(importlib.import_module("localization.commands.info"), "load_robot", fail)
-    assert run("info", "x") == 2
+    (tmp_path / "x").write_text("x")
+    assert run("info", tmp_path / "x") == 2
     assert capsys.readouterr().err == "skidloc: '/dev/disk': Input/output error.\n"

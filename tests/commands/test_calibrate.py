@@ -190,7 +190,7 @@ def heading_errors(robot_file: str) -> np.ndarray:
     short = (relations.ends_ns - relations.starts_ns < 20 * S) & (relations.starts_ns > start_ns + 200 * S)
     errors = []
     for start, end, motion in zip(relations.starts_ns[short], relations.ends_ns[short], relations.motions[short], strict=True):
-        dt, rates, cg, _ = history.window(int(start), int(end), 0.5)
+        dt, rates, cg, *_ = history.window(int(start), int(end), 0.5)
         predicted = preintegrate(model, dt, rates, cg, model.nominal, robot.wheel_noise).delta
         errors.append(float(se2.wrap_angle(predicted[2] - motion[2])))
     assert len(errors) > 100
