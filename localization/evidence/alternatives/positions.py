@@ -41,6 +41,9 @@ _COARSE_S, _FINE_S = 0.25, 0.02
 """Steps of the search of delays [s]."""
 _MIN_COVERED = 0.5
 """Part of the shorter of track and path that the other covers at all delays that are searched."""
+_COINCIDENCE = 7.0
+"""Logarithm of the likelihood ratio from where on a path and the track of another run agree by chance in fewer than one of a thousand
+drives."""
 _DEGREES = (1, 3)
 """Degrees of the curve that is left to the track's own errors, in a window that is straight on and in one with a turn."""
 _RATE_SPAN_S, _MIN_DRIFT_S, _MIN_RATE_DRIVE_S = 2.5, 0.15, 40.0
@@ -78,6 +81,8 @@ def alternatives(track: Track, paths: Sequence[Path], has_times: bool = True) ->
     # another motion is explained by chance: a likelihood ratio of e^g over none has at most the probability e^-g (Ville 1939)
     by_chance = max(0.0, max(f.evidence for f, rows, _ in fitted if not any(row.is_fault for row in rows)) - wide_evidence(track))
     of_own = independent * (own.evidence - prices[1] - by_chance)
+    if independent * by_chance > _COINCIDENCE:  # a smooth track beside a path with noise: its smoothness is no other run
+        of_own = min(of_own, independent * (max(f.evidence for f, _, _ in fitted) - by_chance))
     fitted.append((replace(even, evidence=even.evidence - prices[0]), (_even(),), 0.0))
     found = [Candidate(_ODDS["unrelated"] + of_own, (_unrelated(),))]
     for of_fit, rows, delay in fitted:
