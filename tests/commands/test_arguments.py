@@ -130,7 +130,9 @@ def test_json_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path, c
         for command in (("info", tmp_path / "log.bag"), ("cg",), ("simulate", "rotation_grid", "--out", tmp_path / "o.mcap")):
             assert run(*command, "--json", target) == 2
             assert "output '" in capsys.readouterr().err
-    assert run("replay", tmp_path / "log.bag", "--robot", "vaultbot", "--out", tmp_path / "o", "--json", tmp_path / "o" / "metrics.json") == 2
+    assert (
+        run("replay", tmp_path / "log.bag", "--robot", "vaultbot", "--out", tmp_path / "o", "--json", tmp_path / "o" / "metrics.json") == 2
+    )
     assert "one lies in the other" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "log.bag", "there.json"]
 

@@ -68,7 +68,7 @@ def result(command: str, robot: str, out: Path, log: Path, capsys: pytest.Captur
     return code, shown, sorted(path.name for path in out.parent.rglob("*"))
 
 
-@pytest.mark.parametrize("command", cases(COMMANDS, ("calibrate",)))
+@pytest.mark.parametrize("command", cases(ARGUMENTS, ("calibrate",)))
 def test_command_with_a_robot_by_file_gives_the_same(
     command: str, log: Path, robot_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
