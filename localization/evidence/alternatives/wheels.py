@@ -19,7 +19,7 @@ from motion_models.se2 import FloatArray
 _SPREAD_FLOOR, _SPREAD_OF_SIDE = 0.05, 0.2
 """Standard deviation of a wheel's rate from that of its side: part of all rates' size (encoder steps), and of the side's rate (slip)."""
 _ODDS = {"sign": math.log(1e-3), "unit": math.log(5e-4), "factor": math.log(3e-4), "side_unit": math.log(1e-4), "k": math.log(0.03)}
-"""Prior odds by kind, from counts of public reports on skid-steer drivers (`docs/theory/set-up.md`)."""
+"""Prior odds by kind: a judgement from public reports on skid-steer drivers, not counted (`docs/theory/set-up.md`)."""
 _GEARS = ((2.0, 0.05), (0.5, 0.05), (0.01, 2.5), (1.0, 0.8))
 """Factor, and sigma of its logarithm: radius for diameter or half the resolution, their inverses; counts; a gear."""
 
