@@ -13,8 +13,8 @@ from typing import Any
 
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.evidence import CORRECTED, SetUp
-from localization.evidence.entrance import has_moved, infer
-from localization.evidence.signals import Source, from_gyro, from_joints, from_odometry, from_scans
+from localization.evidence.entrance import has_moved, infer, sources_of_readings
+from localization.evidence.signals import Source, from_scans
 from localization.logs.decode import ArmReading, JointReading, OdometryReading
 from localization.logs.topic_roles import Sources
 from localization.ros.transports.transport import Received
@@ -63,15 +63,14 @@ class _Readings:
     def sources(self, sensors: LiveSensors) -> list[Source]:
         """Sources of motion so far."""
         first_ns = self.wheels[0].stamp_ns
-        name = " and ".join(source.topic for source in sensors.sources.all_wheels)
-        odometry = [reading for reading in self.wheels if isinstance(reading, OdometryReading)]
-        joints = [reading for reading in self.wheels if isinstance(reading, JointReading)]
-        found = [from_odometry(name, odometry, first_ns) if odometry else from_joints(name, joints, sensors.joints, first_ns)]
-        if sensors.sources.imu is not None and self.gyro:
-            found.append(from_gyro(sensors.sources.imu.topic, self.gyro, sensors.mounts, first_ns))
-        if sensors.sources.lidar is not None and self.scans:
-            found.append(from_scans(sensors.sources.lidar.topic, self.scans, sensors.mounts, first_ns))
-        return [source for source in found if source is not None]
+        lidar, imu = sensors.sources.lidar, sensors.sources.imu
+        readings: dict[str, Sequence[Any]] = {sensors.sources.all_wheels[0].topic: self.wheels}
+        if imu is not None:
+            readings[imu.topic] = self.gyro
+        found = sources_of_readings(sensors, readings, first_ns)
+        if lidar is not None and self.scans and (source := from_scans(lidar.topic, self.scans, sensors.mounts, first_ns)) is not None:
+            found.append(source)
+        return found
 
 
 class LiveSetUp:
