@@ -16,7 +16,9 @@ import skidloc
 from localization.cli import main
 from localization.events import WheelSample
 from localization.evidence import SetUp, infer_set_up, open_log_with_set_up
+from localization.evidence.alternatives.alternative import mount_correction
 from localization.logs import TopicOverrides, open_log
+from motion_models.robot import Mount
 from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers import entrance_drives
 from tests.helpers.entrance_drives import Publishing, Vehicle
@@ -210,6 +212,13 @@ def test_lidar_at_the_rear_that_is_described_at_the_front_or_a_robot_whose_front
 @pytest.mark.parametrize("degrees", [0.0, 3.0])
 def test_lidar_yaw_of_a_few_degrees_is_kept(tmp_path: Path, degrees: float) -> None:
     assert scanned(tmp_path, Publishing(lidar_yaw=math.radians(degrees))).sentences == ()
+
+
+def test_mounts_by_two_rows_have_both_corrections() -> None:
+    mount = Mount(0.3, 0.0, 0.2)
+    turned = mount_correction("laser", mount, lambda m: replace(m, yaw=1.0))
+    moved = mount_correction("laser", mount, lambda m: replace(m, x=-0.3))
+    assert moved(turned(ROBOT)).mounts["laser"] == turned(moved(ROBOT)).mounts["laser"] == Mount(-0.3, 0.0, 0.2, yaw=1.0)
 
 
 def test_clocks_of_two_sources_are_brought_together(tmp_path: Path) -> None:

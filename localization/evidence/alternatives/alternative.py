@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -142,14 +142,14 @@ def size_of(channel: FloatArray) -> float:
     return math.sqrt(float(np.mean(known**2)) + 1e-6) if len(known) else 1.0
 
 
-def with_mount(frame: str, change: Callable[[Mount], Mount], mount: Mount, robot: Robot) -> Robot:
-    """``robot`` whose ``frame`` has the changed mount, before what /tf_static says."""
-    from dataclasses import replace
-
+def _with_mount(frame: str, change: Callable[[Mount], Mount], mount: Mount, robot: Robot) -> Robot:
+    """``robot`` whose ``frame`` has the changed mount, before what /tf_static says: that of the robot file where it overrides already, as
+    by another row, else ``mount``."""
+    mount = robot.mounts[frame] if frame in robot.tf.overridden and frame in robot.mounts else mount
     overridden = tuple(dict.fromkeys((*robot.tf.overridden, frame)))
     return replace(robot, mounts={**robot.mounts, frame: change(mount)}, tf=replace(robot.tf, overridden=overridden))
 
 
 def mount_correction(frame: str, mount: Mount, change: Callable[[Mount], Mount]) -> Correction:
     """Correction of the mount of ``frame``, which is ``mount`` now."""
-    return partial(with_mount, frame, change, mount)
+    return partial(_with_mount, frame, change, mount)
