@@ -16,7 +16,7 @@ from localization.evidence.signals import Source
 from motion_models.se2 import FloatArray
 
 _SPAN_S, _COARSE_S, _FINE_S = 12.0, 0.25, 0.02
-"""Longest delay that is searched, and steps of the search [s]: beyond, clocks are set by the times of recording."""
+"""Longest delay that is searched where times of recording show none, and steps of the search [s]."""
 _FLOOR = 0.003
 """Part of the variance that no source shares with another: slip, bias, encoder steps."""
 _MIN_GAIN = 3.0
@@ -38,6 +38,8 @@ def _lag(a: Source, b: Source, edges: FloatArray) -> float | None:
     """By how much later ``b`` has the motion of ``a`` [s]; None where no lag gains."""
     of_a = a.rates(edges)
     lags = np.arange(-_SPAN_S, _SPAN_S + 1e-9, _COARSE_S)
+    if a.behind_s is not None and b.behind_s is not None:  # by the times of recording, at any distance
+        lags = np.concatenate([lags, a.behind_s - b.behind_s + np.arange(-1.0, 1.0 + 1e-9, _COARSE_S)])
     coarse = np.array([_log_likelihood(of_a, b.rates(edges, lag)) for lag in lags])
     best = lags[int(coarse.argmax())]
     fine_lags = best + np.arange(-_COARSE_S, _COARSE_S + 1e-9, _FINE_S)

@@ -33,6 +33,10 @@ _MOVING_S, _READ_S, _SCANS_S, _STANDING_S = 120.0, 900.0, 75.0, 5.0
 """Time after the first motion that is read, in all, with scans (registering one takes a millisecond), and kept from before it [s]."""
 _MOVED = 0.02
 """Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
+_APART_S = 2.0
+"""Difference of the latencies of two topics beyond which their stamps hardly overlap [s]; which clock is off is judged by evidence."""
+_SAME_TIME_S = 1e-6
+"""Difference of times that are one [s]."""
 _DEG_PER_RAD = 180.0 / math.pi
 
 
@@ -104,13 +108,21 @@ def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
     if len(used) < 2:
         there = used[0].name if used else "no source"
         return SetUp("undecidable", robot, reason=f"{there} alone measures the motion often enough: nothing can be compared.")
-    start, end = max(source.t[0] for source in used), min(source.t[-1] for source in used)
+    start, end = _span(used)
     edges = bin_edges(used, start, end)
     if len(edges) < 12:
         return SetUp("undecidable", robot, reason=f"the sources overlap by {max(end - start, 0.0):.1f} s: too short to be compared.")
     if all(float(np.nanmax(np.abs(source.rates(edges)), initial=0.0)) < 1e-3 for source in used):
         return SetUp("undecidable", robot, reason="nothing moves: drive straight on for 10 s and turn in place both ways.")
     return decide(used, make_stacks(used, edges, robot), robot, own)
+
+
+def _span(sources: Sequence[Source]) -> tuple[float, float]:
+    """Begin and end of what is compared [s]: where all sources are; or any, where times of recording show that clocks are apart."""
+    behind = [source.behind_s for source in sources if source.behind_s is not None]
+    first, last = [float(source.t[0]) for source in sources], [float(source.t[-1]) for source in sources]
+    is_apart = len(behind) > 1 and max(behind) - min(behind) > _APART_S
+    return (min(first), max(last)) if is_apart else (max(first), min(last))
 
 
 def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Source]:
@@ -140,7 +152,15 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     if reference is not None and reference.yaws is not None:
         of_reference = from_poses(reference.source, reference.stamps_ns, reference.poses, begin_ns)
         found += [] if of_reference is None else [of_reference]
-    return [replace(source, first_ns=begin_ns) for source in found]
+    behind = {source.name: _behind_s(log, source.name) for source in found}
+    return [replace(source, first_ns=begin_ns, behind_s=behind[source.name]) for source in found]
+
+
+def _behind_s(log: Log, name: str) -> float | None:
+    """Time of recording less stamp of a source [s]; None where it has none, or where all times of recording are stamps."""
+    if all(abs(behind) < _SAME_TIME_S for behind in log.behind_s.values()):
+        return None
+    return log.behind_s.get(name.partition(" and ")[0])
 
 
 def sources_of_readings(log: Any, readings: Mapping[str, Sequence[Any]], first_ns: int) -> list[Source]:

@@ -20,6 +20,8 @@ _DEAD = 1e-6
 """Part of the way of a side's fastest wheel, up to which an encoder counts nothing: rounding."""
 _COUNTERS = (65536.0, 32768.0, 4294967296.0, 16777216.0)
 """Ranges of counters of 16, 15, 32 and 24 bits."""
+_STEP_S, _MIN_MOVING = 0.5, 12
+"""Bins in which fields are compared [s], and how many must go backwards to show a sign."""
 _SAME_JUMP, _MIN_JUMPS = 0.02, 2
 """Relative difference of jumps of one size (a wheel turns a little in that step), and jumps that show a range without a usual size."""
 
@@ -29,7 +31,7 @@ def own_faults(source: Source, robot: Robot) -> tuple[Source, tuple[Row, ...]]:
     if source.kind != "wheels":
         return source, ()
     alive, rows = _without_dead(source)
-    return alive, (*rows, *_counter(source, robot))
+    return alive, (*rows, *_counter(source, robot), *_unsigned(alive))
 
 
 def _without_dead(source: Source) -> tuple[Source, tuple[Row, ...]]:
@@ -81,6 +83,21 @@ def _counter(source: Source, robot: Robot) -> tuple[Row, ...]:
     what = f"a counter of {math.log2(value):.0f} bits wraps" if counter is not None else "a counter wraps"
     text = f"positions jump by {value:.10g} ({len(sizes)} times): {what}"
     return (Row("wheels.counter", text, 0.0, value=value, correct=partial(_set_range, value)),)
+
+
+def _unsigned(source: Source) -> tuple[Row, ...]:
+    """Velocities that are positive while angles go backwards: the angles have the sign."""
+    if source.second is None or len(source.t) < _MIN_MOVING:
+        return ()
+    edges = np.arange(source.t[0], source.t[-1], _STEP_S)
+    by_angle, by_rate = source.rates(edges), source.rates(edges, of_second=True)
+    known = np.isfinite(by_angle) & np.isfinite(by_rate)
+    a, b = by_angle[known], by_rate[known]
+    backwards = a < -0.3 * math.sqrt(float(np.mean(a * a)) if len(a) else 0.0)
+    if backwards.sum() < _MIN_MOVING or b.min() < -1e-3 * np.abs(b).max() or b[backwards].min() <= 0.0:
+        return ()
+    text = "velocities of the wheels have no sign: they are positive while angles go backwards; angles are used"
+    return (Row("wheels.unsigned_velocities", text, 0.0, remedy="Let the driver publish signed velocities, or none."),)
 
 
 def _set_range(value: float, robot: Robot) -> Robot:

@@ -25,7 +25,7 @@ def refined_rows(stacks: Sequence[Stack], choice: Choice, robot: Robot) -> tuple
     found = []
     for stack in single:
         for row in stack.alternatives[0].rows:
-            found.append(_with_factor(row, single) if row.id == "wheels.factor" else row)
+            found.append(_with_factor(row, single) if row.id == "wheels.factor" and row.since_s is None and row.until_s is None else row)
     return tuple(found)
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives import MAKERS, Alternative, Row
-from localization.evidence.alternatives.alternative import LEVELS, STILL_M_S, STILL_RAD_S, unrelated_evidence
+from localization.evidence.alternatives.alternative import LEVELS, STILL_M_S, STILL_RAD_S, size_of, unrelated_evidence
+from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
 from localization.evidence.likelihood import Stack, log_posterior
 from localization.evidence.signals import Source
@@ -21,8 +22,12 @@ _WIDTHS = (8, 6, 5, 3)
 """Choices that are expanded by one more row, by depth: three faults at once are found, and the one beside them."""
 _SAME = 0.2
 """Relative difference of channels that are the same."""
+_SAME_DELAY_S = 0.15
+"""Difference of delays that are the same alignment [s]: between candidates of three sources, and latencies."""
 _RESCORED = 50
 """Best choices whose evidence is integrated over the level of the noise."""
+_CHANGED = 3
+"""Best choices of which one source is tried with a change within the log."""
 _CLEAR = 9.0
 """Logarithm of the evidence by which the robot file's set-up beats each single row, from where on no pair of rows is tried."""
 _SEARCH_LEVELS = (0.35, 1.0)
@@ -32,6 +37,8 @@ _CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
 """Prior odds of a clock that is off by `_CLOCK_S`; of a longer delay x they fall as 1 / x^2, as many delays are tried (`delays`)."""
 _LATENCY_SIGMA_S = 0.05
 """Standard deviation of the latencies of drivers, which the filter estimates by itself [s]: they reach 0.1 s."""
+_OTHER_RECORDER, _RECORDER_SPAN_S = 0.02, 200.0
+"""Share of logs whose recorder has another clock than the sensors, and how far that is off [s]."""
 _UNRELATED_ODDS = math.log(1e-5)
 """Prior odds of a source that measures another motion, or none: another robot's, a frozen sensor, a fault that no row has."""
 
@@ -61,16 +68,39 @@ def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> l
     at_zero = [source.rates(edges) for source in sources]
     bins = _moving_bins(sources, at_zero)
     stacks = []
-    for source, of_source in zip(sources, delays, strict=True):
+    sizes = [_sizes_of_motion(source, rates[bins]) for source, rates in zip(sources, at_zero, strict=True)]
+    for i, (source, of_source) in enumerate(zip(sources, delays, strict=True)):
         found: list[Alternative] = []
+        source = replace(source, sizes_by_others={n: s for of_other in (*sizes[:i], *sizes[i + 1 :]) for n, s in of_other.items()})
         for delay in of_source:
             rates = source.rates(edges, delay)[bins]
             second = source.rates(edges, delay, of_second=True)[bins] if source.second is not None else np.full_like(rates, np.nan)
-            rows = (clock_row(source, delay),) if delay else ()
-            found += [replace(a, rows=(*a.rows, *rows), delay_s=delay) for a in MAKERS[source.kind](source, rates, second, robot)]
+            rows, recorded = ((clock_row(source, delay),) if delay else ()), _recorded_evidence(source, delay)
+            of_delay = MAKERS[source.kind](source, rates, second, robot)
+            found += [replace(a, rows=(*a.rows, *rows), own=a.own + recorded, delay_s=delay) for a in of_delay]
         found.append(_unrelated(source, found[0]))
-        stacks.append(Stack(source.kind, found))
+        stacks.append(Stack(source.kind, found, t=edges[bins]))
     return stacks
+
+
+def _sizes_of_motion(source: Source, rates: FloatArray) -> dict[str, float]:
+    """Root mean square of the way [m/s] and of the turn [rad/s] that a source measures, however it is mounted."""
+    if source.kind == "gyro":
+        return {"turn": size_of(np.linalg.norm(rates, axis=1))}
+    if source.kind == "driver":
+        return {"way": size_of(rates[:, 0])}  # its turns skid
+    if source.kind == "wheels":
+        return {}
+    return {"way": size_of(np.linalg.norm(rates[:, :2], axis=1)), "turn": size_of(rates[:, 2])}
+
+
+def _recorded_evidence(source: Source, delay_s: float) -> float:
+    """Log density of the time from a source's stamps, less a delay, to their recording: a latency, or the recorder's clock is another."""
+    if source.behind_s is None:
+        return 0.0
+    latency = (source.behind_s + delay_s - _LATENCY_SIGMA_S) / (2.0 * _LATENCY_SIGMA_S)
+    inlier = math.log(1.0 - _OTHER_RECORDER) - 0.5 * latency**2 - math.log(2.0 * _LATENCY_SIGMA_S * math.sqrt(math.tau))
+    return float(np.logaddexp(inlier, math.log(_OTHER_RECORDER / _RECORDER_SPAN_S)))
 
 
 def _moving_bins(sources: Sequence[Source], rates: Sequence[FloatArray]) -> IntArray:
@@ -109,6 +139,8 @@ class Found:
     """Log posterior by choice, of the best ones, the level of the noise integrated out."""
     against: Mapping[str, float]
     """By id of a row: logarithm of the Bayes factor against that fault alone."""
+    stacks: Sequence[Stack]
+    """With the alternatives that change within the log."""
 
 
 def search(stacks: Sequence[Stack]) -> Found:
@@ -120,8 +152,9 @@ def search(stacks: Sequence[Stack]) -> Found:
         for key, value in _search_at(stacks, null, level, found).items():
             against[key] = min(value, against.get(key, math.inf))
     best = sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED]
-    kept = dict.fromkeys([null, *best])
-    return Found({choice: _marginal(stacks, choice) for choice in kept}, against)
+    stacks, changed = with_changes(stacks, list(dict.fromkeys([*best[:_CHANGED], null])))
+    kept = dict.fromkeys([null, *best, *changed])
+    return Found({choice: _marginal(stacks, choice) for choice in kept}, against, stacks)
 
 
 def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[Choice, float]) -> dict[str, float]:
@@ -142,7 +175,7 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
         for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
             expand(choice)
     for choice in sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
-        for twin in _mirrored(stacks, choice):
+        for twin in (*_mirrored(stacks, choice), *_shifted(stacks, choice)):
             if twin not in done:
                 expand(twin)
     best = sorted(at_level, key=at_level.__getitem__, reverse=True)[:_RESCORED]
@@ -174,6 +207,33 @@ def _mirrored(stacks: Sequence[Stack], choice: Choice) -> list[Choice]:
         if all(k is not None for k in twin):
             found.append(tuple(k for k in twin if k is not None))
     return found
+
+
+def _shifted(stacks: Sequence[Stack], choice: Choice) -> list[Choice]:
+    """Choices with the same delays between the sources by which another source's clock is right.
+
+    As mirrored ones, they differ in each source at once.
+    """
+    delays = np.array([stack.alternatives[k].delay_s for stack, k in zip(stacks, choice, strict=True)])
+    found = []
+    for zero in np.unique(delays[delays != 0.0]):
+        shifted = [_at_delay(stack, k, delay) for stack, k, delay in zip(stacks, choice, delays - zero, strict=True)]
+        if all(k is not None for k in shifted):
+            found.append(tuple(k for k in shifted if k is not None))
+    return found
+
+
+def _at_delay(stack: Stack, k: int, delay_s: float) -> int | None:
+    """The alternative of a source with the rows of alternative ``k``, but for the clock, whose delay is nearest ``delay_s``; None where
+    none is near."""
+    wanted = _rows_but_clock(stack.alternatives[k])
+    like = [(abs(a.delay_s - delay_s), i) for i, a in enumerate(stack.alternatives) if _rows_but_clock(a) == wanted]
+    distance, nearest = min(like)
+    return nearest if distance < _SAME_DELAY_S else None
+
+
+def _rows_but_clock(alternative: Alternative) -> tuple[tuple[str, str], ...]:
+    return tuple(row.key for row in alternative.rows if row.source != "clock")
 
 
 def _mirror_of(stack: Stack, k: int, signs: Mapping[str, float]) -> int | None:
@@ -221,7 +281,7 @@ def _with_shared_evidence(stacks: Sequence[Stack], scores: Mapping[Choice, float
         chosen = [stack.alternatives[k] for stack, k in zip(stacks, choice, strict=True)]
         rows = [row for a in chosen for row in a.rows]
         relative = tuple(round(a.delay_s - chosen[0].delay_s, 1) for a in chosen)
-        others = tuple(row.key for row in rows if row.source != "clock")
+        others = tuple((row.key, row.value) for row in rows if row.source != "clock")
         alignments.setdefault((relative, others), []).append((choice, sum(row.log_odds for row in rows if row.source == "clock")))
     found = {}
     for members in alignments.values():

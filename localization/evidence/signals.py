@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -33,6 +33,8 @@ _MAX_PERIOD_S = 2.5
 """Longest median time between samples of a source that is compared [s]: scans further apart do not overlap enough to be registered."""
 _SCAN_STEP_S = 0.18
 """Least time from scan to scan [s]: over 0.08 s speeds by scans are 3 % low, over 0.24 s 1.3 % (three simulated drives)."""
+_ROOM_M = 4.0
+"""Range of rooms [m]."""
 _STEADY_SAMPLES = 200
 """Samples at the start whose mean specific force is gravity, where the robot stands."""
 _RESET_FACTOR = 8.0
@@ -67,6 +69,10 @@ class Source:
     """(m, 2) row and size of the steps of wheels' angles that are no motion [rad]."""
     mount: Mount = Mount()  # noqa: RUF009 (frozen)
     """Its mount, as log and robot file have it."""
+    sizes_by_others: Mapping[str, float] = field(default_factory=dict)
+    """Root mean square of the way [m/s] and the turn [rad/s] by the other sources that measure them; set by `search.make_stacks`."""
+    behind_s: float | None = None
+    """Time of recording less stamp [s]; None where the recorder has no clock of its own."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
 
@@ -155,13 +161,16 @@ def from_gyro(name: str, samples: Sequence[ImuSample], mounts: Mapping[str, Moun
 
 def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], first_ns: int) -> Source | None:
     """Motion from scan to scan of the first LiDAR, at its own place, in the body's axes by its mount."""
-    odometry, config, last_s = ScanOdometry(), LidarConfig(), -math.inf
+    odometry, last_s, scale, config = ScanOdometry(), -math.inf, 0.0, LidarConfig()
     t, steps, known, frame = list[float](), list[tuple[float, float, float]](), list[tuple[bool, bool, bool]](), None
     for scan in scans:
         at = (scan.middle_ns - first_ns) * 1e-9
         frame = scan.frame_id if frame is None else frame
         if scan.frame_id != frame or at - last_s < _SCAN_STEP_S:
             continue
+        scale = scale or _to_room_scale(scan, config)
+        if scale != 1.0:  # registered at the scale of rooms, and scaled back
+            scan = replace(scan, points=scale * scan.points)
         motion = odometry.register(profile_of(scan, mounts.get(frame, Mount()), config))
         if t:
             has_way = motion is not None and motion.has_translation
@@ -173,12 +182,18 @@ def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], fi
         return None
     mount = mounts.get(frame or "", Mount())
     moves = np.where(np.array(known), np.array(steps), 0.0)
-    at_sensor = (
-        moves[:, 0] + 1j * moves[:, 1] + 1j * moves[:, 2] * complex(mount.x, mount.y)
-    )  # the body's motion by the file's place, at that place
+    lever = complex(mount.x, mount.y)  # from the body's motion by the file's place to that of this place
+    at_sensor = (moves[:, 0] + 1j * moves[:, 1] + 1j * moves[:, 2] * lever) / scale
     columns = np.stack([at_sensor.real, at_sensor.imag, moves[:, 2]], axis=1)
     integrals = np.vstack([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
     return Source(name, "lidar", np.array(t), integrals, np.array(known), frame=frame or "", mount=mount)
+
+
+def _to_room_scale(scan: Scan, config: LidarConfig) -> float:
+    """Factor by which ranges in another unit are of a room's size, which registration needs; 1 for those within a LiDAR's reach."""
+    ranges = np.linalg.norm(scan.points, axis=1)
+    median = float(np.median(ranges)) if len(ranges) else 0.0
+    return 1.0 if median < config.max_range_m else _ROOM_M / median
 
 
 def from_poses(name: str, stamps_ns: NDArray[np.int64], poses: FloatArray, first_ns: int) -> Source | None:

@@ -78,6 +78,7 @@ class SetUp:
 def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own: tuple[Row, ...] = ()) -> SetUp:
     """The answer to `search`, beside the faults that messages show by their ``own`` fields."""
     searched = search(stacks)
+    stacks = searched.stacks
     ranked = posterior(stacks, searched.scores)
     found = [(p, choice, (*own, *_faults(refined_rows(stacks, choice, robot)))) for p, choice in ranked]
     hypotheses = tuple(Hypothesis(p, rows) for p, _, rows in found if p >= _NAMED)

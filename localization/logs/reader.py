@@ -111,8 +111,10 @@ class Log:
 
     @property
     def behind_s(self) -> Mapping[str, float]:
-        """Time of recording less stamp of each stamped topic that is used [s], by its first messages: the latency, where clocks agree."""
-        return {topic: (self._clocks.offset_ns - offset) * 1e-9 for topic, offset in self._clocks.latency_ns.items()}
+        """Time of recording less stamp, as published, of each stamped topic that is used [s], by its first messages: the latency, where
+        clocks agree."""
+        shifts = self._clocks.shifts_ns
+        return {topic: (self._clocks.offset_ns - offset + shifts.get(topic, 0)) * 1e-9 for topic, offset in self._clocks.latency_ns.items()}
 
     def rate_errors(self) -> dict[str, float]:
         """By how much faster than the recorder's the clock of a topic in use runs [s/s], where it is another than the other topics', by the

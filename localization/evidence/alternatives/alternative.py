@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -30,6 +30,9 @@ _SIDE_FLOOR_M_S, _SIDE_OF_WAY, _SIDE_OF_TURN_M = 0.02, 0.1, 0.05
 """Standard deviation of a robot's sideways speed: floor, part of the speed (slides are below 20 degrees in 99.9 % of three buildings), and
 metres per radian of turn beyond its centre of rotation."""
 
+_FREE_SIGMA, FACTOR_SIGMA = 2.5, 0.2
+"""Sigma of the logarithm of a factor that has no name, a gear or counts for radians; and of its measurement by the sizes of the motion."""
+
 Correction = Callable[[Robot], Robot]
 
 
@@ -50,7 +53,10 @@ class Row:
     remedy: str = ""
     """What to do where the robot file cannot express it."""
     is_fault: bool = True
-    """False for what healthy robots have as well, as a k that changes: it competes with faults for the evidence, and accuses nobody."""
+    """False for what healthy robots have as well, as latencies: it competes with faults for the evidence, and accuses nobody."""
+    since_s: float | None = None
+    """Time from which on the source has it [s after the first reading]; None: all the time."""
+    until_s: float | None = None
 
     @property
     def source(self) -> str:
@@ -65,7 +71,8 @@ class Row:
     @property
     def key(self) -> tuple[str, str]:
         """Equal for rows that are corrected alike, up to a measured value."""
-        return self.id, self.detail
+        when = "" if self.since_s is None and self.until_s is None else " since" if self.until_s is None else " until"
+        return self.id, self.detail + when
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +84,13 @@ class Alternative:
     """(n,) forward speed [m/s]; None: not measured."""
     turn: FloatArray | None = None
     """(n,) yaw rate [rad/s]; None: not measured."""
-    log_jacobian: float = 0.0
-    """Logarithm of the Jacobian of all channels, per bin: the density of a change of units."""
+    log_jacobian: float | FloatArray = 0.0
+    """Logarithm of the Jacobian of all channels, of any bin or by bin (n,): the density of a change of units."""
     own: float = 0.0
     """Evidence that the source has by itself: wheels of a side turn alike, gravity is up, robots do not drive sideways."""
     way_sigma: float = 0.0
     """Sigma of the logarithm of the scale of ``way`` that this choice adds to the source's."""
     turn_sigma: float = 0.0
-    relative: float = 1.0
-    """Factor on the source's relative noise of turns."""
     delay_s: float = 0.0
     is_crossed: bool = False
     """Whether the way is made of what the source calls a turn, and the turn of its way: units go with them."""
@@ -134,6 +139,18 @@ def side_evidence(side: FloatArray, way: FloatArray, turn: FloatArray, place_sig
         weight = np.where(np.isfinite(side), 1.0 / (sigma**2 * (1.0 + ((side - ahead * turn) / (3.0 * sigma)) ** 2)), 0.0)
     price = 0.5 * (ahead / place_sigma_m) ** 2 + 0.5 * math.log1p(information * place_sigma_m**2)
     return mixture(side - ahead * turn, sigma, size_of(np.hypot(way, side))) - price, ahead
+
+
+def free_factor(way: FloatArray, turn: FloatArray, sizes: Mapping[str, float]) -> tuple[float, float]:
+    """Factor by which ``way`` (n,), or ``turn`` where no other source has a way, has the size that others measure; logarithm of its prior.
+
+    Scales are measured about it, so that the source's noise is that of the motion and not of its unit.
+    """
+    name, channel = ("way", way) if "way" in sizes else ("turn", turn)
+    if name not in sizes or not np.isfinite(channel).any():
+        return 1.0, 0.0
+    factor = float(f"{sizes[name] / size_of(channel):.6g}")
+    return factor, -0.5 * (math.log(factor) / _FREE_SIGMA) ** 2 - math.log(_FREE_SIGMA / FACTOR_SIGMA)
 
 
 def size_of(channel: FloatArray) -> float:

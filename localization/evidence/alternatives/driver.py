@@ -8,7 +8,17 @@ from functools import partial
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import LEVELS, STILL_RAD_S, Alternative, Row, mixture, noise_evidence, size_of
+from localization.evidence.alternatives.alternative import (
+    FACTOR_SIGMA,
+    LEVELS,
+    STILL_RAD_S,
+    Alternative,
+    Row,
+    free_factor,
+    mixture,
+    noise_evidence,
+    size_of,
+)
 from localization.evidence.signals import Source
 from motion_models.prior import expected_scaling
 from motion_models.robot import Robot
@@ -20,9 +30,10 @@ _ODDS = {
     "unit": math.log(5e-4),
     "usual": 0.0,
     "multiplier": math.log(0.05),
-    "k": math.log(0.03),
     "pose": math.log(3e-4),
     "turns": math.log(3e-4),
+    "factor": math.log(2e-4),
+    "twist": math.log(0.1),
 }
 """Prior odds by kind, as of wheels; where the robot file has the default multiplier, a driver that corrects for
 skidding is as usual as one that does not (diff_drive_controller's wheel_separation_multiplier)."""
@@ -45,13 +56,15 @@ UNITS = {
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Sides times units of the ``rates`` (n, 2) way and turn of a driver's odometry, by its poses or its twists (``second``)."""
     alike = _alike_evidence(rates, second, 1.0)
-    found = _of_channels(rates, robot, alike, ())
+    found = _of_channels(source, rates, robot, alike, ())
     ratio = _ratio(rates, second)
     if ratio is not None:
+        twist = Row("driver.twist", "the driver's twists are better than its poses", _ODDS["twist"], is_fault=False)
+        found += _of_channels(source, second, robot, alike, (twist,))
         remedy = "Poses that sum speeds without the time between messages: correct the driver; until then its twists are right."
         text = f"the driver's poses move {ratio:.3g} times as far as its twists say"
         row = Row("driver.pose_against_twist", text, _ODDS["pose"], value=ratio, remedy=remedy)
-        found += _of_channels(second, robot, _alike_evidence(rates, second, ratio), (row,))
+        found += _of_channels(source, second, robot, _alike_evidence(rates, second, ratio), (row,))
     return found
 
 
@@ -72,7 +85,7 @@ def _alike_evidence(rates: FloatArray, second: FloatArray, ratio: float) -> floa
     return found
 
 
-def _of_channels(rates: FloatArray, robot: Robot, evidence: float, more: tuple[Row, ...]) -> list[Alternative]:
+def _of_channels(source: Source, rates: FloatArray, robot: Robot, evidence: float, more: tuple[Row, ...]) -> list[Alternative]:
     way, turned = rates[:, 0], rates[:, 1]
     multiplier = expected_scaling(robot) * robot.driver.wheel_separation_multiplier
     is_default = robot.driver.wheel_separation_multiplier == 1.0 and "k_0" not in robot.models.get("skid_steer", {})
@@ -97,8 +110,13 @@ def _of_channels(rates: FloatArray, robot: Robot, evidence: float, more: tuple[R
                 correct=partial(_set_multiplier, float(f"{1.0 / expected_scaling(robot):.4g}")),
             )
             found.append(Alternative((*rows, corrected), v, w, -math.log(multiplier), evidence, sigma, sigma, is_crossed=sigma == 0.0))
-    vary = Row("driver.turns_vary", "the robot turns by a changing part of what its wheels turn", _ODDS["k"], is_fault=False)
-    found.append(Alternative((vary, *more), way, multiplier * turned, 0.0, evidence, 0.0, 1.0, 8.0))
+    remedy = "Check the radius and the resolution in the driver's parameters."
+    for v, w, sigma, of_side in _sides(way, turned, robot):
+        factor, of_factor = free_factor(v, w, source.sizes_by_others)
+        text = f"the driver's odometry is {1.0 / factor:.3g} times too large"
+        scaled = Row("driver.factor", text, _ODDS["factor"], "", factor, remedy=remedy)
+        values = factor * v, factor * multiplier * w, 2.0 * math.log(factor), evidence + of_factor, FACTOR_SIGMA, FACTOR_SIGMA
+        found.append(Alternative((*of_side, scaled, *more), *values, is_crossed=sigma > 0.0))
     no_turns = Row("driver.no_turns", "the driver publishes no turns", _ODDS["turns"], remedy="Correct the driver's yaw rate and heading.")
     sigma = min(max(size_of(turned), LEVELS[0] * STILL_RAD_S), STILL_RAD_S)
     still = evidence + noise_evidence(turned, sigma)

@@ -6,8 +6,10 @@ import itertools
 import math
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.evidence.alternatives.alternative import Alternative, Row, mount_correction, side_evidence
 from localization.evidence.signals import Source
@@ -24,6 +26,8 @@ slide."""
 _PLACE_SIGMA_M, _WRONG_PLACE_SIGMA_M = 0.07, 0.6
 """Standard deviation along the robot of a mount with the centre of rotation (robots turn within 5 cm of the middle of their wheels), and of
 a mount that is wrong."""
+Velocity = NDArray[Any]
+"""Complex: ahead + i to the left [m/s]."""
 _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
 
 
@@ -35,16 +39,12 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         if is_flipped:
             velocity, turn = velocity.conj(), -turn
         in_unit = Row("lidar.unit", f"the LiDAR's ranges are in {unit}", _ODDS["unit"], unit, factor, partial(_set_range, 1.0 / factor))
-        for yaw, odds in _yaws(velocity, turn, source.place):
+        for yaw, odds in yaws(velocity, turn, source.place, (_PLACE_SIGMA_M, _WRONG_PLACE_SIGMA_M)):
             rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
-            own_yaw = yaw if odds else _small_yaw(velocity, turn, source.place)
-            body = velocity * np.exp(1j * own_yaw) - 1j * turn * source.place
-            of_yaw = 0.0 if odds else -0.5 * (own_yaw / _YAW_SIGMA_RAD) ** 2
-            evidence, _ = side_evidence(body.imag, body.real, turn, _PLACE_SIGMA_M)
-            found.append(Alternative(tuple(rows), body.real, turn, 2.0 * math.log(factor), of_yaw + evidence))
-            evidence, ahead = side_evidence(body.imag, body.real, turn, _WRONG_PLACE_SIGMA_M)
-            rows = [*rows, _place_row(source.frame, mount, ahead)]
-            found.append(Alternative(tuple(rows), body.real, turn, 2.0 * math.log(factor), of_yaw + evidence))
+            for place_sigma, is_elsewhere in ((_PLACE_SIGMA_M, False), (_WRONG_PLACE_SIGMA_M, True)):
+                body, evidence, ahead = in_body(velocity, turn, source.place, yaw, place_sigma)
+                more = [_place_row(source.frame, mount, ahead)] if is_elsewhere else []
+                found.append(Alternative((*rows, *more), body.real, turn, 2.0 * math.log(factor), evidence))
     return found
 
 
@@ -54,41 +54,58 @@ def _place_row(frame: str, mount: Mount, ahead: float) -> Row:
     return Row("lidar.place", text, _ODDS["place"], value=ahead, correct=correct)
 
 
-def _small_yaw(velocity: FloatArray, turn: FloatArray, place: complex) -> float:
-    """Posterior mean of a small yaw [rad]: least squares of the sideways speed on the forward one, with a prior."""
-    body = velocity - 1j * turn * place
+def in_body(velocity: Velocity, turn: FloatArray, place: complex, yaw: float, place_sigma_m: float) -> tuple[Velocity, float, float]:
+    """Velocity (n,) in the axes of a body in which the sensor is turned by ``yaw``; the evidence of its sideways part; and how far ahead of
+    its ``place`` the sensor is [m]. A mount of the file has a small yaw, with its prior."""
+    small = 0.0 if yaw else _small_yaw(velocity - 1j * turn * place, turn, place_sigma_m)[0]
+    body = velocity * np.exp(1j * (yaw + small)) - 1j * turn * place
+    evidence, ahead = side_evidence(body.imag, body.real, turn, place_sigma_m)
+    return body, evidence - 0.5 * (small / _YAW_SIGMA_RAD) ** 2, ahead
+
+
+def _small_yaw(body: Velocity, turn: FloatArray, place_sigma_m: float) -> tuple[float, float]:
+    """Posterior means of a small yaw [rad] and of the place ahead [m]: side = ahead wz - yaw v by least squares, with their priors."""
     known = np.isfinite(body)
-    way, side = body.real[known], body.imag[known]
-    weight = 1.0 / (0.02**2 + (0.1 * way) ** 2 + (0.15 * turn[known]) ** 2)
+    X, side = np.stack([-body.real[known], turn[known]], axis=1), body.imag[known]
+    variance = 0.02**2 + (0.1 * X[:, 0]) ** 2 + (0.15 * X[:, 1]) ** 2
+    weight: FloatArray = 1.0 / variance
+    found = np.zeros(2)
     for _ in range(3):
-        yaw = -float((weight * way * side).sum()) / (float((weight * way * way).sum()) + _YAW_SIGMA_RAD**-2)
-        weight = 1.0 / ((0.02**2 + (0.1 * way) ** 2 + (0.15 * turn[known]) ** 2) * (1.0 + ((side + yaw * way) / 0.1) ** 2))
-    return yaw
+        information = (weight[:, None] * X).T @ X + np.diag([_YAW_SIGMA_RAD**-2, place_sigma_m**-2])
+        found = np.linalg.solve(information, X.T @ (weight * side))
+        weight = 1.0 / (variance * (1.0 + ((side - X @ found) / 0.1) ** 2))
+    return float(found[0]), float(found[1])
 
 
-def _yaws(velocity: FloatArray, turn: FloatArray, place: complex) -> list[tuple[float, float]]:
-    """Yaws by which the mount may be wrong, with the logarithm of their prior odds: 0, and the axis of travel with both ends."""
+def yaws(velocity: Velocity, turn: FloatArray, place: complex, place_sigmas_m: tuple[float, float]) -> list[tuple[float, float]]:
+    """Yaws by which the mount may be wrong, with the logarithm of their prior odds: 0, and the axis of travel with both ends, for a sensor
+    at its place and for one elsewhere."""
     known = np.isfinite(velocity)
     u, w = velocity[known], turn[known]
     found = [(0.0, 0.0)]
-    if len(u) < 6:
-        return [*found, (math.pi, _ODDS["quarter"])]
-    rotated = u[None, :] * np.exp(1j * _GRID)[:, None] - 1j * w * place
-    sigma = np.sqrt(0.02**2 + (0.1 * np.abs(u)) ** 2 + (0.15 * np.abs(w)) ** 2)
-    cost = np.log1p((rotated.imag / sigma) ** 2).sum(axis=1)
-    best = int(cost.argmin())
-    yaw = float(_GRID[best]) + _small_yaw(u * np.exp(1j * _GRID[best]), w, place)
-    for angle in (yaw, yaw + math.pi):
-        angle = math.remainder(angle, math.tau)
-        quarter = round(angle / (0.5 * math.pi)) * 0.5 * math.pi
-        is_quarter = abs(angle - quarter) < _QUARTER_RAD
-        if is_quarter and round(quarter / (0.5 * math.pi)) % 4 == 0:
-            continue
-        found.append((_up_to_pi(quarter), _ODDS["quarter"]) if is_quarter else (angle, _ODDS["yaw"]))
+    for place_sigma in place_sigmas_m if len(u) >= 6 else ():
+        yaw = _axis_of_travel(u, w, place, place_sigma)
+        for angle in (math.remainder(yaw, math.tau), math.remainder(yaw + math.pi, math.tau)):
+            quarter = round(angle / (0.5 * math.pi)) * 0.5 * math.pi
+            is_quarter = abs(angle - quarter) < _QUARTER_RAD
+            angle, odds = (_up_to_pi(quarter), _ODDS["quarter"]) if is_quarter else (angle, _ODDS["yaw"])
+            if all(abs(math.remainder(angle - other, math.tau)) > 0.5 * _QUARTER_RAD for other, _ in found):
+                found.append((angle, odds))
     for quarter in (math.pi, 0.5 * math.pi, -0.5 * math.pi):
         if all(abs(math.remainder(quarter - angle, math.tau)) > 2.0 * _QUARTER_RAD for angle, _ in found):
             found.append((quarter, _ODDS["quarter"]))
     return found
+
+
+def _axis_of_travel(velocity: Velocity, turn: FloatArray, place: complex, place_sigma_m: float) -> float:
+    """Yaw [rad] by which the sideways part of the ``velocity`` (n,) is least, the place ahead profiled at each of `_GRID`."""
+    rotated = velocity[None, :] * np.exp(1j * _GRID)[:, None] - 1j * turn * place
+    sigma = np.sqrt(0.02**2 + (0.1 * np.abs(velocity)) ** 2 + (0.15 * np.abs(turn)) ** 2)
+    weight = sigma**-2.0
+    ahead = (rotated.imag * turn * weight).sum(1) / ((turn**2 * weight).sum() + place_sigma_m**-2)
+    cost = np.log1p(((rotated.imag - ahead[:, None] * turn) / sigma) ** 2).sum(axis=1)
+    yaw = float(_GRID[int(cost.argmin())])
+    return yaw + _small_yaw(velocity * np.exp(1j * yaw) - 1j * turn * place, turn, place_sigma_m)[0]
 
 
 def _up_to_pi(angle: float) -> float:
@@ -107,12 +124,12 @@ def _mount_rows(frame: str, mount: Mount, is_flipped: bool, yaw: float, yaw_odds
         side = "left" if yaw > 0.0 else "right"
         angle = f"{abs(math.degrees(yaw)):.0f} deg" + ("" if abs(abs(yaw) - math.pi) < 1e-6 else f" to the {side}")
         rows.append(
-            Row("lidar.yaw", f"the LiDAR is turned by {angle}", yaw_odds, _sector(yaw), yaw, correct=None if is_flipped else correct)
+            Row("lidar.yaw", f"the LiDAR is turned by {angle}", yaw_odds, sector(yaw), yaw, correct=None if is_flipped else correct)
         )
     return rows
 
 
-def _sector(yaw: float) -> str:
+def sector(yaw: float) -> str:
     """Sector of a yaw, of 30 degrees: yaws in one are one symptom."""
     return f"{30 * round(math.degrees(yaw) / 30.0) % 360} deg"
 

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import Alternative, Row, side_evidence
-from localization.evidence.alternatives.lidar import _sector, _small_yaw, _yaws
+from localization.evidence.alternatives.alternative import Alternative, Row
+from localization.evidence.alternatives.lidar import in_body, sector, yaws
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -43,14 +43,12 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
 def _of_motion(rows: tuple[Row, ...], velocity: FloatArray, turn: FloatArray, log_jacobian: float) -> list[Alternative]:
     """Yaws of the tracked body, at the robot's middle or elsewhere, times ``rows``."""
     found = []
-    for yaw, odds in _yaws(velocity, turn, 0.0):
-        own_yaw = yaw if odds else _small_yaw(velocity, turn, 0.0)
-        body = velocity * np.exp(1j * own_yaw)
+    for yaw, odds in yaws(velocity, turn, 0.0, (_PLACE_SIGMA_M, _OTHER_PLACE_SIGMA_M)):
         of_yaw = f"its headings are turned by {math.degrees(yaw):.0f} deg"
-        turned = (Row("reference.yaw", of_yaw, _ODDS["yaw"], _sector(yaw), yaw),) if odds else ()
-        evidence, _ = side_evidence(body.imag, body.real, turn, _PLACE_SIGMA_M)
+        turned = (Row("reference.yaw", of_yaw, _ODDS["yaw"], sector(yaw), yaw),) if odds else ()
+        body, evidence, _ = in_body(velocity, turn, 0.0, yaw, _PLACE_SIGMA_M)
         found.append(Alternative((*rows, *turned), body.real, turn, log_jacobian, evidence))
-        evidence, ahead = side_evidence(body.imag, body.real, turn, _OTHER_PLACE_SIGMA_M)
+        body, evidence, ahead = in_body(velocity, turn, 0.0, yaw, _OTHER_PLACE_SIGMA_M)
         text = f"the tracked point is {abs(ahead):.2f} m {'ahead of' if ahead > 0.0 else 'behind'} the middle of the wheels"
         place = Row("reference.place", text, _ODDS["place"], value=ahead)
         found.append(Alternative((*rows, *turned, place), body.real, turn, log_jacobian, evidence))

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import Alternative, Row, mixture, size_of
+from localization.evidence.alternatives.alternative import FACTOR_SIGMA, Alternative, Row, free_factor, mixture, size_of
 from localization.evidence.signals import Source
 from motion_models.prior import expected_scaling
 from motion_models.robot import Robot
@@ -18,10 +18,10 @@ from motion_models.se2 import FloatArray
 
 _SPREAD_FLOOR, _SPREAD_OF_SIDE = 0.05, 0.2
 """Standard deviation of a wheel's rate from that of its side: part of all rates' size (encoder steps), and of the side's rate (slip)."""
-_ODDS = {"sign": math.log(1e-3), "unit": math.log(5e-4), "factor": math.log(3e-4), "side_unit": math.log(1e-4), "k": math.log(0.03)}
+_ODDS = {"sign": math.log(1e-3), "unit": math.log(5e-4), "factor": math.log(3e-4), "side_unit": math.log(1e-4)}
 """Prior odds by kind: a judgement from public reports on skid-steer drivers, not counted (`docs/theory/set-up.md`)."""
-_GEARS = ((2.0, 0.05), (0.5, 0.05), (0.01, 2.5), (1.0, 0.8))
-"""Factor, and sigma of its logarithm: radius for diameter or half the resolution, their inverses; counts; a gear."""
+_TWICE, _TWICE_SIGMA = (2.0, 0.5), 0.05
+"""Factors of radius for diameter or half the resolution, and their inverses; sigma of the logarithm."""
 
 _HOPELESS = 50.0
 """Logarithm of the evidence that wheels of a side turn alike, below the best wiring's, from where on no other source can redeem one."""
@@ -32,7 +32,7 @@ _FIELDS_SIGMA, _FIELDS_WIDE = 0.1, 3.0
 """Sigma of the logarithm of velocities over rates of angles, of drivers that filter them; and of those in another unit."""
 
 _MIN_MOVING = 12
-"""Values in motion that show a ratio or a sign: half a wheel's rates over six seconds."""
+"""Values in motion that show a ratio: half a wheel's rates over six seconds."""
 
 Wiring = tuple[tuple[int, ...], tuple[int, ...], FloatArray, tuple[Row, ...]]
 """Columns of the left and right wheels, signs (joints,), rows."""
@@ -49,8 +49,15 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
         for factor, sigma, unit_rows in (*fields, *_units(robot)[len(fields) > 0 :]):
             found.append(Alternative((*rows, *unit_rows), factor * way, factor * turn, 2.0 * math.log(factor), alike, sigma, sigma))
+        factor, of_factor = free_factor(way, turn, source.sizes_by_others)
+        found.append(
+            Alternative(
+                (*rows, _factor_row(factor, FACTOR_SIGMA)),
+                *(factor * way, factor * turn, 2.0 * math.log(factor), alike + of_factor, FACTOR_SIGMA, FACTOR_SIGMA),
+            )
+        )
         if not rows:
-            found += [*_of_one_side(source, rates, radius, scale), Alternative((_turns_vary(),), way, turn, 0.0, alike, 0.0, 1.0, 8.0)]
+            found += _of_one_side(source, rates, radius, scale)
     return found
 
 
@@ -135,11 +142,7 @@ def _names(radius: float) -> dict[str, float]:
 
 def _fields(rates: FloatArray, second: FloatArray, radius: float) -> list[Unit]:
     """Where velocities are another multiple of the angles' rates: the velocities have another unit, or the angles have."""
-    ratio, sigma, is_unsigned = _log_ratio(rates, second)
-    if is_unsigned:
-        text = "velocities of the wheels have no sign: they are positive while angles go backwards; angles are used"
-        remedy = "Let the driver publish signed velocities, or none."
-        return [(1.0, 0.0, (Row("wheels.unsigned_velocities", text, _ODDS["unit"], remedy=remedy),))]
+    ratio, sigma = _log_ratio(rates, second)
     same = -0.5 * (ratio / math.hypot(sigma, _FIELDS_SIGMA)) ** 2 - math.log(_FIELDS_SIGMA)
     other = _ODDS["unit"] - 0.5 * (ratio / _FIELDS_WIDE) ** 2 - math.log(_FIELDS_WIDE)
     if not math.isfinite(sigma) or same > other:
@@ -158,33 +161,34 @@ def _fields(rates: FloatArray, second: FloatArray, radius: float) -> list[Unit]:
     ]
 
 
-def _log_ratio(first: FloatArray, second: FloatArray) -> tuple[float, float, bool]:
-    """Logarithm of the size of ``second`` (n, joints) over ``first``, its standard error, and whether ``second`` has no sign."""
+def _log_ratio(first: FloatArray, second: FloatArray) -> tuple[float, float]:
+    """Logarithm of the size of ``second`` (n, joints) over ``first``, and its standard error."""
     known = np.isfinite(first) & np.isfinite(second)
     a, b = first[known], second[known]
     size = float(np.sqrt(np.mean(a * a))) if len(a) else 0.0
     moving = np.abs(a) > 0.3 * size
     if size == 0.0 or moving.sum() < _MIN_MOVING or not np.any(b[moving]):
-        return 0.0, math.inf, False
+        return 0.0, math.inf
     ratios = np.log(np.abs(b[moving]) / np.abs(a[moving]) + 1e-12)
     spread = float(np.median(np.abs(ratios - np.median(ratios)))) * 1.48
-    is_unsigned = bool((a < -0.3 * size).sum() >= _MIN_MOVING and b.min() > -1e-3 * np.abs(b).max() and b[a < -0.3 * size].min() > 0.0)
-    return float(np.median(ratios)), max(spread, 0.03) / math.sqrt(moving.sum() / 4.0), is_unsigned
+    return float(np.median(ratios)), max(spread, 0.03) / math.sqrt(moving.sum() / 4.0)
 
 
 def _units(robot: Robot) -> list[Unit]:
     """The unit of both fields, that of the robot file first."""
     found: list[Unit] = [(1.0, 0.0, ())]
     named = _names(robot.geometry.wheel_radius_m)
-    for name, factor in named.items():
-        text = f"the wheels' rates are in {name}, not in rad/s (1 rad/s is {1.0 / factor:.4g} of them)"
+    for factor in named.values():
         alike = [n for n, other in named.items() if abs(math.log(other / factor)) < _ALIKE]
         detail = " or ".join(alike)  # nothing tells them apart, and their corrections hardly differ
+        text = f"the wheels' rates are in {detail}, not in rad/s (1 rad/s is {1.0 / factor:.4g} of them)"
         found.append((factor, 0.05, (Row("wheels.unit", text, _ODDS["unit"], detail, factor, partial(scale_unit, factor)),)))
-    for factor, sigma in _GEARS:
-        row = Row("wheels.factor", "the wheels' rates have a factor", _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor))
-        found.append((factor, sigma, (row,)))
-    return found
+    return [*found, *((factor, _TWICE_SIGMA, (_factor_row(factor, _TWICE_SIGMA),)) for factor in _TWICE)]
+
+
+def _factor_row(factor: float, sigma: float) -> Row:
+    text = f"the wheels' rates are {1.0 / factor if factor < 1.0 else factor:.3g} times too {'large' if factor < 1.0 else 'small'}"
+    return Row("wheels.factor", text, _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor))
 
 
 def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float) -> Iterator[Alternative]:
@@ -208,11 +212,6 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
             row = Row(f"wheels.factor_{side}", text, _ODDS["side_unit"], name, factor, partial(_scale_side, side, factor))
             way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
             yield Alternative((row,), way, turn, math.log(factor), _alike_evidence(rates, *sides), 0.05, 0.05)
-
-
-def _turns_vary() -> Row:
-    remedy = "k changes with speed, floor or load: calibrate on the floor and at the speeds of the task, or use --model friction."
-    return Row("wheels.turns_vary", "the robot turns by a changing part of what its wheels turn", _ODDS["k"], remedy=remedy, is_fault=False)
 
 
 def _set_sides(left: tuple[str, ...], right: tuple[str, ...], robot: Robot) -> Robot:

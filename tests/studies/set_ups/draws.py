@@ -108,10 +108,16 @@ def real(seed: int, count: int, log: RealLog | None = None, allowed: Callable[[S
         geometry.wheel_radius_m,
         effective,
         robot.driver.track_width_m * robot.driver.wheel_separation_multiplier,
+        has_twists=_has_twists(records, topics.get("driver")),
     )
     faults = tuple(draw_faults(rng, setting, count, allowed))
     body = Body(robot.joints.left, robot.joints.right, geometry.wheel_radius_m, effective, setting.driver_track, tuple(sorted(topics)))
     return Draw(f"{log.name} from {begin:.0f} s", tuple(topics), robot, records, faults, body, log.known, topics.get("reference"))
+
+
+def _has_twists(records: Sequence[Record], topic: str | None) -> bool:
+    """Whether a driver's messages have twists."""
+    return any(bool(m.twist.twist.linear.x) for t, m, _ in records if t == topic)
 
 
 def moved(records: Sequence[Record], topic: str, log: RealLog) -> tuple[float, float]:

@@ -35,6 +35,8 @@ class Setting:
     driver_track: float = 0.5
     """By which the driver divides [m]."""
     has_angles: bool = True
+    has_twists: bool = True
+    """Whether the driver publishes twists beside its poses."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -441,7 +443,7 @@ TABLE: tuple[Symptom, ...] = (
     Symptom("driver.right_reversed", _driver("driver.right_reversed", _side_reversed(1.0)), "wiring"),
     Symptom("driver.unit", _driver_unit, "scale"),
     Symptom("driver.no_turns", _driver("driver.no_turns", lambda s: lambda v, w: (v, 0.0)), "wiring"),
-    Symptom("driver.pose_against_twist", _pose_against_twist, "scale", weight=0.7),
+    Symptom("driver.pose_against_twist", _pose_against_twist, "scale", weight=0.7, fits=lambda s: s.has_twists),
     Symptom("gyro.reversed", lambda rng, s: Fault(Truth("gyro.reversed"), imu_by(s, -np.eye(3), np.eye(3))), "axis"),
     Symptom("gyro.unit", lambda rng, s: Fault(Truth("gyro.unit", "deg/s"), imu_by(s, np.eye(3) * 180.0 / math.pi, np.eye(3))), "unit"),
     Symptom("gyro.axis", _gyro_axis, "axis", weight=1.5),
