@@ -140,7 +140,7 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     if reference is not None and reference.yaws is not None:
         of_reference = from_poses(reference.source, reference.stamps_ns, reference.poses, begin_ns)
         found += [] if of_reference is None else [of_reference]
-    return [replace(source, first_ns=begin_ns) for source in found]
+    return [replace(source, first_ns=begin_ns, behind_s=log.behind_s.get(source.name)) for source in found]
 
 
 def sources_of_readings(log: Any, readings: Mapping[str, Sequence[Any]], first_ns: int) -> list[Source]:

@@ -78,6 +78,8 @@ class Stack:
     alternatives: Sequence[Alternative]
     raw: Mapping[str, float] = field(default_factory=dict)
     """Size of the way and of the turn by the robot file, where ``alternatives`` are not all of them."""
+    behind_s: float | None = None
+    """`Source.behind_s`."""
 
     @cached_property
     def sizes(self) -> Mapping[str, float]:

@@ -67,6 +67,8 @@ class Source:
     """(m, 2) row and size of the steps of wheels' angles that are no motion [rad]."""
     mount: Mount = Mount()  # noqa: RUF009 (frozen)
     """Its mount, as log and robot file have it."""
+    behind_s: float | None = None
+    """Least time of recording less stamp [s]; None where that is unknown."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
 

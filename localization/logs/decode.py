@@ -48,7 +48,7 @@ class Oddity(Enum):
     OUT_OF_ORDER = "recorded out of order, and sorted"
     REPEATED = "dropped (stamp repeated)"
     SECOND_FRAME = "dropped (stamp repeated by another frame: two sensors share the topic); give each of them its own topic"
-    LATE = "dropped (recorded more than a second after newer ones)"
+    LATE = "dropped (recorded long after newer ones)"
     OLD = "dropped (stamped seconds before the topic's others: latched, or left in a buffer)"
     OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
     REBASED = "stamped after a jump of the clock, moved back by it"

@@ -20,17 +20,16 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference, Scan
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
-from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, moved_back, odd_rates, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, odd_rates, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, FrozenWheel, TopicDecoder, decode_item, late_ns, rate_error
 from localization.logs.reference_topics import reference_decoder
 from localization.logs.serialization import LogDeserializer
-from localization.logs.set_forward_clock import MIN_STEP_NS, Reading, SetForward, describe_set_forwards, earlier_ns, find_set_forwards
 from localization.logs.split import SplitSource
 from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
-from localization.logs.wheel_messages import TF_TYPES, odometry_decoder, odometry_edge, wheel_decoder
+from localization.logs.wheel_messages import TF_TYPES, odometry_edge
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 from motion_models.text_files import check_file
@@ -39,8 +38,6 @@ _GPS = "/fix"
 _TF_READ_NS = 10_000_000_000  # in ROS 1, and from simulators, fixed transforms are repeated every 0.1 to 1 s on /tf
 _TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
 _FIRST_READ_NS = 20_000_000_000  # of a topic, for its latency; a long log is not read to its end for one that is slow
-_MISSING = 0.02
-"""Part of the time without wheel messages, from where on a clock that was set is looked for."""
 _RATES_READ_NS, _RATES_READ_BYTES = 120_000_000_000, 300_000_000  # from the start, for the rates of clocks: .2 % is .24 s then
 _POINTS_READ = 100  # first messages of a point that may be the centre of gravity
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
@@ -232,7 +229,7 @@ class Log:
 
     def warnings(self) -> list[str]:
         """Warnings about everything that was lost, corrected or chosen by default so far: `damage` first."""
-        found = [*self.damage(), *describe_set_forwards(self._set_forwards, self.start_ns), *self._mount_notes, *self._choice_notes]
+        found = [*self.damage(), *self._mount_notes, *self._choice_notes]
         for stats in self._stats_by_topic.values():
             found += stats.describe()
         return list(dict.fromkeys(found))
@@ -261,26 +258,7 @@ class Log:
                     decoder = decoder._replace(late_ns=decoder.late_ns + drift_ns)
                 item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoder, stats)
                 if item is not None:
-                    yield moved_back(item, earlier_ns(self._set_forwards, raw.log_ns))
-
-    @cached_property
-    def _set_forwards(self) -> tuple[SetForward, ...]:
-        """Where the clock of all topics was set forward; nothing is read where the wheels have messages for nearly all of the time."""
-        wheels = self.sources.wheels
-        period_s = None if wheels is None else self.period_s.get(wheels.topic)
-        count = 0 if wheels is None else sum(channel.count for channel in self.channels if channel.topic == wheels.topic)
-        if wheels is None or period_s is None or self.duration_s - count * period_s < max(MIN_STEP_NS * 1e-9, _MISSING * self.duration_s):
-            return ()
-        decode = LogDeserializer([c for c in self.channels if c.topic == wheels.topic], is_ros1=self.source.is_ros1)
-        of_joints = wheel_decoder((*self._joints[0], *self._joints[1]), self.robot.joints)
-        read = of_joints if wheels.kind == "joint_states" else odometry_decoder(wheels.type, self.robot.driver.length_unit_m)
-
-        def reading_of(raw: RawMessage) -> Reading | None:
-            message = _or_none(decode, raw)
-            return None if message is None or not hasattr(message, "header") else read(message, stamp_ns(message))
-
-        topics = {source.topic for source in self.sources.used()}
-        return tuple(find_set_forwards(self.source.messages(topics), wheels.topic, reading_of))
+                    yield item
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
         """The first decodable messages of a topic, with their time of recording."""
