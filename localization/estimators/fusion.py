@@ -215,7 +215,8 @@ class EkfFusion(Estimator):
             wheels_cov = wheel_twist_cov(wheels_cov, slip, dt)
         wheels, wheels_cov = twist_at_end(wheels, wheels_cov, change, math.inf)
         if rate is not None:
-            wheels, wheels_cov = fuse_turn(wheels, wheels_cov, *rate)
+            per_s = step.d_clock / dt
+            wheels, wheels_cov = fuse_turn(wheels, wheels_cov, *rate, by_wheels.cov("clock") * np.outer(per_s, per_s))
         if not is_measured:
             return wheels, wheels_cov
         cov[2, :], cov[:, 2], cov[2, 2] = 0.0, 0.0, wheels_cov[2, 2]

@@ -9,20 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from localization.events import ImuSample, Scan
+from localization.events import Scan
 from localization.evidence.alternatives import Row
 from localization.evidence.fields import own_faults
 from localization.evidence.search import make_stacks
 from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, from_scans, is_comparable
 from localization.evidence.verdict import CORRECTED, SetUp, decide
 from localization.logs import Log, TopicOverrides, open_log
-from localization.logs.decode import JointReading, OdometryReading, decode_imu
+from localization.logs.decode import MAX_RATE_RAD_S, JointReading, OdometryReading, imu_decoder
 from localization.logs.event_decoder import TopicDecoder, late_ns
 from localization.logs.wheel_messages import odometry_decoder, wheel_decoder
 from motion_models.errors import CalibrationError
@@ -194,14 +193,8 @@ def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
         else:
             found[source.topic] = odometry_decoder(source.type, log.robot.driver.length_unit_m)
     if log.sources.imu is not None:
-        found[log.sources.imu.topic] = partial(_decode_fast_imu, unit=log.robot.imu.rate_unit_rad_s)
+        found[log.sources.imu.topic] = imu_decoder(log.robot.imu.rate_unit_rad_s, _DEG_PER_RAD * MAX_RATE_RAD_S)
     return found
-
-
-def _decode_fast_imu(message: Any, stamp: int, unit: float) -> ImuSample:
-    """Decode an IMU message whose rates only another unit than rad/s explains."""
-    sample = decode_imu(message, stamp, unit / _DEG_PER_RAD)
-    return replace(sample, angular_velocity=_DEG_PER_RAD * sample.angular_velocity)
 
 
 def has_moved(first: Any, reading: Any) -> bool:

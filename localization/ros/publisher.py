@@ -59,6 +59,7 @@ class EstimatePublisher:
         self.recent_transforms: deque[bytes] = deque(maxlen=_NEW_KEYFRAMES)
         """Transforms of the body, as they were published."""
         self._topics = {topic: names.resolve(topic) for topic in _TYPES}
+        self._advertised: set[str] = set()
         self._has_predictions = False
         self._unread: frozenset[str] = frozenset()  # topics of predictions that nobody receives
         self._path = Path()
@@ -74,7 +75,7 @@ class EstimatePublisher:
 
     def publish_tf(self, is_on: bool) -> None:
         """Publish the transforms from now on, or no more."""
-        if is_on and not self._with_tf and not self.recent_transforms:
+        if is_on:
             self._advertise(TF)
         self._with_tf = is_on
 
@@ -178,6 +179,9 @@ class EstimatePublisher:
         self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=self._header(stamp_ns, self._frames.odom_frame), status=entries))
 
     def _advertise(self, topic: str) -> None:
+        if topic in self._advertised:
+            return
+        self._advertised.add(topic)
         self._transport.advertise(self._topics[topic], _TYPES[topic], is_latched=topic in _LATCHED)
 
     def _publish(self, topic: str, message: object) -> None:
