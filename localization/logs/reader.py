@@ -30,9 +30,9 @@ from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, odometry_edge
+from motion_models.input_files import check_file, open_input, read_text
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
-from motion_models.text_files import check_file
 
 _GPS = "/fix"
 _TF_READ_NS = 10_000_000_000  # in ROS 1, and from simulators, fixed transforms are repeated every 0.1 to 1 s on /tf
@@ -386,12 +386,10 @@ def _open_folder(path: Path) -> Source:
 def _read_metadata(path: Path) -> tuple[list[str], int]:
     """Names of the storage files, and how many messages they hold. Raises `DamagedError` and `FileNotFoundError`."""
     require_file(path)
-    if path.stat().st_size > _MAX_METADATA_BYTES:
-        raise DamagedError("metadata.yaml is longer than any recorder's")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of the parser, about names that come twice
-            content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+            content = YAML(typ="safe").load(read_text(path, _MAX_METADATA_BYTES))["rosbag2_bagfile_information"]
         names, listed = content["relative_file_paths"], content["message_count"]
     except FileNotFoundError:
         raise
@@ -432,7 +430,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _open_file(path: Path) -> Source:
     require_file(path)
-    with path.open("rb") as file:
+    with open_input(path) as file:
         head = file.read(16)
     if not head:
         raise LogError(f"log '{path}' is empty.")
