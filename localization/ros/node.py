@@ -127,7 +127,14 @@ class Node:
         config, state_file = run.node, run.files.state
         discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
         # now: subscribers have found it by the first estimate
-        publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
+        publisher = EstimatePublisher(
+            transport,
+            config.names,
+            config.frames,
+            with_tf=config.tf,
+            map_topic=config.map_topic,
+            transform_tolerance_s=config.transform_tolerance,
+        )
         is_resumed = state_file is not None and state_file.exists()
         needed = read_head(state_file).get("topics", []) if state_file is not None and is_resumed else []
 

@@ -56,6 +56,8 @@ class NodeStatus:
         if is_paused:
             self.statuses.append(Status("pause", WARN, "paused: no messages are used. Call ~/pause with data: false to continue."))
         self._publisher.publish_diagnostics(self.statuses, inputs.robot.name, stamp_ns)
+        if (place := session.pipeline.estimator.localization()) is not None:
+            self._publisher.publish_localization(place["state"])
         parameters: Mapping[str, tuple[float, float]] = session.pipeline.estimator.parameters()
         if parameters:
             self._publisher.publish_corrections(parameters, stamp_ns)
