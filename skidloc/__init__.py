@@ -7,7 +7,7 @@ work with in a notebook.
 >>> for run in runs:
 ...     print(f"{run.name}: {run.ate_m:.1f} m")
 diff_drive_odometry: 7.0 m
-diff_drive_ekf: 3.0 m
+diff_drive_ekf: 3.1 m
 """
 
 from importlib import import_module, metadata
