@@ -122,7 +122,10 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     first_ns = moving_ns = first = None
     for payload in log.readings({t: TopicDecoder(0, _tagged(t, decode), late.get(t, 0)) for t, decode in decoders.items()}):
         first_ns = payload.stamp_ns if first_ns is None else first_ns
-        gathered.setdefault(payload.topic, []).append(payload.reading)
+        reading = payload.reading
+        if reading.stamp_ns != payload.stamp_ns:  # by its topic's clock
+            reading = replace(reading, stamp_ns=payload.stamp_ns)
+        gathered.setdefault(payload.topic, []).append(reading)
         if moving_ns is None and payload.topic == log.sources.wheels.topic:
             first = payload.reading if first is None else first
             moving_ns = payload.stamp_ns if has_moved(first, payload.reading) else None

@@ -172,7 +172,7 @@ class Log:
     def readings(self, decoders: Mapping[str, TopicDecoder]) -> Iterator[Any]:
         """Payloads of ``decoders`` (by topic) as they are, in order of stamps, by the same clocks as `events`."""
         stats = MessageStats()
-        return merge(self._items(decoders, stats), self._clock_plan(list(decoders)), stats)
+        return merge(self._items(decoders, stats), self._clocks_with(decoders), stats)
 
     def scans(self) -> Iterator[Scan]:
         """Scans or clouds of the LiDAR alone, with the ranges of its driver; none without a LiDAR."""
@@ -189,8 +189,7 @@ class Log:
         self._chooser.require(topic, REFERENCE_TYPES, "--reference")
         stats = self._stats_by_topic[topic] = MessageStats()
         decode = reference_decoder(self.types[topic])
-        clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
-        return merge(self._items({topic: TopicDecoder(0, decode)}, stats), clocks, stats)
+        return merge(self._items({topic: TopicDecoder(0, decode)}, stats), self._clocks_with([topic]), stats)
 
     @cached_property
     def mounts(self) -> Mapping[str, Mount]:
@@ -289,6 +288,11 @@ class Log:
 
     def _plan_event_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])
+
+    def _clocks_with(self, topics: Iterable[str]) -> ClockPlan:
+        """Clocks of the topics in use and of ``topics``: alone, one would be the common clock whatever its epoch."""
+        used = [source.topic for source in self.sources.used()]
+        return self._clocks if {*topics} <= {*used} else self._clock_plan([*used, *topics])
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:
         first: dict[str, list[FirstMessage]] = {}
