@@ -17,7 +17,7 @@ ENV PATH="/opt/skidloc/bin:$PATH" \
 USER 1000
 WORKDIR /tmp
 # compiles what a replay needs, once and not with each container
-RUN skidloc simulate preliminary --out warm.mcap && skidloc replay warm.mcap --robot vaultbot --out warm && rm -r warm.mcap warm
+RUN skidloc warm-up
 WORKDIR /data
 ENTRYPOINT ["skidloc"]
 CMD ["--help"]

@@ -24,7 +24,7 @@ KERNELS := $(shell grep -rlE '^@(threaded_kernel|kernel|subroutine)' --include='
 
 .venv/kernels: .venv/installed $(KERNELS)
 	@echo "Compiling, once (a minute)."
-	$(BIN)/python -m tests.helpers.compile_kernels
+	$(BIN)/skidloc warm-up
 	touch $@
 
 # A minute: real rotations held out, then a drive whose arms move the centre of gravity, and beside both one with a hidden load.

@@ -46,9 +46,16 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "cg": ("Cg", "Compute the centre of gravity from scales, arms and payload."),
     "map": ("Map", "Print, view or export a saved map, or merge two."),
     "online": ("OnlineCommand", "Run the estimator live on ROS topics, or on a log as it was recorded."),
+    "warm-up": ("WarmUpCommand", "Compile once what later starts load."),
     "simulate": ("Simulate", "Simulate a skid-steer robot and write a log."),
 }
 """By name: the class in `localization.commands.NAME`, and one line for the overview."""
+
+
+def module_of(command: str) -> str:
+    """Name of a command's module in `localization.commands`."""
+    return command.replace("-", "_")
+
 
 _OF_LOGS = ("try", "info", "replay", "calibrate", "diagnose", "weigh", "init", "check")
 """Commands whose first argument is a log."""
@@ -172,7 +179,7 @@ def parse(name: str, options: Sequence[str]) -> Any:
     """The command ``name`` with its ``options``, to be run. Raises `SystemExit` (2) for what it does not have."""
     import tyro
 
-    command = getattr(importlib.import_module(f"localization.commands.{name}"), COMMANDS[name][0])
+    command = getattr(importlib.import_module(f"localization.commands.{module_of(name)}"), COMMANDS[name][0])
     options = _expand(options, set(_three_state_options(command)))
     try:
         return tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from localization.errors import OutputError
+from motion_models.input_files import open_input
 
 _LIBRARIES = ("skidloc", "numpy", "numba", "filterpy", "gtsam", "kiss-icp", "rosbags")
 _FINGERPRINT_BYTES = 1 << 20  # of the begin and of the end of each file
@@ -123,7 +124,7 @@ def fingerprint(path: Path) -> str:
     for file in sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]:
         size = file.stat().st_size
         digest.update(os.fsencode(file.relative_to(path)) + f"\0{size}\0".encode())
-        with file.open("rb") as data:
+        with open_input(file) as data:
             digest.update(data.read(_FINGERPRINT_BYTES))
             data.seek(max(size - _FINGERPRINT_BYTES, 0))
             digest.update(data.read(_FINGERPRINT_BYTES))

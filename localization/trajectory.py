@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from localization.errors import EvaluationError
 from localization.output import whole_file
 from motion_models import se2
+from motion_models.input_files import read_table
 from motion_models.se2 import FloatArray
-from motion_models.text_files import check_file
 
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -223,8 +223,7 @@ def number_rows(path: str | Path, columns: tuple[str, ...]) -> Iterator[tuple[in
     """(line number, words) of every line that is not empty, a comment or cut at the end of the file. Raises `EvaluationError` unless it has
     all ``columns``."""
     try:
-        check_file(path)
-        text = Path(path).read_text(encoding="utf-8-sig")
+        text = read_table(path)
     except OSError as error:
         raise EvaluationError(f"'{path}' cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:

@@ -18,17 +18,34 @@ from numba.core import caching
 from numba.extending import register_jitable
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+NOT_STORED = (
+    "compiled code can be stored neither beside the package nor in the home folder: each start compiles for a minute."
+    " Set NUMBA_CACHE_DIR to a folder that can be written."
+)
+_not_stored: list[str] = []
 _PACKAGES = ("motion_models", "localization", "tests")
 
 
 def kernel(function: _Function) -> _Function:
     """A loop that Python calls, compiled once for each set of argument types. Division by zero gives inf or NaN, as in numpy."""
-    return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True)(function)  # type: ignore[call-overload, no-any-return]
+    return _compile(function)
 
 
 def threaded_kernel(function: _Function) -> _Function:
     """A `kernel` during which other threads of Python run: for loops of more than some milliseconds beside the estimates."""
-    return numba.njit(cache=True, error_model="numpy", no_cfunc_wrapper=True, nogil=True)(function)  # type: ignore[call-overload, no-any-return]
+    return _compile(function, nogil=True)
+
+
+def _compile(function: _Function, **options: bool) -> _Function:
+    """Stored on disk, where numba finds a folder that can be written; else compiled at each start, which is reported once."""
+    options |= {"no_cfunc_wrapper": True}
+    try:
+        return numba.njit(cache=True, error_model="numpy", **options)(function)  # type: ignore[call-overload, no-any-return]
+    except RuntimeError:
+        if not _not_stored:
+            print(f"skidloc: {NOT_STORED}", file=sys.stderr)
+        _not_stored.append(getattr(function, "__name__", ""))
+        return numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload, no-any-return]
 
 
 def subroutine(function: _Function) -> _Function:

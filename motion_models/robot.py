@@ -142,6 +142,11 @@ class Joints:
         left, right, backwards = (tuple(names[joint] for joint in side) for side in (self.left, self.right, self.reversed))
         return replace(self, left=left, right=right, reversed=backwards)
 
+    def of_sides(self, left: str, right: str) -> Joints:
+        """One joint a side, ``left`` and ``right``, reversed where all wheels of that side are."""
+        backwards = ((left, self.left), (right, self.right))
+        return replace(self, left=(left,), right=(right,), reversed=tuple(name for name, side in backwards if {*side} <= {*self.reversed}))
+
 
 @dataclass(frozen=True)
 class Imu:

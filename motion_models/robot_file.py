@@ -21,10 +21,10 @@ from typing import Any, TypeVar
 
 from motion_models.center_of_gravity.parts import Arms
 from motion_models.errors import RobotError
+from motion_models.input_files import read_text
 from motion_models.registry import MODELS, params_of, traits_of
 from motion_models.robot import DRIVES, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Lidar, Mount, Robot, Tf, Topics, WheelNoise
 from motion_models.terms import VARIABLES, parse_terms, terms_table
-from motion_models.text_files import read_text
 
 Section = TypeVar("Section")
 

@@ -7,7 +7,7 @@ work with in a notebook.
 >>> for run in runs:
 ...     print(f"{run.name}: {run.ate_m:.1f} m")
 diff_drive_odometry: 7.0 m
-diff_drive_ekf: 3.0 m
+diff_drive_ekf: 3.1 m
 """
 
 from importlib import import_module, metadata
@@ -15,6 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from localization import *  # noqa: F403
+    from localization.events import CgSample as CgSample
+    from localization.events import ImuSample as ImuSample
+    from localization.events import PositionSample as PositionSample
+    from localization.events import Scan as Scan
+    from localization.events import WheelSample as WheelSample
     from motion_models import *  # noqa: F403
     from skidloc.online import Online as Online
     from skidloc.robot_log import RobotLog as RobotLog
@@ -22,7 +27,11 @@ if TYPE_CHECKING:
     from skidloc.robot_log import ScoredRun as ScoredRun
     from skidloc.robot_log import open as open
 
-_OWN = {"Online": "skidloc.online", **dict.fromkeys(("RobotLog", "Runs", "ScoredRun", "open"), "skidloc.robot_log")}
+_OWN = {
+    "Online": "skidloc.online",
+    **dict.fromkeys(("RobotLog", "Runs", "ScoredRun", "open"), "skidloc.robot_log"),
+    **dict.fromkeys(("CgSample", "ImuSample", "PositionSample", "Scan", "WheelSample"), "localization.events"),
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from localization.cli import COMMANDS, main
+from localization.cli import COMMANDS, main, module_of
 from localization.commands.short_help import short_help
 
 HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "tyro")
@@ -17,7 +17,7 @@ HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "tyro")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_overview_of_each_command_is_its_docstring(name: str) -> None:
     class_name, summary = COMMANDS[name]
-    command = getattr(importlib.import_module(f"localization.commands.{name}"), class_name)
+    command = getattr(importlib.import_module(f"localization.commands.{module_of(name)}"), class_name)
     assert (command.__doc__ or "").splitlines()[0] == summary
 
 
@@ -42,7 +42,7 @@ def test_short_help_has_each_option_of_the_command(command: str) -> None:
     name = COMMANDS[command][0]
     text = short_help(command, name)
     assert text is not None
-    for field in dataclasses.fields(getattr(importlib.import_module(f"localization.commands.{command}"), name)):
+    for field in dataclasses.fields(getattr(importlib.import_module(f"localization.commands.{module_of(command)}"), name)):
         flag = "--" + field.name.replace("_", "-")
         assert any(line.startswith(("  " + flag, "  " + field.name.upper())) for line in text.splitlines()) or f"{flag}.*" in text
 

@@ -12,7 +12,7 @@ from ruamel.yaml.error import YAMLError
 
 from motion_models.center_of_gravity.drive_controllers import ControllerValues, controller_values, drive_kinds
 from motion_models.errors import RobotError
-from motion_models.text_files import read_text
+from motion_models.input_files import read_text
 
 
 def read_controllers(path: Path) -> tuple[ControllerValues, ...]:

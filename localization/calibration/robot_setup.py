@@ -35,9 +35,9 @@ from motion_models.center_of_gravity.drive_controllers import ControllerValues
 from motion_models.center_of_gravity.urdf import first_names, link_poses, parse_urdf
 from motion_models.center_of_gravity.urdf_wheels import WheelGeometry, is_wheel, sides, wheel_geometry
 from motion_models.errors import RobotError
+from motion_models.input_files import read_text
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
 from motion_models.se2 import FloatArray
-from motion_models.text_files import read_text
 
 _RAW = re.compile(r"raw|mag", re.IGNORECASE)
 _OPEN_SIDES = "sides: the sources contradict each other and the log does not decide; drive a turn, or give --left and --right."

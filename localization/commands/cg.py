@@ -21,11 +21,11 @@ from motion_models.center_of_gravity.weighing import WHEELS, WeighedCg, read_wei
 from motion_models.errors import CgError, RobotError
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import loads
+from motion_models.input_files import read_text
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
-from motion_models.text_files import read_text
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class Option:
 
 def short_help(command: str, class_name: str) -> str | None:
     """Text for ``skidloc command --help``; None where the command has subcommands."""
-    found, options = _class(f"localization.commands.{command}", class_name)
+    found, options = _class(f"localization.commands.{command.replace('-', '_')}", class_name)
     if any(option.name == "action" for option in options):
         return None
     required = [o.flag if o.is_positional else f"{o.flag} {o.name.upper()}" for o in options if o.is_required]

@@ -28,6 +28,7 @@ from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs
 from localization.report.try_page import Part, TryResult, summarize, write_try_page
 from motion_models.errors import SkidlocError
+from motion_models.input_files import read_text
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.robot_file import load_robot
 
@@ -171,4 +172,4 @@ def _contents(folder: Path, models: tuple[str, ...]) -> dict[str, Any]:
     files = {f"calibrate_{model}": folder / f"calibrate_{model}.json" for model in models}
     files |= {"check": folder / "check" / "check.json", "replay": folder / "replay" / "metrics.json"}
     files |= {"diagnose": folder / "diagnosis" / "diagnosis.json"}
-    return {name: json.loads(path.read_text(encoding="utf-8")) for name, path in files.items() if path.exists()}
+    return {name: json.loads(read_text(path)) for name, path in files.items() if path.exists()}

@@ -29,6 +29,7 @@ from localization.report.figures import Axes, plain_logs, svg
 from localization.report.figures import Figure as Canvas
 from localization.report.replay_page import MISSING, number
 from localization.report.runs import capitalize, estimator_colours
+from motion_models.input_files import read_bytes
 
 _MARKERS = "osD^v"  # of matplotlib, by motion model
 _ROW_HEIGHT_IN = 0.42
@@ -68,7 +69,7 @@ def write_comparison_report(path: Path, head: CompareHead, found: ComparisonFind
 def check_report(path: Path) -> None:
     """Raises `OutputError` where a report would overwrite something else."""
     try:
-        if path.exists() and f"<title>{_TITLE}".encode() not in path.read_bytes()[:1000]:
+        if path.exists() and f"<title>{_TITLE}".encode() not in read_bytes(path)[:1000]:
             raise OutputError(f"'{path}' exists already and is no report of a comparison. Choose another --out, or remove it.")
     except OSError as error:
         raise OutputError(f"'{path}' cannot be read: {error.strerror}.") from error

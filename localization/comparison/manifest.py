@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from dataclasses import dataclass
 from pathlib import Path
 
 from localization.comparison.jobs import LogOrigin
 from localization.errors import LogError
+from motion_models.input_files import read_table
 
 COLUMNS = ("log", "robot", "reference", "floor", "day")
 
@@ -31,11 +33,10 @@ def read_manifest(path: Path, robot: str | None, reference: str | None) -> list[
     Raises `LogError` with the line where a log or robot is missing.
     """
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = header
-            rows = [(reader.line_num, {name: (row.get(name) or "").strip() for name in COLUMNS}) for row in reader]
+        reader = csv.DictReader(io.StringIO(read_table(path), newline=""), skipinitialspace=True)
+        header = [name.strip() for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        rows = [(reader.line_num, {name: (row.get(name) or "").strip() for name in COLUMNS}) for row in reader]
     except OSError as error:
         raise LogError(f"manifest '{path}' cannot be read: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error) as error:

@@ -14,6 +14,7 @@ from localization.comparison.jobs import INPUT, OK, Job, Row, TrialSpec
 from localization.errors import OutputError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS
 from localization.output import output_errors, whole_file
+from motion_models.input_files import open_input, read_table
 
 _HEAD = ("log", "robot", "model", "estimator", "corrections", "key", "status", "error")
 _TEXTS = (*_HEAD, "floor", "day", "cause", "notes", "damage", "faults")
@@ -166,8 +167,8 @@ def _write_csv(file: BinaryIO, rows: Sequence[Row]) -> None:
 
 
 def _read_csv(path: Path) -> list[Row]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return [{name: value if name in _TEXTS else _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    rows = csv.DictReader(io.StringIO(read_table(path), newline=""))
+    return [{name: value if name in _TEXTS else _number(value) for name, value in row.items()} for row in rows]
 
 
 def _number(text: str) -> float | int | None:
@@ -187,7 +188,8 @@ def _parquet(path: Path) -> tuple[Callable[[Path], list[Row]], Callable[[BinaryI
 
     def read(path: Path) -> list[Row]:
         try:
-            return [dict(row) for row in parquet.read_table(path).to_pylist()]
+            with open_input(path) as file:
+                return [dict(row) for row in parquet.read_table(file).to_pylist()]
         except pyarrow.ArrowException as error:
             raise ValueError(" ".join(str(error).split())) from error
 

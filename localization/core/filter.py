@@ -18,6 +18,8 @@ from localization.core.state import Group, Layout, Perturbation, State
 from localization.errors import EstimatorError
 from motion_models.se2 import FloatArray
 
+_STEP_MOMENTS = np.array([[2.0 / 15.0, -0.1], [-0.1, 1.2]])
+"""E (a, b)^T (a, b) of the line that is next to a step at a uniform time (`add_change`)."""
 _MAX_NUMBER = 1e12
 """No state or covariance of a robot on Earth is larger, in SI units."""
 
@@ -215,6 +217,21 @@ def widen(state: State, name: str, variance: float) -> State:
     known = state.P[row, row]
     c = state.P[:, row] / known
     return State(state.layout, state.means, state.P + max(variance - known, 0.0) * np.outer(c, c))
+
+
+def add_change(state: State, name: str, variance: float, by: str, seconds: float) -> State:
+    """The state whose variable ``name``, of one dimension, has changed by an independent error with this ``variance``, at a time that is
+    unknown in the last ``seconds``. ``by`` (2,) is considered, and adds to ``name`` since then: a constant, and a slope over time.
+
+    A change d at the share s of that time is, over all of it, next to the line d (a + b t / seconds), b = 6 s (1 - s), a = 1 - s - b / 2:
+    the least squares of a step. With s uniform, E (a, b) = (0, 1), that of a ramp. What the line has done to the other errors is C (a, b).
+    """
+    row, rows = state.layout.rows[name].start, state.layout.rows[by]
+    C = np.linalg.solve(state.P[rows, rows] * [1.0, max(seconds, 1e-9)], state.P[rows, :]).T
+    C[rows], C[row] = 0.0, 0.0
+    one = np.eye(len(C))[row]
+    ramp = np.outer(C[:, 1], one)
+    return State(state.layout, state.means, state.P + variance * (C @ _STEP_MOMENTS @ C.T + ramp + ramp.T + np.outer(one, one)))
 
 
 def set_marginal(state: State, name: str, mean: FloatArray, cov: FloatArray) -> State:

@@ -57,10 +57,16 @@ def wheel_twist_cov(cov: Cov3, slip: Cov3, duration: float) -> Cov3:
     return clip_eigenvalues(cov - of_step) + min(duration / SLIP_LASTS_S, 1.0) * of_step
 
 
-def fuse_turn(twist: Tangent2, cov: Cov3, turn: float, variance: float) -> tuple[Tangent2, Cov3]:
-    """``twist`` (3,), or a way along one, with ``cov`` (3, 3), updated by a measured turn (rate) and its variance."""
-    gain = cov[:, 2] / (cov[2, 2] + variance)
-    return twist + gain * (turn - twist[2]), cov - gain[:, None] * cov[2]
+def fuse_turn(twist: Tangent2, cov: Cov3, turn: float, variance: float, of_clock: Cov3) -> tuple[Tangent2, Cov3]:
+    """``twist`` (3,) with ``cov`` (3, 3), updated by a measured turn rate and its variance.
+
+    Of ``cov``, ``of_clock`` (3, 3) is by the offset of the wheels' clock. A turn rate is no measurement of velocities by way of that: where
+    wheels accelerate, a gyro with a bias would change the speed by all that the clock leaves open. The gain of the velocities is without
+    it (Schmidt 1966), and the covariance is by that gain (Joseph form).
+    """
+    K = np.append(cov[:2, 2] - of_clock[:2, 2], cov[2, 2]) / (cov[2, 2] + variance)
+    I_KH = np.eye(3) - np.outer(K, [0.0, 0.0, 1.0])
+    return twist + K * (turn - twist[2]), I_KH @ cov @ I_KH.T + variance * np.outer(K, K)
 
 
 def mean_twist(delta: Pose2, cov: Cov3, duration: float) -> tuple[Twist2, Cov3]:

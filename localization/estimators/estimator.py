@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from localization.core.policies.clock_offset import ClocksApart
+from localization.core.policies.standstill import BiasChange
 from localization.events import PositionSample, Step, Turn
 from localization.lidar import LostScans
 from localization.lifting import Pose3, Trajectory3
@@ -138,6 +139,11 @@ class Estimator(ABC):
     @property
     def clocks_apart(self) -> ClocksApart | None:
         """Clocks of two sensors alone that are certainly apart; None where they are not, or a third sensor shows whose is off."""
+        return None
+
+    @property
+    def bias_change(self) -> BiasChange | None:
+        """The last change of the gyro's bias between two rests that is a fault; None where there was none."""
         return None
 
     @property

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Generic, TypeVar
 
 from localization.core.policies.clock_offset import ClocksApart
+from localization.core.policies.standstill import BiasChange
 from localization.estimators.estimator import Estimator, GyroCalibration, LearnedParameter, Residuals
 from localization.lidar import LostScans
 from motion_models.se2 import FloatArray
@@ -27,6 +28,11 @@ class FilteredOdometry(Estimator, Generic[Filter]):
     def clocks_apart(self) -> ClocksApart | None:
         """See `Estimator.clocks_apart`."""
         return self.odometry.clocks_apart
+
+    @property
+    def bias_change(self) -> BiasChange | None:
+        """See `Estimator.bias_change`."""
+        return self.odometry.bias_change
 
     @property
     def params(self) -> FloatArray | None:

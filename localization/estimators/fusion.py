@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from localization.core.filter import Innovation, clone, inflate, inflate_both, propagate, set_marginal, update, widen
+from localization.core.filter import Innovation, add_change, augment, clone, inflate, inflate_both, propagate, set_marginal, update, widen
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.standstill import measure_bias, measure_standstill
 from localization.core.measurements.turn import measure_turn
@@ -19,9 +19,9 @@ from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
 from localization.core.policies.outlier import NOTHING_MISSED, PriorOutlier
 from localization.core.policies.slip import SweepSlip
-from localization.core.policies.standstill import StandstillTest
+from localization.core.policies.standstill import BIAS_CHANGE_COV, BiasChange, StandstillTest
 from localization.core.policies.wheel_noise import WheelNoiseScale
-from localization.core.state import State
+from localization.core.state import State, Vector
 from localization.core.twist import fuse_turn, mean_twist, slip_change_cov, twist_at_end, wheel_twist_cov
 from localization.estimators.estimator import (
     NO_POINTS,
@@ -83,9 +83,10 @@ class EkfFusion(Estimator):
             config = replace(config, wheel_radius_sigma=0.0)
         self.model, self._sensor = model, sensor
         self.noise = NoiseModel(robot.wheel_noise, robot.gyro_noise, corrections, config)
-        self.state = initial_state(self.noise, has_lidar=sensor is not None)
+        state = initial_state(self.noise, has_lidar=sensor is not None)
+        self.state = augment(state, "bias_change", Vector(2), np.zeros(2), BIAS_CHANGE_COV)
         """Means and covariance at the end of the last step."""
-        excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius)
+        excitation = Excitation(robot.geometry.track_width_m, corrections.min_track_over_radius, ("bias_change",))
         standstill = StandstillTest(robot.gyro_noise.bias_sigma_rad_per_s)
         self._policies = Policies(excitation, standstill, ContinuousPose() if sensor is None else None)
         self.last = LastStep(Motion(np.zeros(3), np.zeros((3, 3))), self.state["corrections"], is_turning=True)
@@ -105,6 +106,7 @@ class EkfFusion(Estimator):
         step, bias = policies.standstill.add(self.state, step)
         if bias is not None:
             self.state = widen(self.state, "gyro_bias", bias.prior_variance)
+            self.state = add_change(self.state, "gyro_bias", bias.change_variance, "bias_change", policies.standstill.since_rest_s)
             self.state, _ = update(self.state, measure_bias(self.state, bias.rate, bias.variance), policies.excitation.considered())
         state = clone(self.state, "pose", "start")
         by_wheels = state = propagate(state, wheel_transition(state, step, motion, self.noise))
@@ -159,10 +161,11 @@ class EkfFusion(Estimator):
             state = inflate_both(state, ("start", "pose"), np.diag([0.0, 0.0, before]))
             state = inflate(state, "pose", np.diag([0.0, 0.0, of_step]))
         open_bias = {"gyro_bias"} if standstill.is_bias_open else set()
-        state, innovation = update(state, measure_turn(state, step.turn), considered | open_bias)
+        state, innovation = update(state, measure_turn(state, step.turn, standstill.since_rest_s), considered | open_bias)
         self._policies.wheel_noise.learn(innovation)
         if standstill.is_at_rest:
             state, _ = update(state, measure_standstill(state), considered)
+            state = set_marginal(state, "bias_change", np.zeros(2), BIAS_CHANGE_COV)
         return state, innovation
 
     def _update_scan(self, state: State, step: Step) -> tuple[State, Innovation | None, Cov3]:
@@ -215,7 +218,8 @@ class EkfFusion(Estimator):
             wheels_cov = wheel_twist_cov(wheels_cov, slip, dt)
         wheels, wheels_cov = twist_at_end(wheels, wheels_cov, change, math.inf)
         if rate is not None:
-            wheels, wheels_cov = fuse_turn(wheels, wheels_cov, *rate)
+            per_s = step.d_clock / dt
+            wheels, wheels_cov = fuse_turn(wheels, wheels_cov, *rate, by_wheels.cov("clock") * np.outer(per_s, per_s))
         if not is_measured:
             return wheels, wheels_cov
         cov[2, :], cov[:, 2], cov[2, 2] = 0.0, 0.0, wheels_cov[2, 2]
@@ -230,6 +234,11 @@ class EkfFusion(Estimator):
     def clocks_apart(self) -> ClocksApart | None:
         """See `Estimator.clocks_apart`."""
         return find_clocks_apart(self.state, self._has_gyro, self._sensor is not None)
+
+    @property
+    def bias_change(self) -> BiasChange | None:
+        """See `Estimator.bias_change`."""
+        return self._policies.standstill.change
 
     @property
     def params(self) -> FloatArray:

@@ -20,7 +20,7 @@ errors within three standard deviations of that (3e-6).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -62,6 +62,8 @@ class Consistency:
     fraction_inside: float
     """Part of the samples below the 95 % quantile of their own chi-square distribution; 0.95 if consistent."""
     probability: float
+    n_left_out: int = 0
+    """Poses that do not count, as their covariance does not grow from the first match on (`pose_errors`)."""
 
     @property
     def p_value(self) -> float:
@@ -188,7 +190,7 @@ class PoseErrors:
     covariances: FloatArray | None
     """(N, 3, 3) covariances of the estimator, or None if it has none."""
     n_left_out: int = 0
-    """Matches left out: before the first motion, and where the growth of the covariance since the first match is no covariance."""
+    """Matches left out because the growth of the covariance since the first match is no covariance."""
     motions: FloatArray | None = None
     """(N, 3) estimated motion since the first match [m, m, rad]."""
     claimed: FloatArray | None = None
@@ -220,13 +222,14 @@ def pose_errors(trajectory: Trajectory, reference: ReferenceTrack, max_gap_s: fl
         return PoseErrors(stamps, errors, None, motions=d)
     grown = known[1:] - moved_covariances(known[0], d)
     stands = (np.abs(d).max(axis=1) < 1e-9) & (np.abs(grown).max(axis=(1, 2)) < 1e-15)
-    use = is_covariance(grown) & ~stands
+    grows = is_covariance(grown)
+    use, left_out = grows & ~stands, int(np.count_nonzero(~grows & ~stands))
     claimed = grown
     grown = grown + np.eye(3) * trajectory.interpolation_errors_at(stamps)[:, None, :] ** 2
     if part.covariances is not None:
         noise = covariances_in_body(part.covariances, truth[:, 2])
         grown = grown + noise[1:] + moved_covariances(noise[0], r)
-    return PoseErrors(stamps[use], errors[use], grown[use], int(np.count_nonzero(~use)), d[use], claimed[use], _roots(grown[use]))
+    return PoseErrors(stamps[use], errors[use], grown[use], left_out, d[use], claimed[use], _roots(grown[use]))
 
 
 def _is_moved(poses: FloatArray) -> NDArray[np.bool_]:
@@ -256,7 +259,7 @@ def pose_consistency(
     found = pose_errors(trajectory, reference, max_gap_s)
     if found.covariances is None or not found.covariances.any():
         return None
-    return _along_one_run(found, probability, is_dead_reckoning)
+    return replace(_along_one_run(found, probability, is_dead_reckoning), n_left_out=found.n_left_out)
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from localization.logs import Log
 from localization.logs.reference_topics import east_north, geodetic_to_ecef
 from localization.trajectory import IntArray, number_rows, parse_float, tum_rows, whole_lines, yaw_of_quaternion
 from motion_models import se2
+from motion_models.input_files import read_table
 from motion_models.se2 import FloatArray
-from motion_models.text_files import check_file
 
 LogStamps = Callable[[], IntArray]
 """Stamps of the log's scans, or of its events where it has no scans, ascending [ns]: for files without times."""
@@ -205,8 +205,7 @@ def _spread_stamps(n: int, log_stamps: LogStamps | None, path: Path) -> IntArray
 
 def _text_lines(path: Path) -> list[str]:
     try:
-        check_file(path)
-        lines = whole_lines(path.read_text(encoding="utf-8-sig"))
+        lines = whole_lines(read_table(path))
     except OSError as error:
         raise EvaluationError(f"'{path}' cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:

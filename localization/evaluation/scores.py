@@ -39,6 +39,8 @@ class Result:
     """Accuracy of the poses as they were published, where they are not the trajectory."""
     nees_band: tuple[float, float] | None = None
     """Where `nees_mean` is in 95 % of drives of consistent covariances, for as many independent samples as this drive has."""
+    nees_counts: tuple[int, int] | None = None
+    """Poses in `nees_mean`, and those left out of it because their covariances do not grow along the drive."""
     position_nees: Consistency | None = None
     """NEES of distances from the start, 1 expected, where the reference has positions and their covariances, but no headings."""
     stretch_nees: Consistency | None = None
@@ -74,6 +76,7 @@ class Result:
             **{name: numbers.pop(name) for name in first},
             "nees_mean": self.nees_mean,
             "nees_band": None if self.nees_band is None else list(self.nees_band),
+            "nees_counts": None if self.nees_counts is None else list(self.nees_counts),
             "position_nees_mean": None if self.position_nees is None else self.position_nees.mean,
             "position_nees_band": None if self.position_nees is None else list(self.position_nees.band),
             "stretch_nees_mean": None if self.stretch_nees is None else self.stretch_nees.mean,
@@ -121,9 +124,10 @@ def _score(run: Run, reference: ReferenceTrack | Relations | None, contradiction
     stretches = stretch_consistency(published, reference, _LEVER_SIGMA_M) if drifts else None
     found = pose_consistency(published, reference, is_dead_reckoning=drifts)
     mean, band = (None, None) if found is None else (found.mean, found.band)
+    counts = None if found is None else (found.n, found.n_left_out)
     by_distances = None
     if reference.yaws is None:
         by_distances = position_consistency(published, reference, _LEVER_SIGMA_M, is_dead_reckoning=drifts)
     is_over = found is not None and found.mean > found.band[1] and reference.covariances is None
     scatter = scatter_consistency(published, reference) if is_over and not drifts else None
-    return Result(run, accuracy, mean, live, band, by_distances, stretches, scatter)
+    return Result(run, accuracy, mean, live, band, counts, by_distances, stretches, scatter)

@@ -38,7 +38,7 @@ def with_changes(stacks: Sequence[Stack], choices: Sequence[Choice]) -> tuple[li
             composite = _best_change(stacks, choice, i)
             if composite is not None:
                 alternatives = [*found[i].alternatives, composite]
-                found[i] = Stack(stack.kind, alternatives, stack.sizes, stack.t)
+                found[i] = Stack(stack.kind, alternatives, stack.sizes, stack.behind_s, stack.t)
                 changed.append((*choice[:i], len(alternatives) - 1, *choice[i + 1 :]))
     return found, changed
 
@@ -60,7 +60,7 @@ def _best_change(stacks: Sequence[Stack], choice: Choice, index: int) -> Alterna
     joined = [_joined(stack, base, k, row, m, is_since) for _, base, k, row, is_since in best for m in bins]
     if not joined:
         return None
-    tried = [Stack(stack.kind, joined, stack.sizes, stack.t) if i == index else other for i, other in enumerate(stacks)]
+    tried = [Stack(stack.kind, joined, stack.sizes, stack.behind_s, stack.t) if i == index else other for i, other in enumerate(stacks)]
     scores = log_posterior(tried, choice, index, level)
     unchanged = log_posterior(stacks, choice, index, level)
     return joined[int(scores.argmax())] if scores.max() > unchanged.max() else None

@@ -9,20 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from localization.events import ImuSample, Scan
+from localization.events import Scan
 from localization.evidence.alternatives import Row
 from localization.evidence.fields import own_faults
 from localization.evidence.search import make_stacks
 from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, from_scans, is_comparable
 from localization.evidence.verdict import CORRECTED, SetUp, decide
 from localization.logs import Log, TopicOverrides, open_log
-from localization.logs.decode import JointReading, OdometryReading, decode_imu
+from localization.logs.decode import MAX_RATE_RAD_S, JointReading, OdometryReading, imu_decoder
 from localization.logs.event_decoder import TopicDecoder, late_ns
 from localization.logs.wheel_messages import odometry_decoder, wheel_decoder
 from motion_models.errors import CalibrationError
@@ -33,10 +32,6 @@ _MOVING_S, _READ_S, _SCANS_S, _STANDING_S = 120.0, 900.0, 75.0, 5.0
 """Time after the first motion that is read, in all, with scans (registering one takes a millisecond), and kept from before it [s]."""
 _MOVED = 0.02
 """Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
-_APART_S = 2.0
-"""Difference of the latencies of two topics beyond which their stamps hardly overlap [s]; which clock is off is judged by evidence."""
-_SAME_TIME_S = 1e-6
-"""Difference of times that are one [s]."""
 _DEG_PER_RAD = 180.0 / math.pi
 
 
@@ -108,21 +103,13 @@ def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
     if len(used) < 2:
         there = used[0].name if used else "no source"
         return SetUp("undecidable", robot, reason=f"{there} alone measures the motion often enough: nothing can be compared.")
-    start, end = _span(used)
+    start, end = max(source.t[0] for source in used), min(source.t[-1] for source in used)
     edges = bin_edges(used, start, end)
     if len(edges) < 12:
         return SetUp("undecidable", robot, reason=f"the sources overlap by {max(end - start, 0.0):.1f} s: too short to be compared.")
     if all(float(np.nanmax(np.abs(source.rates(edges)), initial=0.0)) < 1e-3 for source in used):
         return SetUp("undecidable", robot, reason="nothing moves: drive straight on for 10 s and turn in place both ways.")
     return decide(used, make_stacks(used, edges, robot), robot, own)
-
-
-def _span(sources: Sequence[Source]) -> tuple[float, float]:
-    """Begin and end of what is compared [s]: where all sources are; or any, where times of recording show that clocks are apart."""
-    behind = [source.behind_s for source in sources if source.behind_s is not None]
-    first, last = [float(source.t[0]) for source in sources], [float(source.t[-1]) for source in sources]
-    is_apart = len(behind) > 1 and max(behind) - min(behind) > _APART_S
-    return (min(first), max(last)) if is_apart else (max(first), min(last))
 
 
 def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Source]:
@@ -135,7 +122,10 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     first_ns = moving_ns = first = None
     for payload in log.readings({t: TopicDecoder(0, _tagged(t, decode), late.get(t, 0)) for t, decode in decoders.items()}):
         first_ns = payload.stamp_ns if first_ns is None else first_ns
-        gathered.setdefault(payload.topic, []).append(payload.reading)
+        reading = payload.reading
+        if reading.stamp_ns != payload.stamp_ns:  # by its topic's clock
+            reading = replace(reading, stamp_ns=payload.stamp_ns)
+        gathered.setdefault(payload.topic, []).append(reading)
         if moving_ns is None and payload.topic == log.sources.wheels.topic:
             first = payload.reading if first is None else first
             moving_ns = payload.stamp_ns if has_moved(first, payload.reading) else None
@@ -152,15 +142,7 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     if reference is not None and reference.yaws is not None:
         of_reference = from_poses(reference.source, reference.stamps_ns, reference.poses, begin_ns)
         found += [] if of_reference is None else [of_reference]
-    behind = {source.name: _behind_s(log, source.name) for source in found}
-    return [replace(source, first_ns=begin_ns, behind_s=behind[source.name]) for source in found]
-
-
-def _behind_s(log: Log, name: str) -> float | None:
-    """Time of recording less stamp of a source [s]; None where it has none, or where all times of recording are stamps."""
-    if all(abs(behind) < _SAME_TIME_S for behind in log.behind_s.values()):
-        return None
-    return log.behind_s.get(name.partition(" and ")[0])
+    return [replace(source, first_ns=begin_ns, behind_s=log.behind_s.get(source.name)) for source in found]
 
 
 def sources_of_readings(log: Any, readings: Mapping[str, Sequence[Any]], first_ns: int) -> list[Source]:
@@ -214,14 +196,8 @@ def _decoders(log: Log) -> dict[str, Callable[[Any, int], Any]]:
         else:
             found[source.topic] = odometry_decoder(source.type, log.robot.driver.length_unit_m)
     if log.sources.imu is not None:
-        found[log.sources.imu.topic] = partial(_decode_fast_imu, unit=log.robot.imu.rate_unit_rad_s)
+        found[log.sources.imu.topic] = imu_decoder(log.robot.imu.rate_unit_rad_s, _DEG_PER_RAD * MAX_RATE_RAD_S)
     return found
-
-
-def _decode_fast_imu(message: Any, stamp: int, unit: float) -> ImuSample:
-    """Decode an IMU message whose rates only another unit than rad/s explains."""
-    sample = decode_imu(message, stamp, unit / _DEG_PER_RAD)
-    return replace(sample, angular_velocity=_DEG_PER_RAD * sample.angular_velocity)
 
 
 def has_moved(first: Any, reading: Any) -> bool:

@@ -74,6 +74,8 @@ class Stack:
     alternatives: Sequence[Alternative]
     raw: Mapping[str, float] = field(default_factory=dict)
     """`sizes`, where ``alternatives`` are not all of them."""
+    behind_s: float | None = None
+    """`Source.behind_s`."""
 
     @cached_property
     def sizes(self) -> Mapping[str, float]:
@@ -91,7 +93,7 @@ class Stack:
 
     def only(self, k: int) -> Stack:
         """The stack with alternative ``k`` alone."""
-        return Stack(self.kind, [self.alternatives[k]], self.sizes, self.t)
+        return Stack(self.kind, [self.alternatives[k]], self.sizes, self.behind_s, self.t)
 
     def alone(self, name: str, size: float) -> FloatArray:
         """Evidence (A,) of a channel that no other source measures; ``size``: of the motion of usual robots. 0 where it is unknown."""
@@ -120,11 +122,12 @@ class Stack:
         return np.asarray(found)
 
     def _jacobians_of(self, name: str) -> FloatArray:
-        """(A, n) tempered logarithm of the Jacobian of a channel where it moves: at rest, rates are noise of encoders in any unit."""
+        """(A, n) tempered logarithm of the Jacobian of a channel, for encoders where they move: at rest they count nothing in any unit."""
         channel = self.channel(name)
         assert channel is not None
         names = list(_SIZES) if self.kind == "driver" else [name]  # a driver reckons both of the same wheels
-        is_moving = np.any([self._is_moving(each) for each in names], axis=0)
+        has_noise = self.kind not in ("wheels", "driver")  # at rest as well
+        is_moving = np.isfinite(channel) if has_noise else np.any([self._is_moving(each) for each in names], axis=0)
         shares = _SCALE_SHARE[self.kind]
         share = np.array([shares[(name == "turn") != a.is_crossed] for a in self.alternatives])
         of_bins = np.stack([np.broadcast_to(a.log_jacobian, channel.shape[1:]) for a in self.alternatives])

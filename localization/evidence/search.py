@@ -35,10 +35,11 @@ _SEARCH_LEVELS = (0.35, 1.0)
 _MAX_BINS = 140
 _CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
 """Prior odds of a clock that is off by `_CLOCK_S`; of a longer delay x they fall as 1 / x^2, as many delays are tried (`delays`)."""
+_LATENCY_TAIL_S, _SYNCHRONIZED_S = 0.2, 0.02
+"""Latency from a measurement to its recording, from where on longer ones are rarer as 1 / x^2 [s]: queues of scans reach 0.7 s. Nothing is
+recorded before it is measured, but for clocks of computers, which NTP synchronizes to 20 ms."""
 _LATENCY_SIGMA_S = 0.05
 """Standard deviation of the latencies of drivers, which the filter estimates by itself [s]: they reach 0.1 s."""
-_OTHER_RECORDER, _RECORDER_SPAN_S = 0.02, 200.0
-"""Share of logs whose recorder has another clock than the sensors, and how far that is off [s]."""
 _UNRELATED_ODDS = math.log(1e-5)
 """Prior odds of a source that measures another motion, or none: another robot's, a frozen sensor, a fault that no row has."""
 
@@ -75,11 +76,10 @@ def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> l
         for delay in of_source:
             rates = source.rates(edges, delay)[bins]
             second = source.rates(edges, delay, of_second=True)[bins] if source.second is not None else np.full_like(rates, np.nan)
-            rows, recorded = ((clock_row(source, delay),) if delay else ()), _recorded_evidence(source, delay)
-            of_delay = MAKERS[source.kind](source, rates, second, robot)
-            found += [replace(a, rows=(*a.rows, *rows), own=a.own + recorded, delay_s=delay) for a in of_delay]
+            rows = (clock_row(source, delay),) if delay else ()
+            found += [replace(a, rows=(*a.rows, *rows), delay_s=delay) for a in MAKERS[source.kind](source, rates, second, robot)]
         found.append(_unrelated(source, found[0]))
-        stacks.append(Stack(source.kind, found, t=edges[bins]))
+        stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins]))
     return stacks
 
 
@@ -92,15 +92,6 @@ def _sizes_of_motion(source: Source, rates: FloatArray) -> dict[str, float]:
     if source.kind == "wheels":
         return {}
     return {"way": size_of(np.linalg.norm(rates[:, :2], axis=1)), "turn": size_of(rates[:, 2])}
-
-
-def _recorded_evidence(source: Source, delay_s: float) -> float:
-    """Log density of the time from a source's stamps, less a delay, to their recording: a latency, or the recorder's clock is another."""
-    if source.behind_s is None:
-        return 0.0
-    latency = (source.behind_s + delay_s - _LATENCY_SIGMA_S) / (2.0 * _LATENCY_SIGMA_S)
-    inlier = math.log(1.0 - _OTHER_RECORDER) - 0.5 * latency**2 - math.log(2.0 * _LATENCY_SIGMA_S * math.sqrt(math.tau))
-    return float(np.logaddexp(inlier, math.log(_OTHER_RECORDER / _RECORDER_SPAN_S)))
 
 
 def _moving_bins(sources: Sequence[Source], rates: Sequence[FloatArray]) -> IntArray:
@@ -263,7 +254,8 @@ def rows_of(stacks: Sequence[Stack], choice: Choice) -> tuple[Row, ...]:
 def posterior(stacks: Sequence[Stack], scores: Mapping[Choice, float]) -> list[tuple[float, Choice]]:
     """Probability by choice, the most probable first; choices that are corrected alike count together.
 
-    Delays that differ by one constant are the same alignment of the sources (only their prior differs): they share its evidence.
+    Delays that differ by one constant are the same alignment of the sources: they share its evidence, but for their prior and for the
+    times of recording.
     """
     scores = _with_shared_evidence(stacks, scores)
     top = max(scores.values())
@@ -286,5 +278,18 @@ def _with_shared_evidence(stacks: Sequence[Stack], scores: Mapping[Choice, float
     found = {}
     for members in alignments.values():
         evidence = max(scores[choice] - prior for choice, prior in members)
-        found.update({choice: evidence + prior for choice, prior in members})
+        found.update({choice: evidence + prior + _recording_evidence(stacks, choice) for choice, prior in members})
     return found
+
+
+def _recording_evidence(stacks: Sequence[Stack], choice: Choice) -> float:
+    """Log density of the latencies from the measurements to their recording, by a recorder whose own clock may be off as any other."""
+    chosen = [(stack.behind_s, stack.alternatives[k]) for stack, k in zip(stacks, choice, strict=True)]
+    latencies = np.array([behind + a.delay_s for behind, a in chosen if behind is not None])
+    by_offset = []
+    for offset in (0.0, *latencies):
+        late = latencies - offset
+        scale = np.where(late > 0.0, _LATENCY_TAIL_S, _SYNCHRONIZED_S)
+        prior = _CLOCK_ODDS - 2.0 * math.log(max(abs(offset), _CLOCK_S) / _CLOCK_S) if offset else 0.0
+        by_offset.append(prior - float(np.log1p((late / scale) ** 2).sum()))
+    return max(by_offset)

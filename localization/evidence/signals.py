@@ -72,7 +72,7 @@ class Source:
     sizes_by_others: Mapping[str, float] = field(default_factory=dict)
     """Root mean square of the way [m/s] and the turn [rad/s] by the other sources that measure them; set by `search.make_stacks`."""
     behind_s: float | None = None
-    """Time of recording less stamp [s]; None where the recorder has no clock of its own."""
+    """Least time of recording less stamp [s]; None where that is unknown."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
 

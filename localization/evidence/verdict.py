@@ -105,10 +105,11 @@ def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own
 
 
 def _alignment(sources: Sequence[Source], kept: Sequence[tuple[float, Choice, tuple[Row, ...]]], common: tuple[Row, ...]) -> Row | None:
-    """The clock to shift where set-ups differ in which of the clocks is off, and agree in how far they are apart; else None."""
-    rest = [[row for row in rows if row.family not in {r.family for r in common}] for _, _, rows in kept]
+    """The clock to shift where set-ups differ in which of the clocks is off, whatever else they differ in, and all have one; else None."""
+    families = {row.family for row in common}
+    rest = [[row for row in rows if row.source == "clock" and row.family not in families] for _, _, rows in kept]
     clocks = {row.id: row for rows in rest for row in rows}
-    if len(kept) < 2 or len(clocks) < 2 or any(len(rows) != 1 or rows[0].source != "clock" for rows in rest):
+    if len(kept) < 2 or len(clocks) < 2 or any(len(rows) != 1 for rows in rest):
         return None
     return next((clocks[key] for key in ("clock.wheels", "clock.gyro", "clock.lidar") if key in clocks), None)
 
@@ -124,7 +125,9 @@ def _aligned(
 ) -> SetUp:
     """Two clocks are apart, and nothing shows which is off: they are brought together, and the covariance has the way in that time."""
     rows = (*common, clock)
-    corrected, others = _correct(robot, rows), sorted({row.text for _, _, r in kept for row in r if row.source == "clock"} - {clock.text})
+    families = {row.family for row in rows}
+    corrected = _correct(robot, rows)
+    others = sorted({" and ".join(row.text for row in r if row.family not in families) for _, _, r in kept} - {""})
     late_s = abs(clock.value or 0.0)
     keys = changed_entries(robot, corrected)
     text = _alignment_warning(sources, clock, others, keys)

@@ -17,6 +17,8 @@ from typing import Any, BinaryIO, NamedTuple, Protocol
 import lz4.frame  # type: ignore[import-untyped]
 from rosbags.interfaces import MessageDefinition
 
+from motion_models.input_files import open_input
+
 if sys.version_info >= (3, 14):
     from compression import zstd
 else:
@@ -185,7 +187,7 @@ def decompress_file(path: Path, target: Path) -> str:
     """Decompress a zstd file into ``target`` as far as it is valid; returns why it stopped, or nothing."""
     most = max_decompressed_bytes(path.stat().st_size)
     try:
-        with path.open("rb") as packed, target.open("wb") as plain:
+        with open_input(path) as packed, target.open("wb") as plain:
             return _copy(_decompressed_pieces(packed), plain, most)
     except zstd.ZstdError as error:
         return str(error)

@@ -12,8 +12,8 @@ wrong. Three steps:
 - How far a topic's clock is from the recorder's is taken from its first eleven messages: one that lies behind them (a latched message, a
   buffer of the driver) is dropped as old. Where fewer than three are known, the clock may still be replaced by the next three.
 - A topic without stamps gets the time of recording; one whose clock is far from all others is shifted by a constant.
-- Plausible messages are held in a heap until nothing older can come: one second after the slowest topic's usual latency. Live they are
-  passed on at once.
+- Plausible messages of a file are sorted: as many are held as memory allows (`_MAX_BUFFERED_WEIGHT`), however late they were recorded.
+  Live they are passed on at once.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from localization.logs.decode import MessageStats, Oddity
 
 _SECOND = 1_000_000_000
 _MAX_STEP_NS = _SECOND
-_REORDER_WAIT_NS = _SECOND
 _MAX_CLOCK_OFFSET_NS = 10 * _SECOND  # more is another clock, not latency
 _EQUAL_JUMP_NS = _SECOND // 4  # jumps of two topics that differ by less have one cause
 _MIN_JUMPED_MESSAGES = 3
@@ -46,7 +45,7 @@ _PACE_MESSAGES, _MIN_PACE_MESSAGES = 20, 8
 _MAX_PENDING_NS = 10 * _SECOND  # bounds the latency
 _MAX_BURST_NS = 5 * _SECOND
 _MAX_PENDING_MESSAGES = 1000  # bounds the memory
-_MAX_BUFFERED_WEIGHT = 20_000  # bounds the memory: 200 scans
+_MAX_BUFFERED_WEIGHT = 20_000  # bounds the memory: 200 scans, or 20 s of a robot with an IMU of 100 Hz
 _RATE_WINDOW_NS, _MIN_RATE_WINDOWS, _MAX_RATE_WINDOWS = 5 * _SECOND, 6, 360
 """Times of recording over which the least latency is taken, and fewest and most of these windows, to compare the rates of clocks."""
 _MAX_RATE, _MAX_DRIFT_S, _LINEAR = 0.002, 0.15, 0.1
@@ -174,19 +173,11 @@ class TopicClock:
         """Shift of the stamps of this topic."""
         return self._shift
 
-    def horizon(self, log_ns: int) -> int:
-        """Lower bound of the stamps of messages recorded after ``log_ns``.
-
-        Messages that have been pending for ten seconds are dropped, so that they do not hold all others.
-        """
+    def expire(self, log_ns: int) -> None:
+        """Drop messages that have been pending for ten seconds."""
         while self._pending and log_ns - self._pending[0].log_ns > _MAX_PENDING_NS:
             del self._pending[0]
             self._stats.count(self._topic, Oddity.OUTLIER)
-        if not self._pending:
-            return log_ns + self.offset_ns
-        first = self._pending[0]
-        since = min(log_ns, first.log_ns) + self.offset_ns
-        return min(since, first.stamp_ns + self._shift) if self._may_be_late() else since
 
     def insert(self, item: Item) -> list[Item]:
         """Insert the next message; returns those that are plausible now, with their final stamps."""
@@ -361,12 +352,12 @@ def _odd_of(drifts: Mapping[str, tuple[float, float]]) -> dict[str, float]:
 class Merger:
     """Merges items by stamp: `insert` an item, take the payloads that are due. A topic's payloads always have increasing stamps.
 
-    With ``wait_ns`` [ns] (a log) the payloads of all topics come in order of stamps, never decreasing. Without (live) each is yielded at
-    once, in order of arrival: one that comes after a newer one of its own topic is dropped; those late against other topics are passed on.
+    The payloads of a log come in order of stamps, never decreasing. ``is_live``: each is yielded at once, in order of arrival: one that
+    comes after a newer one of its own topic is dropped; those late against other topics are passed on.
     """
 
-    def __init__(self, plan: ClockPlan, stats: MessageStats, wait_ns: int | None = _REORDER_WAIT_NS) -> None:
-        self._plan, self._stats, self._wait_ns = plan, stats, wait_ns
+    def __init__(self, plan: ClockPlan, stats: MessageStats, is_live: bool = False) -> None:
+        self._plan, self._stats, self._is_live = plan, stats, is_live
         self._jumps: list[int] = []
         self._clocks = {topic: TopicClock(topic, plan, self._jumps, stats) for topic in plan.latency_ns}
         self._held: list[tuple[int, int, int, Item]] = []
@@ -382,11 +373,8 @@ class Merger:
             clock = self._clocks[item.topic] = TopicClock(item.topic, self._plan, self._jumps, self._stats)
         self._now = max(self._now, item.log_ns)
         self._hold(clock.insert(item))
-        if self._wait_ns is None:
-            clock.horizon(self._now)  # drops what has been pending for long
-            yield from self._release(2**63 - 1, 0)
-        else:
-            yield from self._release(min(c.horizon(self._now) for c in self._clocks.values()) - self._wait_ns, _MAX_BUFFERED_WEIGHT)
+        clock.expire(self._now)
+        yield from self._release(0 if self._is_live else _MAX_BUFFERED_WEIGHT)
 
     def shift_ns(self, topic: str) -> int:
         """Shift of the stamps of ``topic``, whose clock was set or is not the common one."""
@@ -400,7 +388,7 @@ class Merger:
         """Release everything that is held, at the end of the messages."""
         for clock in self._clocks.values():
             self._hold(clock.flush())
-        yield from self._release(2**63 - 1, 0)
+        yield from self._release(0)
         self._compare_rates()
 
     def _compare_rates(self) -> None:
@@ -411,7 +399,7 @@ class Merger:
 
     def _hold(self, items: Iterable[Item]) -> None:
         for item in items:
-            newest = self._newest if self._wait_ns is not None else self._emitted.get((item.topic, item.rank), item.stamp_ns)
+            newest = self._newest if not self._is_live else self._emitted.get((item.topic, item.rank), item.stamp_ns)
             if item.stamp_ns < newest:
                 self._stats.count(item.topic, Oddity.LATE)
                 continue
@@ -419,9 +407,9 @@ class Merger:
             self._serial += 1
             self._held_weight += item.weight
 
-    def _release(self, horizon: int, most: int) -> Iterator[Any]:
+    def _release(self, most: int) -> Iterator[Any]:
         held = self._held
-        while held and (held[0][0] <= horizon or self._held_weight > most):
+        while self._held_weight > most:
             stamp, _, _, item = heapq.heappop(held)
             self._held_weight -= item.weight
             if self._emitted.get((item.topic, item.rank)) == stamp:
@@ -446,15 +434,6 @@ def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterat
     for item in items:
         yield from merger.insert(item)
     yield from merger.flush()
-
-
-def moved_back(item: Item, by_ns: int) -> Item:
-    """``item`` recorded and stamped earlier by ``by_ns`` [ns]; one without a stamp has none after it, and one that was stamped before the
-    clock was set keeps its stamp."""
-    if not by_ns:
-        return item
-    is_earlier = item.log_ns - item.stamp_ns > by_ns // 2
-    return _restamped(item._replace(log_ns=item.log_ns - by_ns), item.stamp_ns - (0 if is_earlier else by_ns) if item.stamp_ns else 0)
 
 
 def _restamped(item: Item, stamp_ns: int) -> Item:

@@ -24,8 +24,10 @@ MAX_PERIODS = 1.5
 """Length of a sweep in periods: some overlap a little, and drivers join packets by whole ones."""
 _MAX_SWEEP = 1e9  # of the longest sweep, in nanoseconds
 _MIN_SWEEP = 0.05  # of the longest sweep, a field of view of 27 degrees: times in milliseconds are known from times that are wrong
-_MAX_RATE_RAD_S = math.radians(2000.0)  # rad/s, the full scale of gyros on robots
+MAX_RATE_RAD_S = math.radians(2000.0)
+"""Full scale of gyros on robots [rad/s]."""
 _MAX_SPECIFIC_FORCE_M_S2 = 1e5  # m/s^2; drivers use other units, in which this may be 100 g (cm/s^2)
+_MAX_ORIENTATION_GAP_NS = 500_000_000  # as `rate_series` has it: over more, no turn is interpolated
 _MIN_SQUARED_NORM = 0.01  # of a rotation, as its quaternion need not be normalised; a smaller one was not filled in
 _MAX_BEAMS = 1_000_000  # of a planar scan; the finest scanners have 20,000
 _MAX_FIELD_OF_VIEW_RAD = math.tau * 1.1  # from first to last beam; scanners that turn on a little overlap their first beam
@@ -43,12 +45,14 @@ class Oddity(Enum):
     NOT_FINITE = "dropped (NaN or inf)"
     BEYOND = "dropped (beyond what such a sensor can measure)"
     NO_FIX = "left out (no GPS fix)"
+    NO_RATES = "left out (zero rates with a covariance of -1, and no orientation: this IMU has no gyro; name one that has)"
+    RATES_OF_ORIENTATION = "without a gyro (zero rates with a covariance of -1); its rates are those of the orientation"
     NO_STAMP = "without a header stamp, placed by the time of recording"
     FOREIGN_CLOCK = "stamped by another clock than the other topics', moved to the time of recording"
     OUT_OF_ORDER = "recorded out of order, and sorted"
     REPEATED = "dropped (stamp repeated)"
     SECOND_FRAME = "dropped (stamp repeated by another frame: two sensors share the topic); give each of them its own topic"
-    LATE = "dropped (recorded more than a second after newer ones)"
+    LATE = "dropped (recorded long after newer ones)"
     OLD = "dropped (stamped seconds before the topic's others: latched, or left in a buffer)"
     OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
     REBASED = "stamped after a jump of the clock, moved back by it"
@@ -153,17 +157,54 @@ def frame_name(frame_id: str) -> str:
     return frame_id.strip().lstrip("/")
 
 
-def decode_imu(message: Any, stamp: int, rate_unit_rad_s: float = 1.0) -> ImuSample:
-    """sensor_msgs/Imu, with its angular velocities in ``rate_unit_rad_s``. Raises `UnusableError`."""
-    w, a = message.angular_velocity, message.linear_acceleration
-    if not math.isfinite(w.x + w.y + w.z + a.x + a.y + a.z):  # faster than numpy on six numbers
-        raise UnusableError(Oddity.NOT_FINITE)
-    if (
-        max(abs(w.x), abs(w.y), abs(w.z)) * abs(rate_unit_rad_s) > _MAX_RATE_RAD_S
-        or max(abs(a.x), abs(a.y), abs(a.z)) > _MAX_SPECIFIC_FORCE_M_S2
-    ):
-        raise UnusableError(Oddity.BEYOND)
-    return ImuSample(stamp, rate_unit_rad_s * np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z]), frame_name(message.header.frame_id))
+def imu_decoder(
+    rate_unit_rad_s: float = 1.0, max_rate_rad_s: float = MAX_RATE_RAD_S, count: Callable[[Oddity], None] = lambda oddity: None
+) -> Callable[[Any, int], ImuSample | None]:
+    """Decoder of sensor_msgs/Imu, with its angular velocities in ``rate_unit_rad_s``, up to ``max_rate_rad_s``. It raises `UnusableError`.
+
+    An AHRS or a receiver with two antennas may have no gyro: the first covariance of the angular velocity is -1, and the rates are zero.
+    Rates are then those of the orientation, log(R_a^T R_b) / dt from one message to the next, at the middle of both; the sum of the turns
+    is the orientation's. ``count`` is called with each of these.
+    """
+    last: tuple[int, FloatArray] | None = None
+
+    def decode(message: Any, stamp: int) -> ImuSample | None:
+        nonlocal last
+        w, a = message.angular_velocity, message.linear_acceleration
+        has_gyro = message.angular_velocity_covariance[0] != -1.0 or w.x != 0.0 or w.y != 0.0 or w.z != 0.0
+        if not math.isfinite(w.x + w.y + w.z + a.x + a.y + a.z):  # faster than numpy on six numbers
+            raise UnusableError(Oddity.NOT_FINITE)
+        fastest = max(abs(w.x), abs(w.y), abs(w.z)) * abs(rate_unit_rad_s)
+        if fastest > max_rate_rad_s or max(abs(a.x), abs(a.y), abs(a.z)) > _MAX_SPECIFIC_FORCE_M_S2:
+            raise UnusableError(Oddity.BEYOND)
+        frame, force = frame_name(message.header.frame_id), np.array([a.x, a.y, a.z])
+        if has_gyro:
+            return ImuSample(stamp, rate_unit_rad_s * np.array([w.x, w.y, w.z]), force, frame)
+        before, last = last, (stamp, _unit_quaternion(message))
+        count(Oddity.RATES_OF_ORIENTATION)
+        if before is None or not 0 < stamp - before[0] < _MAX_ORIENTATION_GAP_NS:
+            return None
+        turn = _turn_between(before[1], last[1]) / ((stamp - before[0]) * 1e-9)
+        return ImuSample((before[0] + stamp) // 2, turn, force, frame)
+
+    return decode
+
+
+def _unit_quaternion(message: Any) -> FloatArray:
+    """(4,) x, y, z, w of the orientation of a message. Raises `UnusableError` where it has none."""
+    q = np.array([message.orientation.x, message.orientation.y, message.orientation.z, message.orientation.w])
+    norm = float(np.linalg.norm(q))
+    if message.orientation_covariance[0] == -1.0 or not norm * norm >= _MIN_SQUARED_NORM:
+        raise UnusableError(Oddity.NO_RATES)
+    return q / norm
+
+
+def _turn_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(3,) rotation vector from orientation ``a`` to ``b``, in the axes of ``a``; unit quaternions (4,) x, y, z, w."""
+    vector = a[3] * b[:3] - b[3] * a[:3] - np.cross(a[:3], b[:3])
+    sine, cosine = float(np.linalg.norm(vector)), float(a @ b)
+    angle = 2.0 * math.atan2(sine, abs(cosine))
+    return np.zeros(3) if sine == 0.0 else vector * math.copysign(angle / sine, cosine)
 
 
 def decode_cg(message: Any, stamp: int) -> CgSample:

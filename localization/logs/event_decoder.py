@@ -28,10 +28,11 @@ from localization.logs.decode import (
     UnusableError,
     arm_decoder,
     decode_cg,
-    decode_imu,
+    imu_decoder,
     scan_decoder,
     stamp_ns,
 )
+from localization.logs.driver_messages import DRIVER_MESSAGES
 from localization.logs.topic_roles import Sources, TopicSource
 from localization.logs.wheel_messages import ODOMETRY_DECODERS, odometry_decoder, wheel_decoder
 from motion_models.center_of_gravity.cg_model import CgModel, CgTracker
@@ -107,7 +108,9 @@ class EventDecoder:
         self._has_multipliers = bool((self._multipliers != 1.0).any())
         least_radius = robot.geometry.wheel_radius_m * min(1.0, float(self._multipliers.min()))
         self.from_joints = JointsToWheels(left, right, least_radius, wheels, stats)
-        self.from_joints.angle_period = robot.joints.angle_range * robot.joints.angle_unit_rad or math.tau
+        counter = DRIVER_MESSAGES.get(odometry_type)
+        counter_range = 0.0 if counter is None else counter.angle_range_rad
+        self.from_joints.angle_period = robot.joints.angle_range * robot.joints.angle_unit_rad or counter_range or math.tau
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats, is_whole=odometry_type not in ODOMETRY_DECODERS)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
@@ -157,7 +160,7 @@ class EventDecoder:
         if source.kind == "odometry":
             return odometry_decoder(source.type, self._length_unit_m)
         decoders: dict[str, MessageDecoder] = {
-            "imu": partial(decode_imu, rate_unit_rad_s=self._imu_unit),
+            "imu": imu_decoder(self._imu_unit, count=partial(stats.count, source.topic)),
             "center_of_gravity": decode_cg,
             "points": cloud_decoder(self._period_s.get(source.topic)),
         }

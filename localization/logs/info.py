@@ -14,7 +14,7 @@ import numpy as np
 
 from localization.accelerometer import scale_of_force
 from localization.gyro import GRAVITY_SAMPLES
-from localization.logs.decode import decode_imu
+from localization.logs.decode import imu_decoder
 from localization.logs.event_decoder import TopicDecoder
 from localization.logs.reader import Log
 from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
@@ -219,7 +219,7 @@ def _describe_tilt(log: Log) -> str:
 
 def first_force(log: Log, topic: str) -> FloatArray | None:
     """Mean specific force (3,) of an IMU's first samples, as it is published; None where there are none."""
-    samples = islice(log.readings({topic: TopicDecoder(0, decode_imu)}), GRAVITY_SAMPLES)
+    samples = islice(log.readings({topic: TopicDecoder(0, imu_decoder())}), GRAVITY_SAMPLES)
     forces = [sample.linear_acceleration for sample in samples]
     return np.asarray(np.mean(forces, axis=0)) if forces else None
 

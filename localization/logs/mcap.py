@@ -25,6 +25,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from localization.errors import LogError
 from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, decompress_message, in_log_order
 from localization.logs.set_back_clock import Times, describe_set_backs, find_set_backs, later_ns, move_chunks
+from motion_models.input_files import open_input
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -64,7 +65,7 @@ class McapFile:
         self._reported: set[int] = set()
         self.warnings: list[str] = []
         reason, unread = "", 0
-        with path.open("rb") as file:
+        with open_input(path) as file:
             try:
                 self._read_summary(file)
             except (DamagedError, struct.error) as error:
@@ -91,7 +92,7 @@ class McapFile:
         """The messages of these topics in order of log time."""
         wanted = {key: t for key, t in self._topics.items() if t.name in topics}
         later = partial(later_ns, self._set_backs)
-        with self._path.open("rb") as file:
+        with open_input(self._path) as file:
 
             def load(chunk: Chunk) -> list[RawMessage]:
                 file.seek(chunk.position)
@@ -107,7 +108,7 @@ class McapFile:
             yield from in_log_order((c for c in self._chunks if not wanted.keys().isdisjoint(c.counts)), load)
 
     def _times(self, chunk: Chunk) -> Times:
-        with self._path.open("rb") as file:
+        with open_input(self._path) as file:
             file.seek(chunk.position)
             return [(key, log_ns) for key, log_ns, _ in self._entries(file.read(chunk.size))[0]]
 

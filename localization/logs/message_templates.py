@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from localization.logs.driver_messages import definitions
+
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE.register(definitions())
 _T = STORE.types
 _STAMP = (0x5A5A1234, 0x3A3A4321)
 _NS = 1_000_000_000
@@ -29,7 +32,7 @@ Array = NDArray[Any]
 def store_ros1() -> Typestore:
     """Types of ROS 1, made when they are first asked for."""
     store = get_typestore(Stores.ROS1_NOETIC)
-    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    store.register({**definitions(), **get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")})
     return store
 
 

@@ -20,27 +20,24 @@ from localization.errors import LogError, TopicError
 from localization.events import Event, Reference, Scan
 from localization.logs import mcap, ros1, sqlite
 from localization.logs.chunks import DamagedError, RawMessage, Source, decompress_file, merge_channels
-from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, moved_back, odd_rates, plan_clocks
+from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage, Item, merge, odd_rates, plan_clocks
 from localization.logs.decode import MessageStats, UnusableError, frame_name, stamp_ns
 from localization.logs.event_decoder import EventDecoder, FrozenWheel, TopicDecoder, decode_item, late_ns, rate_error
 from localization.logs.reference_topics import reference_decoder
 from localization.logs.serialization import LogDeserializer
-from localization.logs.set_forward_clock import MIN_STEP_NS, Reading, SetForward, describe_set_forwards, earlier_ns, find_set_forwards
 from localization.logs.split import SplitSource
 from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
-from localization.logs.wheel_messages import TF_TYPES, odometry_decoder, odometry_edge, wheel_decoder
+from localization.logs.wheel_messages import TF_TYPES, odometry_edge
+from motion_models.input_files import check_file, open_input, read_text
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
-from motion_models.text_files import check_file
 
 _GPS = "/fix"
 _TF_READ_NS = 10_000_000_000  # in ROS 1, and from simulators, fixed transforms are repeated every 0.1 to 1 s on /tf
 _TRANSFORMS_READ = 2000  # first messages of /tf that are searched for the odometry's
 _FIRST_READ_NS = 20_000_000_000  # of a topic, for its latency; a long log is not read to its end for one that is slow
-_MISSING = 0.02
-"""Part of the time without wheel messages, from where on a clock that was set is looked for."""
 _RATES_READ_NS, _RATES_READ_BYTES = 120_000_000_000, 300_000_000  # from the start, for the rates of clocks: .2 % is .24 s then
 _POINTS_READ = 100  # first messages of a point that may be the centre of gravity
 _JOINT_STATES_READ = 500  # first messages that are searched for joint names
@@ -111,10 +108,8 @@ class Log:
 
     @property
     def behind_s(self) -> Mapping[str, float]:
-        """Time of recording less stamp, as published, of each stamped topic that is used [s], by its first messages: the latency, where
-        clocks agree."""
-        shifts = self._clocks.shifts_ns
-        return {topic: (self._clocks.offset_ns - offset + shifts.get(topic, 0)) * 1e-9 for topic, offset in self._clocks.latency_ns.items()}
+        """Time of recording less stamp of each stamped topic that is used [s], by its first messages: the latency, where clocks agree."""
+        return {topic: (self._clocks.offset_ns - offset) * 1e-9 for topic, offset in self._clocks.latency_ns.items()}
 
     def rate_errors(self) -> dict[str, float]:
         """By how much faster than the recorder's the clock of a topic in use runs [s/s], where it is another than the other topics', by the
@@ -177,7 +172,7 @@ class Log:
     def readings(self, decoders: Mapping[str, TopicDecoder]) -> Iterator[Any]:
         """Payloads of ``decoders`` (by topic) as they are, in order of stamps, by the same clocks as `events`."""
         stats = MessageStats()
-        return merge(self._items(decoders, stats), self._clock_plan(list(decoders)), stats)
+        return merge(self._items(decoders, stats), self._clocks_with(decoders), stats)
 
     def scans(self) -> Iterator[Scan]:
         """Scans or clouds of the LiDAR alone, with the ranges of its driver; none without a LiDAR."""
@@ -194,8 +189,7 @@ class Log:
         self._chooser.require(topic, REFERENCE_TYPES, "--reference")
         stats = self._stats_by_topic[topic] = MessageStats()
         decode = reference_decoder(self.types[topic])
-        clocks = self._clock_plan([*(s.topic for s in self.sources.used()), topic])
-        return merge(self._items({topic: TopicDecoder(0, decode)}, stats), clocks, stats)
+        return merge(self._items({topic: TopicDecoder(0, decode)}, stats), self._clocks_with([topic]), stats)
 
     @cached_property
     def mounts(self) -> Mapping[str, Mount]:
@@ -234,7 +228,7 @@ class Log:
 
     def warnings(self) -> list[str]:
         """Warnings about everything that was lost, corrected or chosen by default so far: `damage` first."""
-        found = [*self.damage(), *describe_set_forwards(self._set_forwards, self.start_ns), *self._mount_notes, *self._choice_notes]
+        found = [*self.damage(), *self._mount_notes, *self._choice_notes]
         for stats in self._stats_by_topic.values():
             found += stats.describe()
         return list(dict.fromkeys(found))
@@ -263,26 +257,7 @@ class Log:
                     decoder = decoder._replace(late_ns=decoder.late_ns + drift_ns)
                 item = decode_item(raw.topic, raw.log_ns, partial(decode, raw), decoder, stats)
                 if item is not None:
-                    yield moved_back(item, earlier_ns(self._set_forwards, raw.log_ns))
-
-    @cached_property
-    def _set_forwards(self) -> tuple[SetForward, ...]:
-        """Where the clock of all topics was set forward; nothing is read where the wheels have messages for nearly all of the time."""
-        wheels = self.sources.wheels
-        period_s = None if wheels is None else self.period_s.get(wheels.topic)
-        count = 0 if wheels is None else sum(channel.count for channel in self.channels if channel.topic == wheels.topic)
-        if wheels is None or period_s is None or self.duration_s - count * period_s < max(MIN_STEP_NS * 1e-9, _MISSING * self.duration_s):
-            return ()
-        decode = LogDeserializer([c for c in self.channels if c.topic == wheels.topic], is_ros1=self.source.is_ros1)
-        of_joints = wheel_decoder((*self._joints[0], *self._joints[1]), self.robot.joints)
-        read = of_joints if wheels.kind == "joint_states" else odometry_decoder(wheels.type, self.robot.driver.length_unit_m)
-
-        def reading_of(raw: RawMessage) -> Reading | None:
-            message = _or_none(decode, raw)
-            return None if message is None or not hasattr(message, "header") else read(message, stamp_ns(message))
-
-        topics = {source.topic for source in self.sources.used()}
-        return tuple(find_set_forwards(self.source.messages(topics), wheels.topic, reading_of))
+                    yield item
 
     def _first_messages(self, topic: str, most: int) -> Iterator[tuple[int, Any]]:
         """The first decodable messages of a topic, with their time of recording."""
@@ -313,6 +288,11 @@ class Log:
 
     def _plan_event_clocks(self) -> ClockPlan:
         return self._clock_plan([source.topic for source in self.sources.used()])
+
+    def _clocks_with(self, topics: Iterable[str]) -> ClockPlan:
+        """Clocks of the topics in use and of ``topics``: alone, one would be the common clock whatever its epoch."""
+        used = [source.topic for source in self.sources.used()]
+        return self._clocks if {*topics} <= {*used} else self._clock_plan([*used, *topics])
 
     def _clock_plan(self, topics: list[str]) -> ClockPlan:
         first: dict[str, list[FirstMessage]] = {}
@@ -410,12 +390,10 @@ def _open_folder(path: Path) -> Source:
 def _read_metadata(path: Path) -> tuple[list[str], int]:
     """Names of the storage files, and how many messages they hold. Raises `DamagedError` and `FileNotFoundError`."""
     require_file(path)
-    if path.stat().st_size > _MAX_METADATA_BYTES:
-        raise DamagedError("metadata.yaml is longer than any recorder's")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of the parser, about names that come twice
-            content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+            content = YAML(typ="safe").load(read_text(path, _MAX_METADATA_BYTES))["rosbag2_bagfile_information"]
         names, listed = content["relative_file_paths"], content["message_count"]
     except FileNotFoundError:
         raise
@@ -456,7 +434,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _open_file(path: Path) -> Source:
     require_file(path)
-    with path.open("rb") as file:
+    with open_input(path) as file:
         head = file.read(16)
     if not head:
         raise LogError(f"log '{path}' is empty.")

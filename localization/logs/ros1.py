@@ -21,6 +21,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from localization.errors import LogError
 from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, in_log_order
 from localization.logs.set_back_clock import Times, describe_set_backs, find_set_backs, later_ns, move_chunks
+from motion_models.input_files import open_input
 
 MAGIC = b"#ROSBAG V"
 
@@ -49,7 +50,7 @@ class Ros1Bag:
         self._chunks: list[Chunk] = []
         self.warnings: list[str] = []
         self._reported: set[int] = set()
-        with path.open("rb") as file:
+        with open_input(path) as file:
             version = file.readline(32).removeprefix(MAGIC).strip()
             if version != b"2.0":
                 raise LogError(f"'{path}' is a ROS bag of version {version.decode(errors='replace')}; only 2.0 can be read.")
@@ -78,7 +79,7 @@ class Ros1Bag:
         """The messages of these topics in order of log time."""
         wanted = {key: c for key, c in self._connections.items() if c.topic in topics}
         later = partial(later_ns, self._set_backs)
-        with self._path.open("rb") as file:
+        with open_input(self._path) as file:
 
             def load(chunk: Chunk) -> list[RawMessage]:
                 listed = sum(chunk.counts.values())
@@ -100,7 +101,7 @@ class Ros1Bag:
 
     def _times(self, chunk: Chunk) -> Times:
         try:
-            with self._path.open("rb") as file:
+            with open_input(self._path) as file:
                 return [(e.key, e.log_ns) for e in _entries(self._chunk_bytes(file, chunk)) if isinstance(e, _Message)]
         except DamagedError:
             return []

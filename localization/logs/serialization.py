@@ -20,6 +20,7 @@ from rosbags.typesys.store import Typestore
 
 from localization.logs.chunks import Channel, RawMessage
 from localization.logs.decode import Oddity, UnusableError
+from localization.logs.driver_messages import WheelJoints, as_joint_states, definitions
 from localization.logs.message_templates import STORE, Message, MessageLayout, Template, store_ros1
 from localization.logs.writer import BODY_FRAME, PARENT_FRAME, FusedEstimate, odometry_message, six_by_six, transform_message
 from motion_models.se2 import FloatArray
@@ -34,7 +35,7 @@ Shape = tuple[Any, ...]
 """Shape of a field: ("base", name), ("message", type), ("array", shape, length) or ("sequence", shape)."""
 
 _CDR, _FIRST = b"\0\1\0\0", 4  # little endian; places are counted from behind these bytes
-_UINT, _HEADER, _IMU = struct.Struct("<I"), struct.Struct("<iII"), struct.Struct("<104x3d72x3d72x")
+_UINT, _HEADER, _IMU = struct.Struct("<I"), struct.Struct("<iII"), struct.Struct("<5d64x4d64x3d72x")
 _LASER_SCAN = struct.Struct("<7fI")
 
 
@@ -45,16 +46,16 @@ def encode(message: Any, *, is_ros1: bool = False) -> bytes:
     return bytes(STORE.cdr_to_ros1(data, kind) if is_ros1 else data)
 
 
-def decoder(kind: str, *, is_ros1: bool = False) -> Callable[[bytes], Any]:
-    """Deserializer of messages of type ``kind`` (package/msg/Type); for frequent types it returns the fields in use only (`fast_decoder`).
-    It raises `UnusableError`."""
+def decoder(kind: str, topic: str = "", *, is_ros1: bool = False) -> Callable[[bytes], Any]:
+    """Deserializer of messages of type ``kind`` (package/msg/Type); for frequent types it returns the fields in use only (`fast_decoder`),
+    for drivers' messages about the wheels on ``topic`` joint states (`driver_messages`). It raises `UnusableError`."""
     deserialize = store_ros1().deserialize_ros1 if is_ros1 else STORE.deserialize_cdr
     fast = None if is_ros1 else fast_decoder(kind)
 
     def decode(data: bytes) -> Any:
         try:
             message = None if fast is None else fast(data)
-            return deserialize(data, kind) if message is None else message
+            return as_joint_states(deserialize(data, kind), topic, kind) if message is None else message
         except Exception as error:  # struct.error, SerdeError, UnicodeDecodeError, ... : the bytes are not such a message
             raise UnusableError(Oddity.UNDECODABLE) from error
 
@@ -109,7 +110,8 @@ def _shape(described: Any) -> Shape:
 
 
 class LogDeserializer:
-    """Deserializes raw messages by the definitions in the log, else by those of ROS 2 Humble (ROS 1: Noetic).
+    """Deserializes raw messages by the definitions in the log, else by those of ROS 2 Humble (ROS 1: Noetic) and of `driver_messages`, of
+    which it makes joint states.
 
     A type's definition is parsed at its first message: a damaged definition affects that type only.
     """
@@ -127,7 +129,7 @@ class LogDeserializer:
             deserialize = _deserializer(raw.type, definition.format, definition.data, self._is_ros1)
             self._deserializers[raw.type] = deserialize
         try:
-            return deserialize(raw.data)
+            return as_joint_states(deserialize(raw.data), raw.topic, raw.type)
         except Exception as error:  # struct.error, SerdeError, UnicodeDecodeError, ... : the bytes are not such a message
             raise UnusableError(Oddity.UNDECODABLE) from error
 
@@ -135,6 +137,7 @@ class LogDeserializer:
 @lru_cache(maxsize=64)
 def _deserializer(kind: str, form: MessageDefinitionFormat, text: str, is_ros1: bool) -> Callable[[bytes], Any]:
     standard = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    standard.register(definitions())
     store = get_typestore(Stores.EMPTY)
     try:
         types = _parse_definition(kind, form, text)
@@ -229,21 +232,24 @@ class Vector3(NamedTuple):
     z: float
 
 
+class Quaternion(NamedTuple):
+    """geometry_msgs/Quaternion."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
 class ImuMessage(NamedTuple):
-    """What is used of sensor_msgs/Imu."""
+    """What is used of sensor_msgs/Imu; of the covariances the first number."""
 
     header: Header
+    orientation: Quaternion
+    orientation_covariance: tuple[float]
     angular_velocity: Vector3
+    angular_velocity_covariance: tuple[float]
     linear_acceleration: Vector3
-
-
-class JointStateMessage(NamedTuple):
-    """What is used of sensor_msgs/JointState."""
-
-    header: Header
-    name: tuple[str, ...]
-    position: FloatArray
-    velocity: FloatArray
 
 
 class LaserScanMessage(NamedTuple):
@@ -278,8 +284,9 @@ def _imu(data: bytes) -> ImuMessage | None:
     at = _aligned(end, 8)
     if not data.startswith(_CDR) or not 0 <= len(data) - at - _IMU.size < 4 or not length or data[end - 1]:
         return None
-    wx, wy, wz, ax, ay, az = _IMU.unpack_from(data, at)
-    return ImuMessage(Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Vector3(wx, wy, wz), Vector3(ax, ay, az))
+    qx, qy, qz, qw, of_q, wx, wy, wz, of_w, ax, ay, az = _IMU.unpack_from(data, at)
+    header, orientation = Header(Stamp(sec, nanosec), data[16 : end - 1].decode()), Quaternion(qx, qy, qz, qw)
+    return ImuMessage(header, orientation, (of_q,), Vector3(wx, wy, wz), (of_w,), Vector3(ax, ay, az))
 
 
 def _laser_scan(data: bytes) -> LaserScanMessage | None:
@@ -298,12 +305,12 @@ def _laser_scan(data: bytes) -> LaserScanMessage | None:
     return LaserScanMessage(header, first, last, step, beam_s, shortest, longest, ranges)
 
 
-def _joint_states() -> Callable[[bytes], JointStateMessage | None]:
+def _joint_states() -> Callable[[bytes], WheelJoints | None]:
     """Caches the names of the last message: they rarely change."""
     cached, frame = b"", ""
     names: tuple[str, ...] = ()
 
-    def read(data: bytes) -> JointStateMessage | None:
+    def read(data: bytes) -> WheelJoints | None:
         nonlocal cached, frame, names
         if not data.startswith(_CDR):
             return None
@@ -320,7 +327,7 @@ def _joint_states() -> Callable[[bytes], JointStateMessage | None]:
         velocity, at = _doubles(data, at)
         _, at = _doubles(data, at)
         sec, nanosec, _ = _HEADER.unpack_from(data, _FIRST)
-        return JointStateMessage(Header(Stamp(sec, nanosec), frame), names, position, velocity) if len(data) - at < 4 else None
+        return WheelJoints(Header(Stamp(sec, nanosec), frame), names, position, velocity) if len(data) - at < 4 else None
 
     return read
 

@@ -22,6 +22,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from localization.errors import LogError
 from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, Channel, DamagedError, RawMessage, decompress_message
 from localization.logs.set_back_clock import COMPARED, MAX_CANDIDATES, MIN_STEP_NS, SetBack, describe_set_backs, is_of_all, later_ns
+from motion_models.input_files import open_input
 
 MAGIC = b"SQLite format 3\x00"
 
@@ -217,7 +218,7 @@ class RecoveredSqlite:
 
     def _leaves(self, read: Callable[[bytes], T | None]) -> Iterator[tuple[int, T]]:
         """Rows on the file's leaf pages, each with its number, of those that ``read`` knows."""
-        with self._path.open("rb") as file:
+        with open_input(self._path) as file:
             pages = _Pages(file)
             leaves = (page for page in map(pages.read, range(1, pages.count)) if page[:1] == bytes([_TABLE_LEAF]))
             rows = ((index, read(payload)) for page in leaves for index, payload in _leaf_rows(pages, page))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from localization.errors import TopicError
 from localization.logs.cg_topic import MeanPoint, choose_cg_topic
 from localization.logs.chunks import Channel
+from localization.logs.driver_messages import DRIVER_MESSAGES, LEFT, RIGHT, is_by_driver
 from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate, is_without_gyro, match_joints
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from motion_models.center_of_gravity.cg_model import CgModel
@@ -30,6 +31,8 @@ REFERENCE_TYPES = (
     "geometry_msgs/msg/TransformStamped",
     "sensor_msgs/msg/NavSatFix",
 )
+OTHER_TYPES: Mapping[str, tuple[str, ...]] = {"joint_states": tuple(DRIVER_MESSAGES), "odometry": (*TWIST_TYPES, *TF_TYPES)}
+"""Types that are read in a role besides its own."""
 _WHEEL_WORDS = re.compile(r"wheel|motor|encoder|tick|joint|odom")
 """Names of topics that may be the wheels', of whatever type."""
 _MAX_LISTED = 4
@@ -131,6 +134,11 @@ class TopicChooser:
         """Topics of one of these types, sorted."""
         return sorted(topic for topic, kind in self._types.items() if kind in types)
 
+    def by_drivers(self) -> list[str]:
+        """Topics of drivers' messages about the wheels; those with angles, where some have them."""
+        found = sorted(topic for topic, kind in self._types.items() if is_by_driver(topic, kind))
+        return [topic for topic in found if DRIVER_MESSAGES[self._types[topic]].has_angles] or found
+
     def type_of(self, topic: str) -> str:
         """Type of a topic's messages; "" where the log has none of it."""
         return self._types.get(topic, "")
@@ -139,7 +147,7 @@ class TopicChooser:
         """The topic that an option or the robot file names. Raises `TopicError` if an option names one that does not fit."""
         wanted = getattr(self._overrides, kind)
         if wanted:
-            others = (*TWIST_TYPES, *TF_TYPES) if kind == "odometry" else ()
+            others = OTHER_TYPES.get(kind, ())
             self.require(wanted, (TYPES[kind], *others), f"--topic.{kind.replace('_', '-')}")
             return TopicSource(wanted, kind, "option", self.type_of(wanted) if self.type_of(wanted) in others else "")
         topic = getattr(self._robot.topics, kind)
@@ -192,7 +200,7 @@ class TopicChooser:
 
     def _describe_other_types(self) -> str:
         """Topics of other types that are the wheels' by name, and what to do: a sentence after a blank, "" where there are none."""
-        read = {*TYPES.values(), *TWIST_TYPES, *TF_TYPES, *REFERENCE_TYPES}
+        read = {*TYPES.values(), *TWIST_TYPES, *TF_TYPES, *REFERENCE_TYPES, *DRIVER_MESSAGES}
         named = {topic: kind for topic, kind in self._types.items() if kind not in read and _WHEEL_WORDS.search(topic.lower())}
         if not named:
             return ""
@@ -382,7 +390,27 @@ class _RoleChooser:
         if len(fitting) > 1:
             topics = ", ".join(topic for topic, _ in fitting)
             self._warnings.append(f"{topics} all have the wheel joints; name one with --topic.joint-states.")
-        return self._odometry(named, known, bool(candidates) and not fitting)
+        driver = self._by_driver() if not fitting and self._overrides.joint_states is None else None
+        return driver or self._odometry(named, known, bool(candidates) and not fitting)
+
+    def _by_driver(self) -> TopicSource | None:
+        """Wheels in messages of a driver's own type, where no joint states have them; None where there are none, or several."""
+        topics = self._chooser.by_drivers()
+        if self._overrides.odometry:
+            return None
+        fitting, known = self._fitting(topics)
+        if not fitting and self._rename_joints(topics, known):
+            fitting, known = self._fitting(topics)
+        if len(fitting) > 1:
+            listed = ", ".join(topic for topic, _ in fitting)
+            self._warnings.append(f"{listed} could each be the wheels; name one with --topic.joint-states.")
+            return None
+        if not fitting:
+            return self._wheels_in_parts(topics)
+        ((topic, self._joints),) = fitting
+        source = self._source_of_joints(topic)
+        self._warnings.append(f"{topic} ({short_type(source.type)}) is used as the wheels: no joint states of {self._log} have them.")
+        return source
 
     def _fitting(self, topics: list[str]) -> tuple[list[tuple[str, Sides]], set[str]]:
         """Topics whose messages have wheels of both sides, with their joints, and all joints of ``topics``."""
@@ -406,6 +434,9 @@ class _RoleChooser:
     def _rename_joints(self, topics: list[str], names: set[str]) -> bool:
         """Give the robot's wheel joints the ``names`` that ``topics`` have for them, where these have another prefix."""
         joints = self._robot.joints
+        if names and names <= {LEFT, RIGHT}:
+            self._robot = replace(self._robot, joints=joints.of_sides(LEFT, RIGHT))
+            return True
         ways = match_joints((*joints.left, *joints.right), sorted(names))
         if len(ways) == 1:
             (way,) = ways
@@ -430,8 +461,8 @@ class _RoleChooser:
             return None
         self._joints = left, right
         named = self._chooser.find_named("joint_states")
-        first = named if named is not None and named.topic in topics else TopicSource(topics[0], "joint_states", "joints")
-        self._more_wheels = tuple(TopicSource(topic, "joint_states", "joints") for topic in topics if topic != first.topic)
+        first = named if named is not None and named.topic in topics else self._source_of_joints(topics[0])
+        self._more_wheels = tuple(self._source_of_joints(topic) for topic in topics if topic != first.topic)
         absent = [joint for joint in (*wanted.left, *wanted.right) if joint not in names]
         rest = f" None has {', '.join(absent)}; their sides are the mean of the others." if absent else ""
         self._warnings.append(
@@ -439,6 +470,10 @@ class _RoleChooser:
             f" each interpolated between its stamps.{rest}"
         )
         return first
+
+    def _source_of_joints(self, topic: str) -> TopicSource:
+        kind = self._chooser.type_of(topic)
+        return TopicSource(topic, "joint_states", "joints", kind if kind != TYPES["joint_states"] else "")
 
     def _odometry(self, joint_states: TopicSource | None, known: set[str], is_missing_joints: bool) -> TopicSource | None:
         """The odometry, where no joint states have the wheels."""

@@ -22,6 +22,7 @@ from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.position_plane import plane_from_json
 from localization.maps.space_map import SpaceMap
 from localization.output import whole_file
+from motion_models.input_files import open_input
 from motion_models.se2 import FloatArray
 
 PLANAR = 1
@@ -31,8 +32,8 @@ SPACE = 2
 _FORMAT, _HEADER = "skidmap", "skidmap.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Time of all members: the earliest that a zip can hold."""
-_MAX_BYTES = 1 << 31
-"""Largest size of all arrays when unpacked [B]: 2 GiB are 250 million points."""
+_MAX_BYTES = 1 << 28
+"""Largest size of all arrays when unpacked [B]: 33 million points. `map info` takes 1 GB for 20 million."""
 _MAX_HEADER_BYTES = 1 << 24
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -111,11 +112,11 @@ def save_map(path: Path, saved: SavedMap) -> None:
 def load_map(path: Path) -> SavedMap:
     """Read and check a map. Raises `MapError` for a file that is missing, foreign, of a newer version, truncated or damaged."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_input(path) as file, zipfile.ZipFile(file) as archive:
             header = _read_header(archive, path)
             shapes = _SHAPES_OF[header["version"]]
             if sum(archive.getinfo(f"{name}.npy").file_size for name in shapes) > _MAX_BYTES:
-                raise MapError(f"map '{path}' holds more than {_MAX_BYTES >> 30} GiB of arrays, which no map of this program does.")
+                raise MapError(f"map '{path}' holds more than {_MAX_BYTES >> 20} MiB of arrays, which no map of this program does.")
             arrays = {name: _read_array(archive, name, dtype, header, path) for name, (dtype, _) in shapes.items()}
             plane = plane_from_json(header["positions"]) if "positions" in header else None
     except FileNotFoundError as error:

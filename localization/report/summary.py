@@ -77,7 +77,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         *_as_published(best),
         *_coverage(best),
         *_consistency(best),
-        *_exactness(best, reference),
+        *(_left_out(best.result) or _exactness(best, reference)),
         *_visibility(best, reference),
         *_by_errors(best, reference),
         *_advice(lines, best, equals, reference),
@@ -279,7 +279,7 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
         if verdict_ == "over" and middle < expected * _MIN_SIGMA_FACTOR**2:
             text += f" in the mean, but most fit (median {middle:.1f}, {expected:.1f} expected), so some outliers make it"
         results_.append((verdict_, text))
-    if nees is not None and not math.isnan(nees):
+    if nees is not None and not math.isnan(nees) and not _left_out(line.result):
         results_.append(_test("NEES", nees, _nees_band(line.result), "errors"))
         if explained := _by_scatter(line.result, nees, [word for word, _ in results_[:-1]]):
             results_[-1] = ("fits", explained)
@@ -311,6 +311,15 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     if found["fits"]:
         return [f"{whose} are consistent: {join_words(found['fits'])}."]
     return [f"{whose} could not be tested: that takes scans, or a reference with headings or with covariances of its positions."]
+
+
+def _left_out(result: Result) -> list[str]:
+    """That NEES is no test where most poses are left out of it."""
+    counted, left_out = result.nees_counts or (0, 0)
+    if left_out <= counted:
+        return []
+    poses = counted + left_out
+    return [f"NEES is not judged: it is of {counted} of {poses} poses, as the covariances of the others shrink along the drive."]
 
 
 def _by_scatter(result: Result, nees: float, innovations: Sequence[str]) -> str:

@@ -22,9 +22,12 @@ from typing import Any
 from localization.errors import CheckpointError
 from localization.output import versions
 from localization.ros.state_serialization import deserialize, serialize, serialize_parts
+from motion_models.input_files import read_bytes
 from motion_models.robot import Robot
 
 _MAGIC = b"skidloc state 1\n"
+_MAX_BYTES = 512 << 20
+"""Largest state [B]: with the map of an hour of driving it has some 50 MB."""
 _INT_END = 2**63 - 1
 _MAX_SHARE = 0.01
 """Largest share of a core for writing states down: 11 ms with the map of a minute in four rooms
@@ -128,7 +131,7 @@ def read_checkpoint(path: Path, made_by: Mapping[str, str], shared: Mapping[str,
 
 def _read(path: Path) -> tuple[dict[str, Any], bytes, bytes]:
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, _MAX_BYTES)
     except OSError as error:
         raise CheckpointError(f"no state can be read from '{path}': {error.strerror}.") from error
     if not content.startswith(_MAGIC):

@@ -14,6 +14,7 @@ from localization.estimate_table import COLUMNS, COV, POSE, TWIST, TWIST_COV, ro
 from localization.estimators import Estimate
 from localization.logs.writer import FusedEstimate
 from localization.trajectory import IntArray
+from motion_models.input_files import check_file
 from motion_models.se2 import FloatArray
 
 _ROW = np.dtype([("stamp_ns", "<i8"), ("numbers", "<f8", (COLUMNS,))])
@@ -52,6 +53,7 @@ class EstimateLog:
     def resume(cls, path: Path, count: int) -> EstimateLog:
         """The first ``count`` rows of a file; what came after them is dropped, to be written anew. Raises `CheckpointError`."""
         try:
+            check_file(path)
             file = path.open("r+b", buffering=0)
             size = file.seek(0, 2)
             if size < count * _ROW.itemsize:

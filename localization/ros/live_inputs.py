@@ -10,7 +10,7 @@ import numpy as np
 
 from localization.logs.decode import MessageStats
 from localization.logs.topic_roles import Sources
-from localization.ros.discovery import TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TransformConflicts
+from localization.ros.discovery import ROLE_GROUPS, TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TransformConflicts
 from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
 from localization.ros.live_stream import LiveStream
 from localization.ros.payloads import Payloads
@@ -74,6 +74,18 @@ class LiveInputs:
         sources = self.sources
         urgent = [source.topic for source in (sources.lidar, sources.wheels if is_predicting else None) if source is not None]
         self._transport.restrict([*others, *self.topics, *commands], [*urgent, *commands])
+
+    def lacking(self) -> list[tuple[str, ...]]:
+        """Groups of roles without a topic."""
+        used = {source.kind for source in self.sources.used()}
+        return [group for group in ROLE_GROUPS if used.isdisjoint(group)]
+
+    def take(self, discovered: DiscoveredTopics, mounts: Mapping[str, Mount]) -> None:
+        """Read the topics of ``discovered`` from here on; angles of the wheels go on."""
+        angles = self.stream.wheel_angles
+        self.discovered = replace(discovered, backlog=(), transforms=self.transforms)
+        self.reopen(mounts)
+        self.stream.restore(angles)
 
     def rewire(self, wiring: LiveRobot, mounts: Mapping[str, Mount]) -> None:
         """Read messages from here on as of the robot of ``wiring``."""

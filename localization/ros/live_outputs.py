@@ -20,13 +20,14 @@ from localization.ros.settings import LiveRun
 from localization.ros.start_pose import StartPose
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
+from motion_models.se2 import Cov3, Pose2
 
 
 class LiveOutputs:
     """Publishes through ``publisher``, with stamps in the clocks of the senders of ``inputs``."""
 
     def __init__(self, publisher: EstimatePublisher, inputs: LiveInputs, trial: Trial, run: LiveRun) -> None:
-        self.publisher, self._inputs, self._trial, self._run = publisher, inputs, trial, run
+        self.publisher, self._inputs, self.trial, self._run = publisher, inputs, trial, run
         self._predictor = self._make_predictor() if run.node.predict else None
         """None where predictions are not wanted."""
         self._interim: InterimOdometry | None = None
@@ -37,7 +38,7 @@ class LiveOutputs:
 
     def _make_predictor(self) -> Predictor:
         """One without an estimate yet, for the robot as its messages are read now."""
-        return Predictor(self._trial.model, self._inputs.robot, self._run.config.step, self._run.node.predict_hz)
+        return Predictor(self.trial.model, self._inputs.robot, self._run.config.step, self._run.node.predict_hz)
 
     def advertise(self, *, has_map_frame: bool) -> None:
         """Open the topics that not every node fills."""
@@ -76,9 +77,11 @@ class LiveOutputs:
             in_odom = Estimate(present.stamp_ns, start.odom_T_start, start.odom_cov, present.twist, present.twist_covariance)
             self.begin_interim(pipeline.synchronizer.wheels.buffer, in_odom)
 
-    def present(self, pipeline: Pipeline, estimate: Estimate) -> Estimate:
-        """``estimate``, the last one, moved to the newest wheel sample."""
-        return self._newest(pipeline) or estimate
+    def present_odometry(self, pipeline: Pipeline, estimate: Estimate) -> tuple[Pose2, Cov3]:
+        """The pose in `odom` and its covariance by ``estimate``, the last one, moved to the newest wheel sample."""
+        estimate = self._newest(pipeline) or estimate
+        pose, cov = estimate.odometry or (estimate.pose, estimate.covariance)
+        return pose, np.zeros((3, 3)) if cov is None else cov
 
     def _newest(self, pipeline: Pipeline) -> Estimate | None:
         """By the last estimate, the pose at the newest wheel sample."""

@@ -48,7 +48,7 @@ class LiveStream:
         parts, self._stats, self._epoch_ns = discovered.parts, stats, epoch_ns
         self.sources: Sources = parts.sources
         self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats, discovered.plan.period_s)
-        self._merger = Merger(discovered.plan, stats, wait_ns=None)
+        self._merger = Merger(discovered.plan, stats, is_live=True)
         self._decoders = {source.topic: decoder(source.type or TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self.topic_rates = {source.topic: TopicRate() for source in parts.sources.used()}
         """Rate of each topic in use."""

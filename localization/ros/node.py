@@ -87,6 +87,7 @@ class Node:
         trial: Trial,
         publisher: EstimatePublisher,
         report: Callable[[str], None],
+        discovery: TopicDiscovery,
         executor: Executor | None = None,
     ) -> None:
         """``run`` with resolved topics; ``executor``: where questions about the set-up are answered beside the estimator. The session
@@ -102,6 +103,7 @@ class Node:
         """None where messages are processed as they come."""
         self._times = DriveTimes()
         self.is_paused = False
+        self.discovery = discovery
 
     @classmethod
     def start(
@@ -125,7 +127,14 @@ class Node:
         config, state_file = run.node, run.files.state
         discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
         # now: subscribers have found it by the first estimate
-        publisher = EstimatePublisher(transport, config.names, config.frames, with_tf=config.tf)
+        publisher = EstimatePublisher(
+            transport,
+            config.names,
+            config.frames,
+            with_tf=config.tf,
+            map_topic=config.map_topic,
+            transform_tolerance_s=config.transform_tolerance,
+        )
         is_resumed = state_file is not None and state_file.exists()
         needed = read_head(state_file).get("topics", []) if state_file is not None and is_resumed else []
 
@@ -142,7 +151,7 @@ class Node:
         notes = prior_notes(run.robot, [trial.model.name])
         for warning in (*notes, *notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
             report(warning)
-        node = cls(transport, run, discovered, trial, publisher, report, executor)
+        node = cls(transport, run, discovered, trial, publisher, report, discovery, executor)
         node._open_session(discovered, view, is_compiled)
         return node
 
@@ -209,6 +218,7 @@ class Node:
             if now >= next_poll:
                 next_poll = now + _POLL_S
                 self.commands.take_loaded_map()
+                self._find_late_topics()
                 self.outputs.publisher.find_readers()
                 on_poll(self)
         self._catch_up(math.inf)
@@ -222,7 +232,7 @@ class Node:
     def publish_status(self, now: float) -> None:
         """Publish diagnostics, and what else is due at ``now`` [s] of the monotonic clock; infinite: all."""
         stamp_ns = self.inputs.stream.sender_stamp_ns(self._times.newest_ns, by_lidar=True)
-        self.status.publish(self.session, self._transport.now_ns(), stamp_ns, is_paused=self.is_paused)
+        self.status.publish(self.session, self.discovery, self._transport.now_ns(), stamp_ns, is_paused=self.is_paused)
         self.outputs.publish_utm(self.session, stamp_ns)
         self.outputs.publish_overview(now, self.session, stamp_ns)
 
@@ -334,6 +344,9 @@ class Node:
         elif received.topic == self.inputs.tf_static:
             self.inputs.transforms.insert(received.data)
             self._add_mounts(self.inputs.transforms.mounts())
+        elif received.topic in self.discovery.late - {*self.topics}:
+            if (discovered := self.discovery.insert_late(received)) is not None:
+                self._take_late_topics(discovered)
         elif self.commands.execute(received) or self.is_paused:
             pass
         elif (gnss := self.inputs.gnss) is not None and received.topic == gnss.topic:
@@ -382,6 +395,33 @@ class Node:
     def _add_to_entrance(self, entrance: LiveSetUp, event: Event) -> None:
         entrance.add_event(event)
         self.session.start_error_m = entrance.largest_error_m
+
+    def _find_late_topics(self) -> None:
+        """Receive topics of roles that are empty, which are published by now."""
+        if self._waiting is None and (lacking := self.inputs.lacking()):
+            self.discovery.watch_late(lacking)
+
+    def _take_late_topics(self, discovered: DiscoveredTopics) -> None:
+        """Use the topics of ``discovered`` from here on; with a LiDAR, the estimator begins anew where the robot is."""
+        before = {*self.topics}
+        had_lidar, estimate, mounts = self.inputs.has_lidar, self.session.health.estimate, self.session.pipeline.mounts
+        self.inputs.take(discovered, mounts)
+        self.session.state.angles = self.inputs.stream.wheel_angles
+        late = sorted({*self.topics} - before)
+        if not late:
+            return
+        self._report(f"{', '.join(late)}: published after the start, and used from here on.")
+        self.inputs.subscribe(self.commands.topics, with_tf=self._run.node.tf, is_predicting=self._run.node.predict)
+        if self.inputs.has_lidar and not had_lidar:
+            self._trial = self._run.make_trial(True)
+            self.outputs.trial = self._trial
+            self.session.change_lidar()
+            self.outputs.advertise(has_map_frame=self.session.pipeline.is_localizing)
+            here = self.session.state.start
+            if estimate is not None:
+                here = StartPose(*self.outputs.present_odometry(self.session.pipeline, estimate))
+            self.restart(replace(here, map_T_start=here.odom_T_start, map_cov=here.odom_cov))
+        self._begin_checks()
 
     def _begin_checks(self) -> None:
         """Ask from here on which set-up the robot has."""

@@ -275,9 +275,8 @@ class OperatorCommands:
         if estimate is None:
             start = self._node.session.state.start
             return start.odom_T_start, start.odom_cov
-        estimate = self._node.outputs.present(self._node.session.pipeline, estimate)
-        pose, cov = estimate.odometry or (estimate.pose, estimate.covariance)
-        return pose, _known(cov)
+        pose, cov = self._node.outputs.present_odometry(self._node.session.pipeline, estimate)
+        return pose, cov
 
 
 def _map_path(name: str) -> Path:

@@ -128,6 +128,14 @@ class Predictor:
         return predicted
 
 
+def extrapolate(estimate: Estimate, stamp_ns: int) -> Estimate:
+    """``estimate`` at another stamp, by its twist; the covariance grows by that of the twist times the time."""
+    seconds = (stamp_ns - estimate.stamp_ns) * _NS
+    twist_cov = np.zeros((3, 3)) if estimate.twist_covariance is None else estimate.twist_covariance
+    motion = Motion(np.array(scalar_exp(triple(seconds * estimate.twist))), seconds**2 * twist_cov, _NO_PARAMS, _NO_CG)
+    return _propagated(estimate, motion, estimate.twist, twist_cov, stamp_ns)
+
+
 def predicted_motion(dt: FloatArray, twists: FloatArray, noise: FloatArray, turn: FloatArray) -> tuple[Motion, FloatArray, FloatArray]:
     """The motion by ``twists`` (n, 3) over intervals ``dt`` (n,) [s] with ``noise`` (8,), the twist at its end (3,), its covariance.
 

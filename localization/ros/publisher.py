@@ -23,6 +23,7 @@ from motion_models.se2 import FloatArray
 
 ODOMETRY, PREDICTED_ODOMETRY, POSE = "~/odometry", "~/odometry_predicted", "~/pose"
 CORRECTIONS, DIAGNOSTICS, PATH, MAP = "~/corrections", "/diagnostics", "~/path", "~/map"
+LOCALIZATION = "~/localization_state"
 
 _NEW_KEYFRAMES = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
 _TYPES = {
@@ -34,8 +35,9 @@ _TYPES = {
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     PATH: "nav_msgs/msg/Path",
     MAP: "nav_msgs/msg/OccupancyGrid",
+    LOCALIZATION: "std_msgs/msg/String",
 }
-_LATCHED = (POSE, PATH, MAP)
+_LATCHED = (POSE, PATH, MAP, LOCALIZATION)
 _MAX_PATH_POSES, _PATH_SPACING_M = 500, 0.05
 """A path is thinned to so many poses: rosbags takes 15 us for each, and no scan shall wait for it for more than 10 ms."""
 _CELL_M, _MAX_CELLS = 0.1, 4_000_000
@@ -52,13 +54,18 @@ class EstimatePublisher:
     there, and the next prediction starts from it.
     """
 
-    def __init__(self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool) -> None:
+    def __init__(
+        self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool, map_topic: str = MAP, transform_tolerance_s: float = 0.0
+    ) -> None:
+        """``transform_tolerance_s``: by how much `map` -> `odom` is stamped later [s]."""
         self._transport, self._with_tf, self._frames = transport, with_tf, frames
+        self._tolerance_ns, self._state = round(transform_tolerance_s * 1e9), ""
         self._odometry = FusedWriter(is_ros1=transport.is_ros1, parent=frames.odom_frame, body=frames.base_link_frame)
         self._map_correction = FusedWriter(is_ros1=transport.is_ros1, parent=frames.map_frame, body=frames.odom_frame)
         self.recent_transforms: deque[bytes] = deque(maxlen=_NEW_KEYFRAMES)
         """Transforms of the body, as they were published."""
-        self._topics = {topic: names.resolve(topic) for topic in _TYPES}
+        self._topics = {topic: names.resolve(map_topic if topic == MAP else topic) for topic in _TYPES}
+        self._advertised: set[str] = set()
         self._has_predictions = False
         self._unread: frozenset[str] = frozenset()  # topics of predictions that nobody receives
         self._path = Path()
@@ -74,7 +81,7 @@ class EstimatePublisher:
 
     def publish_tf(self, is_on: bool) -> None:
         """Publish the transforms from now on, or no more."""
-        if is_on and not self._with_tf and not self.recent_transforms:
+        if is_on:
             self._advertise(TF)
         self._with_tf = is_on
 
@@ -109,7 +116,8 @@ class EstimatePublisher:
             self.recent_transforms.append(self._odometry.transform(fused))
             self._transport.publish(self._topics[TF], self.recent_transforms[-1])
             if estimate.map_T_odom is not None:
-                self._transport.publish(self._topics[TF], self._map_correction.transform(_correction(estimate, stamp_ns)))
+                correction = _correction(estimate, stamp_ns + self._tolerance_ns)
+                self._transport.publish(self._topics[TF], self._map_correction.transform(correction))
         if self._has_predictions and PREDICTED_ODOMETRY not in self._unread:
             self._transport.publish(self._topics[PREDICTED_ODOMETRY], self._odometry.odometry(fused))
 
@@ -124,6 +132,13 @@ class EstimatePublisher:
         fused = FusedEstimate(stamp_ns, estimate.pose, np.zeros(3), estimate.covariance, in_space=estimate.in_map)
         pose = make("geometry_msgs/msg/PoseWithCovariance", pose=_placed(*fused.place()), covariance=fused.pose_covariance())
         self._publish(POSE, make(_TYPES[POSE], header=self._header(stamp_ns, self._frames.map_frame), pose=pose))
+
+    def publish_localization(self, state: str) -> None:
+        """std_msgs/String, where ``state`` of the localization in a saved map is another than before."""
+        self._advertise(LOCALIZATION)
+        if state != self._state:
+            self._state = state
+            self._publish(LOCALIZATION, make(_TYPES[LOCALIZATION], data=state))
 
     def publish_path(self, stamp_ns: int) -> None:
         """nav_msgs/Path of the estimates so far, thinned, in `map` where there is one, else in `odom`."""
@@ -178,6 +193,9 @@ class EstimatePublisher:
         self._publish(DIAGNOSTICS, make(_TYPES[DIAGNOSTICS], header=self._header(stamp_ns, self._frames.odom_frame), status=entries))
 
     def _advertise(self, topic: str) -> None:
+        if topic in self._advertised:
+            return
+        self._advertised.add(topic)
         self._transport.advertise(self._topics[topic], _TYPES[topic], is_latched=topic in _LATCHED)
 
     def _publish(self, topic: str, message: object) -> None:

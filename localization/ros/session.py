@@ -163,6 +163,11 @@ class Session:
         if self.checkpoints is not None and trial.prior is not None:
             self.checkpoints.change_identity(fingerprints(map=trial.prior.places.fingerprint), shared_of(trial))
 
+    def change_lidar(self) -> None:
+        """Checkpoints are of a robot whose LiDAR is used from now on."""
+        if self.checkpoints is not None:
+            self.checkpoints.change_identity(fingerprints(LiDAR="used"), {})
+
     def change_mounts(self, mounts: Mapping[str, Mount]) -> None:
         """Checkpoints are of a robot with ``mounts`` from now on."""
         if self.checkpoints is not None:

@@ -154,6 +154,10 @@ class NodeConfig(Settings):
     """Time between two messages on `~/path` [s]; 0: none."""
     map_period_s: float = 10.0
     """Time between two messages on `~/map` [s]; 0: none."""
+    map_topic: str = "~/map"
+    """Topic of the map; `/map` where nav2 and RViz take it from there."""
+    transform_tolerance: float = 0.0
+    """By how much the transform `map_frame` -> `odom_frame` is stamped later [s], as by AMCL: others find one for stamps up to now."""
     diagnose_every_min: Annotated[float, tyro.conf.arg(aliases=["--diagnose-every"])] = 5.0
     """Minutes between two diagnoses of the last two minutes, which a process of lowest priority makes and diagnostics report; 0: none."""
     clearpath: str = ""

@@ -12,6 +12,7 @@ import numpy as np
 from localization.estimators import Estimate, Estimator, Residuals
 from localization.events import ImuSample, Scan, Step
 from localization.lidar import LidarConfig
+from localization.sensor_checks.bias_changes import BiasChangeCheck
 from localization.sensor_checks.clocks import ClockCheck
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import rate_off
@@ -84,6 +85,7 @@ class SensorChecks:
         self._steps = StepChecks(faults, mounts, config, step_config)
         self._consistency, self._places = SensorConsistency(faults), KnownPlaces(faults)
         self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
+        self._biases = BiasChangeCheck(faults)
         self._mounts, self._is_lidar_placed = mounts, True
         self._records = Records()
         self._is_acting = True
@@ -173,6 +175,7 @@ class SensorChecks:
         if estimate.covariance is None:
             return estimate
         self._clocks.add(estimator)
+        self._biases.add(estimator)
         inflated = self._inflation.inflate(estimate)
         if scan is not None and self._places.update(lambda: self._steps.window.scans.profile(scan), record.pose):
             self._consistency.restart()  # a place from before the faults shows the pose: differences count from here on

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from localization.errors import SimulationError
+from motion_models.input_files import read_bytes
 
 _ATTRIBUTE = re.compile(rb"""([\w:.-]+)(\s*=\s*)("[^"]*"|'[^']*')""")
 
@@ -143,7 +144,7 @@ def load(path: Path) -> Mjcf:
 
 def _collect(path: Path, folder: Path, name: str, files: dict[str, bytes]) -> None:
     try:
-        files[name] = path.read_bytes()
+        files[name] = read_bytes(path)
     except OSError as error:
         raise SimulationError(f"simulator '{path}' cannot be read: {error.strerror}.") from error
     for element in _parse_file(files[name], name, path).walk():

@@ -14,6 +14,7 @@ from localization.twin.mjcf import Mjcf, parse
 from localization.twin.mujoco_engine import converted
 from localization.twin.robot_mjcf import HALF_WIDTH
 from motion_models.center_of_gravity.urdf import load_urdf, urdf_root
+from motion_models.input_files import read_bytes, read_text
 from motion_models.robot import Robot
 
 _WORLD = "skidloc_world"
@@ -26,7 +27,7 @@ def mjcf_of_urdf(path: Path, robot: Robot) -> tuple[Mjcf, tuple[str, ...]]:
     Joints that are no wheels are fixed at zero: the log's centre of gravity takes the place of the arms' postures.
     """
     root_link = load_urdf(path).root
-    root = urdf_root(path.read_text(encoding="utf-8"), str(path))
+    root = urdf_root(read_text(path), str(path))
     notes = []
     meshes = 0
     for link in root.iter("link"):
@@ -83,7 +84,7 @@ def _turn_wheels_alone(root: ET.Element, robot: Robot) -> list[str]:
 def is_urdf(path: Path) -> bool:
     """Whether the file's root is <robot>."""
     try:
-        return ET.parse(path).getroot().tag == "robot"
+        return ET.fromstring(read_bytes(path)).tag == "robot"
     except ET.ParseError:
         return path.suffix.lower() == ".urdf"
     except OSError as error:

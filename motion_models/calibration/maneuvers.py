@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motion_models.errors import CalibrationError
+from motion_models.input_files import read_table
 from motion_models.se2 import FloatArray
-from motion_models.text_files import check_file
 
 IntArray = NDArray[np.int64]
 
@@ -313,11 +313,9 @@ def windows_text(maneuvers: Sequence[Maneuver]) -> str:
 def read_rows(path: str | Path) -> tuple[list[str], list[Row]]:
     """Header and lines of a CSV file. Raises `CalibrationError` for one that cannot be read or is empty, naming the line."""
     try:
-        check_file(path)
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            columns = [name.strip() for name in next(reader, [])]
-            lines = [(reader.line_num, cells) for cells in reader if cells]
+        reader = csv.reader(io.StringIO(read_table(path), newline=""))
+        columns = [name.strip() for name in next(reader, [])]
+        lines = [(reader.line_num, cells) for cells in reader if cells]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(f"table '{path}' cannot be read: {error}.") from error
     if not columns:

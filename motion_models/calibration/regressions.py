@@ -15,6 +15,7 @@ angle, so the covariance grows as 1/angle^2 towards small turns. A turn of exact
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +26,9 @@ from scipy import stats
 
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
+from motion_models.input_files import read_table
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, adjoint, between, inverse, rotation, wrap_angle
-from motion_models.text_files import check_file
 
 COLUMNS = ("cg_x_m", "cg_y_m", "rotation_ratio", "cor_x_m", "cor_y_m")
 CONTROLLER_MULTIPLIER = 1.875
@@ -63,10 +64,8 @@ class RotationTable:
 def read_rotation_table(path: str | Path) -> RotationTable:
     """The table of a CSV file with the columns `COLUMNS`, in any order. Raises `CalibrationError`, naming row and column."""
     try:
-        check_file(path)
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-            names = set(rows[0]) if rows else set()
+        rows = list(csv.DictReader(io.StringIO(read_table(path), newline="")))
+        names = set(rows[0]) if rows else set()
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise CalibrationError(f"table '{path}' cannot be read: {error}.") from error
     if not rows:

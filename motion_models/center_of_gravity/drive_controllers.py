@@ -21,7 +21,7 @@ _KINDS = {
         re.IGNORECASE,
     ),
     STEERED: re.compile(r"(?<!skid)(?<!skid[_\-])steer|ackermann|tricycle", re.IGNORECASE),
-    CASTERS: re.compile(r"caster|castor", re.IGNORECASE),
+    CASTERS: re.compile(r"(?:(?<![A-Za-z])|(?<=[a-z0-9])(?=[A-Z]))(?i:cast[eo]r)"),  # a word: joint_state_broadcaster has none
 }
 
 
@@ -40,8 +40,10 @@ class ControllerValues:
 def drive_kinds(names: Iterable[str]) -> tuple[str, ...]:
     """Kinds of wheels and tracks by the ``names`` of links, joints, meshes, plugins or controllers.
 
-    >>> drive_kinds(["front_left_wheel", "mecanum_drive_controller/MecanumDriveController", "skid_steer_drive"])
+    >>> drive_kinds(["front_left_wheel", "mecanum_drive_controller/MecanumDriveController", "skid_steer_drive", "joint_state_broadcaster"])
     ('mecanum wheels',)
+    >>> drive_kinds(["rearCaster_joint"])
+    ('casters',)
     """
     names = tuple(names)
     return tuple(kind for kind, pattern in _KINDS.items() if any(pattern.search(name) for name in names))

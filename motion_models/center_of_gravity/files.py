@@ -13,7 +13,7 @@ from motion_models.center_of_gravity.parts import TYPICAL, Arms, CgEstimate, Pay
 from motion_models.center_of_gravity.urdf import Urdf, load_urdf, parse_urdf
 from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
 from motion_models.errors import CgError, RobotError
-from motion_models.text_files import read_text
+from motion_models.input_files import read_text
 
 
 def arms_model(

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from motion_models.errors import RobotError
+from motion_models.input_files import read_text
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
-from motion_models.text_files import read_text
 
 _WORLDS = ("world", "map", "odom")
 _MOVING = ("revolute", "continuous", "prismatic")

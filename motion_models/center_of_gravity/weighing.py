@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from motion_models.errors import CgError
+from motion_models.input_files import read_table
 from motion_models.se2 import FloatArray
-from motion_models.text_files import check_file
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheels in every array of four."""
@@ -95,15 +96,13 @@ def read_weighings(path: str | Path) -> FloatArray:
     """
     columns = [f"{wheel}_kg" for wheel in WHEELS]
     try:
-        check_file(path)
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            header = [name.strip() for name in reader.fieldnames or ()]
-            reader.fieldnames = header
-            missing = [name for name in columns if name not in header]
-            if missing:
-                raise CgError(f"{path}: no column {', '.join(missing)}; columns are {', '.join(header) or 'none'}.")
-            rows = [[_cell(row[name], name, reader.line_num, path) for name in columns] for row in reader]
+        reader = csv.DictReader(io.StringIO(read_table(path), newline=""), skipinitialspace=True)
+        header = [name.strip() for name in reader.fieldnames or ()]
+        reader.fieldnames = header
+        missing = [name for name in columns if name not in header]
+        if missing:
+            raise CgError(f"{path}: no column {', '.join(missing)}; columns are {', '.join(header) or 'none'}.")
+        rows = [[_cell(row[name], name, reader.line_num, path) for name in columns] for row in reader]
     except OSError as error:
         raise CgError(f"weighings '{path}' cannot be read: {error.strerror}.") from error
     except (UnicodeDecodeError, csv.Error) as error:

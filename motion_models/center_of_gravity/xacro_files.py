@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from motion_models.errors import RobotError
+from motion_models.input_files import read_text
 
 _LEVELS = 4
 """Folders above a xacro file in which packages are looked for: PACKAGE/urdf/arms/FILE.xacro beside the other packages."""
@@ -20,7 +21,7 @@ def is_xacro(path: Path) -> bool:
     if path.suffix == ".xacro":
         return True
     try:
-        return "<xacro:" in path.read_text(encoding="utf-8", errors="replace")
+        return "<xacro:" in read_text(path, errors="replace")
     except OSError:
         return False
 
@@ -80,7 +81,7 @@ def _children(folder: Path) -> list[Path]:
 
 def _package_name(folder: Path) -> str | None:
     try:
-        found = _NAME.search((folder / "package.xml").read_text(encoding="utf-8", errors="replace"))
+        found = _NAME.search(read_text(folder / "package.xml", errors="replace"))
     except OSError:
         return None
     return None if found is None else found[1]

@@ -12,7 +12,7 @@ from localization.cli import main
 from motion_models.robot import Robot, Topics
 from motion_models.robot_file import load_robot
 from tests.helpers.entrance_drives import Publishing, Vehicle, drive, write
-from tests.studies.entrances import urdf_of
+from tests.helpers.urdf_texts import urdf_of
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 BASE_LOG = CASES / "base-log" / "log.mcap"

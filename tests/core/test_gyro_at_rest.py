@@ -11,6 +11,7 @@ from localization.core.motion import FilterConfig
 from localization.estimators.fusion import EkfFusion
 from localization.events import Step
 from localization.rate_series import RateSeries
+from motion_models import se2
 from motion_models.motion import Motion
 from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
@@ -23,9 +24,11 @@ RATE_HZ, STEP_S, WHITE = 100.0, 0.05, 5e-4
 MEMS_RAD_S = math.radians(0.4)
 
 
-def drive(rates: np.ndarray, white: float = WHITE, rest_s: float = math.inf, seed: int = 0) -> tuple[EkfFusion, np.ndarray]:
-    """The filter after ``rates`` (n,) of the gyro [rad/s] at `RATE_HZ`, with wheels at rest for ``rest_s`` and turning as the gyro's true
-    rate, zero, after that; and the published yaw after each step."""
+def drive(
+    rates: np.ndarray, white: float = WHITE, rest_s: float = math.inf, seed: int = 0, stop_s: float = math.inf
+) -> tuple[EkfFusion, np.ndarray]:
+    """The filter after ``rates`` (n,) of the gyro [rad/s] at `RATE_HZ`, with wheels at rest for ``rest_s``, straight on after that, at rest
+    from ``stop_s`` on; and the published yaw after each step."""
     model = make_model("diff_drive", ROBOT)
     ekf = EkfFusion(model, make_corrections(model, "constant"), ROBOT, None, FilterConfig())
     series, yaws = RateSeries(ROBOT.gyro_noise.white_rad_per_sqrt_s, 10.0), []
@@ -36,7 +39,7 @@ def drive(rates: np.ndarray, white: float = WHITE, rest_s: float = math.inf, see
         if i % per_step or not i:
             continue
         start_ns, end_ns = round((i - per_step) / RATE_HZ * 1e9), round(i / RATE_HZ * 1e9)
-        is_standing = i / RATE_HZ <= rest_s
+        is_standing = i / RATE_HZ <= rest_s or i / RATE_HZ > stop_s
         way = 0.0 if is_standing else 0.4 * STEP_S
         cov = np.zeros((3, 3)) if is_standing else np.diag([4e-4, 1e-4, 1e-3]) * way
         motion = Motion(np.array([way, 0.0, 0.0]), cov, np.zeros((3, len(model.nominal))), np.zeros((3, 2)))
@@ -95,6 +98,38 @@ def test_robot_that_is_moved_with_its_wheels_at_rest_is_not_at_rest(name):
     assert not ekf._policies.standstill.is_at_rest
     assert abs(ekf.state.number("gyro_bias")) < 5.0 * GyroNoise.bias_sigma_rad_per_s
     assert abs(yaws[-1] - rates.sum() / RATE_HZ) < 4.0 * math.sqrt(ekf.state.cov("pose")[2, 2])
+
+
+def change_of_bias(kind: str, seed: int) -> tuple[np.ndarray, float]:
+    """Rates of a gyro whose bias steps at a uniform time of the 20 s between two rests, or rises through all of them; and the change."""
+    rng, seconds = np.random.default_rng(seed), np.arange(round(23.0 * RATE_HZ)) / RATE_HZ
+    rate, at_s = rng.normal(0.0, math.radians(1.0)), rng.uniform(1.5, 21.5)
+    return rate * (seconds > at_s if kind == "step" else np.clip((seconds - 1.5) / 20.0, 0.0, 1.0)), rate
+
+
+def consistency_after(kind: str, draws: int) -> tuple[float, float, float]:
+    """Mean NEES of the heading and, per degree of freedom, of the pose after the second rest, and the root mean square of the heading's
+    error over that of the change times 20 s."""
+    yaw, pose, errors, changes = [], [], [], []
+    for seed in range(draws):
+        rates, change = change_of_bias(kind, seed)
+        ekf, _ = drive(rates, rest_s=1.5, stop_s=21.5, seed=seed)
+        P, error = ekf.state.cov("pose"), se2.local(ekf.state["pose"], np.array([0.4 * 20.0, 0.0, 0.0]))
+        yaw.append(error[2] ** 2 / P[2, 2])
+        pose.append(error @ np.linalg.solve(P, error) / 3.0)
+        errors.append(error[2])
+        changes.append(20.0 * change)
+        found = ekf.bias_change
+        assert found is None or found.rate == pytest.approx(change, abs=2e-3)
+        assert (found is not None) == (abs(change) > 3.0 * GyroNoise.bias_sigma_rad_per_s) or abs(change) < 5e-3
+    return float(np.mean(yaw)), float(np.mean(pose)), float(np.linalg.norm(errors) / np.linalg.norm(changes))
+
+
+def test_bias_that_rises_between_two_rests_is_corrected():
+    yaw, pose, share = consistency_after("ramp", 4)
+    assert yaw < 1.0
+    assert pose < 2.0
+    assert share < 0.1
 
 
 def test_vibration_at_rest_is_noise_and_no_motion():

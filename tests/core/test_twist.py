@@ -23,7 +23,7 @@ def test_twist_at_end_is_never_exact_and_takes_the_gyros_rate():
     twist, cov = twist_at_end(mean, np.diag([1e-2, 1e-2, 4e-2]), change, 0.1)
     assert twist == pytest.approx(mean + change)
     assert cov[2, 2] == pytest.approx(4e-3 + 1e-2 + 4e-6)
-    fused, fused_cov = fuse_turn(twist, cov, 0.6, 1e-4)
+    fused, fused_cov = fuse_turn(twist, cov, 0.6, 1e-4, np.zeros((3, 3)))
     assert fused[2] == pytest.approx(0.6, abs=2e-3)
     assert 0.0 < fused_cov[2, 2] < 1e-4
 
@@ -71,3 +71,14 @@ def test_change_of_slip_within_a_step_is_that_of_a_gauss_markov_process(duration
         paths[k] = value
     expected = slip_change_cov(np.eye(3) * duration, duration)[0, 0]  # of a density of 1
     assert np.var(paths[-1] - paths.mean(axis=0)) == pytest.approx(expected, rel=0.12)
+
+
+def test_turn_rate_changes_no_velocity_by_the_clock_of_the_wheels():
+    """Wheels that speed up by 1.2 m/s^2 and .4 rad/s^2, their clock open by .1 s, and a gyro that is off by 4 deg/s."""
+    twist, by_noise = np.array([0.15, 0.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4])
+    of_clock = 0.1**2 * np.outer([1.2, 0.0, 0.4], [1.2, 0.0, 0.4])
+    fused, cov = fuse_turn(twist, by_noise + of_clock, -0.07, 1e-5, of_clock)
+    np.testing.assert_allclose(fused[:2], twist[:2])
+    assert abs(fused[2] + 0.07) < 1e-3
+    assert cov[0, 0] == pytest.approx(by_noise[0, 0] + of_clock[0, 0])
+    assert np.linalg.eigvalsh(cov).min() > 0.0

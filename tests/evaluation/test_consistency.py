@@ -356,6 +356,7 @@ def test_pose_nees_shrinking_covariance_is_left_out_and_counted():
     found = pose_errors(as_trajectory(estimate, p), as_track(truth))
     assert found.n_left_out == 1
     assert 40 * SECOND not in found.stamps_ns
+    assert pose_consistency(as_trajectory(estimate, p), as_track(truth)).n_left_out == 1
 
 
 def test_pose_nees_untestable_is_none_or_refused():

@@ -21,11 +21,12 @@ from localization.evidence.alternatives.alternative import mount_correction
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot, robot_toml
-from tests.helpers import entrance_drives
+from tests.helpers import bags, entrance_drives
 from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.helpers.extended import cases
 from tests.helpers.hostile_mounts import rear_lidar_described_at_the_front
 from tests.helpers.wiring import CASES, LEFT, RIGHT, ROBOT_TOML, Change, drive
+from tests.studies.set_ups.symptoms import stamp_of
 
 ROBOT = load_robot(ROBOT_TOML)
 NOTHING = np.zeros(0)
@@ -222,10 +223,22 @@ def test_mounts_by_two_rows_have_both_corrections() -> None:
     assert moved(turned(ROBOT)).mounts["laser"] == turned(moved(ROBOT)).mounts["laser"] == Mount(-0.3, 0.0, 0.2, yaw=1.0)
 
 
+NO_GYRO = replace(SCANNING, imu_hz=0.0)
+
+
+@pytest.mark.parametrize("late_s", [0.5, -1.5])
+def test_clock_of_two_sources_that_is_not_the_recorders_is_corrected(tmp_path: Path, late_s: float) -> None:
+    found = scanned(tmp_path, Publishing(offsets_s={"/scan": late_s}), NO_GYRO)
+    assert (found.verdict, faults(found)) == ("certain", {"clock.lidar"})
+    assert found.robot.clock.lidar_time_offset_s == pytest.approx(late_s, abs=0.04)
+
+
 def test_clocks_of_two_sources_are_brought_together(tmp_path: Path) -> None:
-    """Which of both is off is not in the log: the alignment is, and the covariance has the way in that time."""
-    vehicle = replace(SCANNING, imu_hz=0.0)
-    found = scanned(tmp_path, Publishing(offsets_s={"/scan": 0.5}), vehicle)
+    """Which of both is off is not in a log recorded by its stamps: the alignment is, and the covariance has the way in that time."""
+    records = entrance_drives.records_of(NO_GYRO, entrance_drives.drive(NO_GYRO), Publishing(offsets_s={"/scan": 0.5}))
+    by_stamps = [(t, m, stamp_of(m) if hasattr(m, "header") else at) for t, m, at in records]
+    path = bags.write_mcap(tmp_path / "log.mcap", sorted(by_stamps, key=lambda record: record[2]))
+    found = infer_set_up(open_log(path, NO_GYRO.robot()))
     assert found.is_ambiguous
     assert found.robot.clock.wheel_time_offset_s == pytest.approx(-0.5, abs=0.04)
     assert found.robot.clock.sigma_s == pytest.approx(0.5, abs=0.04)

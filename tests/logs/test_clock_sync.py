@@ -82,6 +82,15 @@ def test_clock_sync_topic_always_3_s_late_is_waited_for() -> None:
     assert stats.describe() == []
 
 
+def test_clock_sync_scans_recorded_in_bursts_are_all_sorted() -> None:
+    """Every 2.5 s the network delivers what a LiDAR at 5 Hz has measured meanwhile."""
+    every = 5 * S // 2
+    scans = [mark("/scan", START + i * S // 5, START + (i * S // 5 // every + 1) * every + i) for i in range(200)]
+    marks, stats = run([*ticks("/wheels", 40, 50), *scans])
+    check_order(marks)
+    assert (len(marks), stats.describe()) == (2200, [])
+
+
 def test_clock_sync_stalled_recorder_loses_nothing() -> None:
     """For four seconds nothing is written; then all that waited, at once. The headers were right all the time."""
     items = [*ticks("/wheels", 20, 50), *ticks("/scan", 20, 10, latency=60 * MS)]

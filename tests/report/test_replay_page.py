@@ -602,3 +602,12 @@ def test_way_is_that_of_the_published_poses_which_do_not_jump():
     assert result.accuracy.distance_m == smooth.accuracy.distance_m < 0.98 * jumping.accuracy.distance_m
     assert result.accuracy.drift_percent == 100.0 * result.accuracy.end_error_m / smooth.accuracy.distance_m
     assert f"over {smooth.accuracy.distance_m:.1f} m driven" in verdict([result], positions)
+
+
+def test_summary_nees_of_few_poses_is_no_verdict() -> None:
+    (result,) = score([run(nis=chi_square_nis(), noise=0.01)], track())
+    wrong = dataclasses.replace(result, nees_mean=40.0, nees_band=(2.0, 4.2))
+    few = verdict([dataclasses.replace(wrong, nees_counts=(9, 283))], track())
+    assert "overconfident" not in few
+    assert "NEES is not judged: it is of 9 of 292 poses" in few
+    assert "overconfident" in verdict([dataclasses.replace(wrong, nees_counts=(283, 9))], track())

@@ -269,10 +269,10 @@ def test_predicted_motion_is_that_of_the_estimators(has_angle, has_rate):
         mean, mean_cov = mean_twist(delta, cov, duration)
         twist, twist_cov = twist_at_end(mean, mean_cov, by_model.value[-1] - mean, duration)
         if has_angle:
-            way, cov = fuse_turn(se2.log(delta), cov, angle, 1e-5)
+            way, cov = fuse_turn(se2.log(delta), cov, angle, 1e-5, np.zeros((3, 3)))
             delta = se2.exp(way)
         if has_rate:
-            twist, twist_cov = fuse_turn(twist, twist_cov, rate, 1e-4)
+            twist, twist_cov = fuse_turn(twist, twist_cov, rate, 1e-4, np.zeros((3, 3)))
         turn = [*((angle, 1e-5) if has_angle else (np.nan, np.nan)), *((rate, 1e-4) if has_rate else (np.nan, np.nan))]
         found, found_twist, found_twist_cov = predicted_motion(dt, by_model.value, noise, np.array(turn))
         np.testing.assert_allclose(found.delta, delta, rtol=1e-10, atol=1e-12)

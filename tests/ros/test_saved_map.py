@@ -11,17 +11,18 @@ import pytest
 from localization.estimators import PriorMap
 from localization.log_replay import replay
 from localization.logs import open_log
-from localization.logs.serialization import encode, make
+from localization.logs.serialization import STORE, encode, make
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import Trial
 from localization.ros.diagnostics import OK, WARN
-from localization.ros.publisher import DIAGNOSTICS, MAP
+from localization.ros.discovery import TF
+from localization.ros.publisher import DIAGNOSTICS
 from localization.ros.settings import NodeConfig, OnlineSettings
 from localization.ros.transports.transport import Received
 from motion_models.registry import make_model
 from tests.helpers.floor_plan import make_map
-from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, track
+from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, stamp_of, track
 from tests.ros.test_operator_commands import pose_message
 
 S = 1_000_000_000
@@ -44,8 +45,14 @@ def test_node_in_a_saved_map_is_localized_after_initialpose(places: PlaceMap) ->
         return sorted([*messages, Received("/initialpose", at, pose)], key=lambda m: m.received_ns)
 
     transport = LogTransport(drive_log(), spoil)
-    node, reports = run_node(transport, "map", config=NodeConfig(wait_s=0.0), prior=PriorMap(places))
+    config = NodeConfig(wait_s=0.0, map_topic="/map", transform_tolerance=0.5)
+    node, reports = run_node(transport, "map", config=config, prior=PriorMap(places))
     assert any("the place in the map is searched near x 1.000 m" in text for text in reports)
+    states = [STORE.deserialize_cdr(data, "std_msgs/msg/String").data for data in transport.published["/skidloc/localization_state"]]
+    assert (states[0], states[-1]) == ("searching", "localized")
+    links = [t for message in published(transport, TF) for t in message.transforms]
+    at = {frame: [stamp_of(t) for t in links if t.header.frame_id == frame] for frame in ("map", "odom")}
+    assert {stamp - S // 2 for stamp in at["map"]} <= {*at["odom"]}
     found = node.session.pipeline.estimator.localization()
     assert found["state"] == "localized"
     assert found["probability"] > 0.95
@@ -55,7 +62,7 @@ def test_node_in_a_saved_map_is_localized_after_initialpose(places: PlaceMap) ->
     assert levels["map"] == OK
     first = [status for status in published(transport, DIAGNOSTICS)[0].status if status.name == "skidloc: map"]
     assert [status.level for status in first] == [WARN]
-    grid = published(transport, MAP)[-1]
+    grid = STORE.deserialize_cdr(transport.published["/map"][-1], "nav_msgs/msg/OccupancyGrid")
     cells = np.asarray(grid.data)
     assert {-1, 0, 100} == set(cells.tolist())
     assert (cells == 0).mean() > 0.5

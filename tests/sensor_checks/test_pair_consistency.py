@@ -15,6 +15,7 @@ from localization.log_replay import replay
 from localization.logs import open_log
 from localization.pipeline import Trial
 from localization.ros.state_serialization import deserialize, serialize
+from localization.sensor_checks.bias_changes import BIAS_CHANGED
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.innovations import InnovationWindows
@@ -46,7 +47,7 @@ def test_healthy_drive_is_not_reported(robot: str, model: str) -> None:
 def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> None:
     drive = without_lidar("husky_a200")
     outcome = run(drive, faults_of_turns(upright_axis(drive))[name], "skid_steer")
-    assert set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR}, outcome.warnings
+    assert set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR, BIAS_CHANGED}, outcome.warnings
     assert "saturated" not in name or any("end at 20 deg/s, its range" in warning for warning in outcome.warnings)
     error, sigma = outcome.last
     assert error < max(3.0 * sigma, 0.1)

@@ -1,7 +1,7 @@
 """Estimators in buildings that nobody tuned them on: fr079, MIT-CSAIL and ACES, with default settings.
 
 python -m tests.studies.buildings [--log fr079,csail,aces] [--estimator ...] [--model diff_drive,skid_steer,icr]
-    [--corrections none,constant,cg_field] [--matcher submap,kiss] [--reference-noise]
+    [--corrections none,constant,cg_field] [--matcher submap,kiss] [--reference-noise] [--starts 8] [--write]
 
 Absolute trajectory error (ATE) after one SE(2) alignment, and the median relative pose error over 10 m of the reference's path. Both use
 the reference at its own instants alone: MIT-CSAIL's holds at key scans only, so nothing is interpolated between its poses. ACES has
@@ -13,6 +13,8 @@ mean over all instants, and over those at which the robot turns by less than 0.1
 independent errors, the differences give the error of each (Gray & Allan 1974, three-cornered hat). CPU is that of the whole replay in
 memory, after a first run of a few seconds that compiles.
 Where an estimator smooths at the end, its live poses have a row of their own.
+``--starts N`` begins each log at N moments, 0.43 s apart, and prints the scatter: two versions differ where their means do, not where one
+run does. ``--write`` puts the numbers into the tables of README.md and docs/lab/lidar.md, which are of this command alone.
 """
 
 from __future__ import annotations
@@ -52,6 +54,17 @@ SHORT_S = 20.0
 REFERENCE_SIGMA = np.array([0.016, 0.016, np.radians(0.5)])
 """Noise of a pose of the references of fr079 and MIT-CSAIL [m, m, rad]."""
 _SLOW_TURN_RAD_S = 0.1
+_START_S = 0.43
+"""From start to start of ``--starts``: key scans fall on other scans [s]."""
+_REPOSITORY = Path(__file__).parents[2]
+_README_ROWS = {
+    "odometry": "odometry",
+    "lidar": "KISS-ICP, scans alone (`lidar`)",
+    "ekf": "EKF",
+    "graph live": "factor graph, live",
+    "graph smoothed": "factor graph, smoothed",
+}
+_BEGIN, _END = "<!-- buildings: begin -->", "<!-- buildings: end -->"
 _SAME_INSTANT_NS = 1_000_000
 """A pose farther in time from a reference's instant is not scored: the references' stamps are those of scans, rounded to a microsecond."""
 
@@ -92,6 +105,11 @@ class Drive:
         config = ReplayConfig(estimator=EstimatorConfig(ekf=FilterConfig(**ekf), lidar=LidarConfig(matcher=matcher)))
         pair = Trial(make_model(model, self.robot), estimator, corrections)
         return replay(self.events, [pair], self.robot, self.mounts, True, config)[0]
+
+    def begun_after(self, seconds: float) -> Drive:
+        """It without the first ``seconds``."""
+        begin = self.events[0].stamp_ns + round(seconds * 1e9)
+        return Drive([event for event in self.events if event.stamp_ns >= begin], self.robot, self.mounts, self.reference)
 
     def until(self, seconds: float) -> Drive:
         """The first ``seconds`` of it."""
@@ -192,6 +210,38 @@ def rows(drive: Drive, options: argparse.Namespace) -> Iterator[str]:
                 yield f"{estimator}{kind}{' (' + ', '.join(parts) + ')' if parts else ''} | {cells}"
 
 
+def scatter(drive: Drive, starts: int, estimator: str, model: str = "diff_drive", form: str = "constant", matcher: str = "submap") -> str:
+    """Mean and standard deviation of both errors over moments at which the log begins, and the error of the mean."""
+    runs = [drive.begun_after(k * _START_S).run(estimator, model, form, matcher) for k in range(starts)]
+    cells = []
+    for kind, tracks in (("", [run.trajectory for run in runs]), (" live", [run.live for run in runs if run.live is not None])):
+        if tracks:
+            errors = np.array([errors_of(track, drive.reference) for track in tracks])
+            mean, sd = errors.mean(axis=0), errors.std(axis=0, ddof=1)
+            cells.append(f"{estimator}{kind}: {mean[0]:.3f} +- {sd[0] / math.sqrt(starts):.3f}, one run +- {sd[0]:.3f}; {mean[1]:.4f}")
+    return " | ".join(cells)
+
+
+def write_tables(lines: Sequence[str]) -> None:
+    """Put the rows of `main`'s table, of all logs and estimators, into README.md and docs/lab/lidar.md."""
+    journal = _REPOSITORY / "docs/lab/lidar.md"
+    before, _, rest = journal.read_text().partition(_BEGIN)
+    journal.write_text(before + "\n".join([_BEGIN, *lines, _END]) + rest.partition(_END)[2])
+    numbers: dict[tuple[str, str], str] = {}
+    for line in lines[2:]:
+        log, estimator, errors = (cell.strip() for cell in line.split("|")[1:4])
+        ate, rpe = errors.split(" / ")
+        numbers[log, estimator.partition(" (")[0]] = f"{float(ate):.3f} / {float(rpe):.3f}"
+    readme = _REPOSITORY / "README.md"
+    text = readme.read_text().splitlines()
+    for estimator, label in _README_ROWS.items():
+        at = next(i for i, line in enumerate(text) if line.startswith(f"| {label} |"))
+        cells = [cell.strip() for cell in text[at].split("|")[1:-1]]
+        cells[1:4] = [numbers[log, estimator] for log in BUILDINGS]
+        text[at] = f"| {' | '.join(cells)} |".replace("|  |", "| |")
+    readme.write_text("\n".join(text) + "\n")
+
+
 def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     def split(text: str) -> list[str]:
         return text.split(",")
@@ -202,6 +252,8 @@ def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--model", type=split, default=["diff_drive"])
     parser.add_argument("--corrections", type=split, default=["constant"])
     parser.add_argument("--matcher", type=split, default=["submap"])
+    parser.add_argument("--starts", type=int, default=0, help="moments at which each log begins: their scatter, in place of the table")
+    parser.add_argument("--write", action="store_true", help="also into README.md and docs/lab/lidar.md; all logs and estimators")
     parser.add_argument("--reference-noise", action="store_true", help="compare the reference with both matchers, in place of the table")
     return parser.parse_args(words)
 
@@ -214,13 +266,23 @@ def main(words: Sequence[str] | None = None) -> None:
             if isinstance(drive.reference, ReferenceTrack):
                 print(f"{name}: {reference_noise(drive, drive.reference)}", flush=True)
         return
-    print("| log | estimator | ATE / RPE 10 m, or relations all / < 20 s [m] | NEES all / slow turns | scans lost [%] | CPU ms a scan |")
-    print("|---" * 6 + "|")
+    if options.starts:
+        for name in options.log:
+            drive = BUILDINGS[name].open()
+            for estimator in options.estimator:
+                print(f"{name}: {scatter(drive, options.starts, estimator, options.model[0])}", flush=True)
+        return
+    lines = ["| log | estimator | ATE / RPE 10 m, or relations all / < 20 s [m] | NEES all / slow turns | scans lost [%] | CPU ms a scan |"]
+    lines.append("|---" * 6 + "|")
+    print("\n".join(lines))
     for name in options.log:
         drive = BUILDINGS[name].open()
         drive.until(_WARM_UP_S).run("ekf")
         for line in rows(drive, options):
-            print(f"| {name} | {line} |", flush=True)
+            lines.append(f"| {name} | {line} |")
+            print(lines[-1], flush=True)
+    if options.write:
+        write_tables(lines)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 from localization.core.state import State
 from motion_models.motion import Motion
@@ -18,8 +19,10 @@ class Excitation:
     measurement of it.
     """
 
-    def __init__(self, track_m: float, min_track_over_radius: float) -> None:
-        """``min_track_over_radius``: track over turning radius from which a motion excites the corrections."""
+    def __init__(self, track_m: float, min_track_over_radius: float, never: Collection[str] = ()) -> None:
+        """``min_track_over_radius``: track over turning radius from which a motion excites the corrections; ``never``: variables besides
+        submap and keyframe that are not estimated."""
+        self._never = never
         self._track_m, self._min_track_over_radius = track_m, min_track_over_radius
         self.is_turning = True
         """Whether the motion of the step excites the corrections."""
@@ -39,7 +42,7 @@ class Excitation:
 
     def considered(self) -> set[str]:
         """Names of the variables that have no gain."""
-        names = {"map", "key"}
+        names = {"map", "key", *self._never}
         if not self.is_turning:
             names.add("corrections")
         if self._is_way_open:

@@ -11,13 +11,24 @@ import numpy as np
 from localization.core.state import State
 from localization.events import Step
 
+BIAS_CHANGE_COV = np.diag([1e-12, 1e-16])
+"""Covariance of "bias_change", a variable that is what the bias has changed by since the last rest, as a constant and a slope. It is small
+against that of any gyro's bias, and the variable is never estimated: its correlations are what a change does to the other variables
+[rad^2/s^2, rad^2/s^4]."""
 _BIAS_PRIORS = ((0.8, 1.0, 0.0), (0.2, 0.0, 1.75e-2))
 """Hypotheses on a bias that no rest has measured: prior probability, sigma over that of the robot file, and sigma [rad/s]. Drivers that
 zero their gyro at switch-on have the robot file's; the others the sensor's own, 1 deg/s in data sheets of MEMS gyros (BMI088)."""
 _AT_REST = 0.97
 """Prior probability that a robot whose wheels read zero is at rest, and least posterior to use that."""
-_MAX_RATE_RAD_S = 1.0
-"""Rates of a robot that is turned with its wheels at rest, as on a turntable or carried, are uniform up to this [rad/s]."""
+_CHANGE = 0.1, 3.5e-2
+"""Prior probability that the bias has changed since the rest before, beyond its random walk, and sigma of the change [rad/s]: twice a MEMS
+gyro's offset."""
+_MIN_REPORTED = 3.0
+"""A change is a fault from this many of the robot file's sigmas of the bias on: drivers that zero their gyro leave less."""
+_MAX_RATE_RAD_S, _CONSTANT = 1.0, 0.1
+"""Rates of a robot that is turned with its wheels at rest are uniform up to this [rad/s]. Those on a turntable are constant, which is this
+share of them; those of one that rolls or is carried vary."""
+_MAX_EXPONENT = 300.0
 _SETTLING_S = 0.2
 """Time in which a robot whose wheels read zero stops [s]: their clock may be ahead of the gyro's by a driver's latency (`clock_offset`)."""
 _MIN_SPELL_S, _MIN_STEPS = 0.5, 5
@@ -29,16 +40,27 @@ class BiasAtRest(NamedTuple):
 
     prior_variance: float
     """Variance of the prior that holds, where it is wider than the filter's [rad^2/s^2]; else 0."""
+    change_variance: float
+    """Square of the change since the rest before [rad^2/s^2]; 0 where there is none."""
     rate: float
     """Mean of the gyro's rate in the standstill before this step [rad/s]."""
     variance: float
     """[rad^2/s^2]"""
 
 
+class BiasChange(NamedTuple):
+    """A bias that has changed between two rests."""
+
+    end_ns: int
+    """Stamp at which it is found."""
+    rate: float
+    """By how much [rad/s]."""
+
+
 class StandstillTest:
     """`add` each step. A standstill is a time of zero wheels; by Bayes' rule on the gyro's turns in it, with their own scatter for noise:
 
-    - at rest, the turns are those of one bias, which has the filter's variance, or, in the first rest, one of `_BIAS_PRIORS`;
+    - at rest, the turns are those of one bias, which has the filter's variance, in the first rest one of `_BIAS_PRIORS`, or has changed;
     - moved, they are those of any rate, constant as on a turntable, or varying as of a robot that rolls or is carried.
 
     A gyro that never scatters tells nothing about its noise: the robot file's is taken. Vibration scatters, and is no motion.
@@ -46,6 +68,11 @@ class StandstillTest:
 
     def __init__(self, bias_sigma: float) -> None:
         """``bias_sigma``: of the robot file [rad/s]."""
+        self._bias_sigma = bias_sigma
+        self.since_rest_s = 0.0
+        """Time since the robot was last known to be at rest [s]."""
+        self.change: BiasChange | None = None
+        """The last one that is a fault."""
         self._priors = [(share, factor * bias_sigma + sigma) for share, factor, sigma in _BIAS_PRIORS]
         self._turns: list[tuple[float, float, float]] = []  # angle, time, variance of each step of the standstill
         self._bias = 0.0, 0.0  # mean and variance at its begin
@@ -76,6 +103,7 @@ class StandstillTest:
     def add(self, state: State, step: Step) -> tuple[Step, BiasAtRest | None]:
         """``step``, with a gyro of its own noise where it shows rest; and the bias, where rest is found, or contradicts its prior.
         ``state``: at the start of the step."""
+        self.since_rest_s = 0.0 if self.is_at_rest else self.since_rest_s + step.duration
         if not step.is_standing or not step.has_wheels or step.turn is None or step.duration <= 0.0:
             self._is_prior_tested |= self.is_at_rest
             self._turns.clear()
@@ -88,7 +116,7 @@ class StandstillTest:
             return step, None
         if not self._turns:
             self._bias = state.number("gyro_bias"), state.variance("gyro_bias")
-        found = self._judge()
+        found = self._judge(step.start_ns)
         turn = step.turn
         self._turns.append((turn.angle, turn.duration, turn.scatter_variance or turn.variance))
         return (replace(step, turn=replace(turn, variance=self._density() * turn.duration)) if self.is_at_rest else step), found
@@ -98,26 +126,33 @@ class StandstillTest:
         """Whether the standstill is long enough to be judged."""
         return len(self._turns) >= _MIN_STEPS and sum(seconds for _, seconds, _ in self._turns) >= _MIN_SPELL_S
 
-    def _judge(self) -> BiasAtRest | None:
+    def _judge(self, now_ns: int) -> BiasAtRest | None:
         """Set the probability of rest; return the bias, where rest is found now, or another prior holds than the filter has."""
         if not self._is_long:
             return None
         angle, seconds, _ = np.array(self._turns).sum(axis=0).tolist()
         rate, noise = angle / seconds, self._density() / seconds
-        biases = [(1.0, *self._bias)]
+        (mean, variance), (share, sigma) = self._bias, _CHANGE
+        biases = [(1.0 - share, mean, variance), (share, mean, variance + sigma**2)]
         if not self._is_prior_tested:
             (share, _), *others = self._priors
             biases = [(share, *self._bias), *((share, 0.0, sigma**2) for share, sigma in others)]
         likelihoods = [share * _normal(rate - mean, cov + noise) for share, mean, cov in biases]
-        at_rest = _AT_REST * sum(likelihoods) * math.exp(-self._variation(rate))
-        moved = (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S
+        at_rest = _AT_REST * sum(likelihoods)
+        moved = (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S * (_CONSTANT + (1.0 - _CONSTANT) * math.exp(self._variation(rate)))
         was_at_rest, self._rest = self.is_at_rest, at_rest / (at_rest + moved)
         best = int(np.argmax(likelihoods))
         if not self.is_at_rest or (was_at_rest and best == 0):
             return None
-        if best:
-            self._is_prior_tested, self._bias = True, (rate, noise)
-        return BiasAtRest(biases[best][2] if best else 0.0, rate, noise)
+        if not best:
+            return BiasAtRest(0.0, 0.0, rate, noise)
+        is_first, change = not self._is_prior_tested, rate - self._bias[0]
+        self._is_prior_tested, self._bias = True, (rate, noise)
+        if is_first:
+            return BiasAtRest(biases[best][2], 0.0, rate, noise)
+        if abs(change) > _MIN_REPORTED * self._bias_sigma:
+            self.change = BiasChange(now_ns, change)
+        return BiasAtRest(0.0, change**2, rate, noise)
 
     def _density(self) -> float:
         """Variance of the turns of this standstill, by the scatter in all of it [rad^2/s]."""
@@ -130,7 +165,8 @@ class StandstillTest:
         turns = np.array(self._turns)
         n = len(turns)
         ratio = float(np.sum((turns[:, 0] - rate * turns[:, 1]) ** 2 / turns[:, 1])) / (n * self._density())
-        return max(0.5 * n * (ratio - 1.0 - math.log(ratio)) - 0.5 * math.log(n), 0.0) if ratio > 1.0 else 0.0
+        gain = 0.5 * n * (ratio - 1.0 - math.log(ratio)) if ratio > 1.0 else 0.0
+        return min(gain - 0.5 * math.log(n), _MAX_EXPONENT)
 
 
 def _normal(residual: float, variance: float) -> float:

@@ -18,6 +18,8 @@ def node(topics, condition):
         "autostart": ParameterValue(LaunchConfiguration("autostart"), value_type=bool),
         "use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool),
         "clearpath": ParameterValue(LaunchConfiguration("clearpath"), value_type=str),
+        "map": ParameterValue(LaunchConfiguration("map"), value_type=str),
+        "positions": ParameterValue(LaunchConfiguration("positions"), value_type=str),
         **topics,
     }
     return Node(
@@ -42,6 +44,8 @@ def generate_launch_description():
         ),
         DeclareLaunchArgument("params_file", default_value=own_params, description="Parameter file; the arguments here go before it"),
         DeclareLaunchArgument("estimator", default_value="ekf", description="ekf, graph or lidar; without LiDAR also odometry"),
+        DeclareLaunchArgument("map", default_value="", description="Map of an earlier drive, NAME.skidmap, to localize in; empty: none"),
+        DeclareLaunchArgument("positions", default_value="", description="Topic of a GNSS receiver, for graph; empty: none"),
         DeclareLaunchArgument("lidar", default_value="true", description="false: wheels and gyro alone"),
         DeclareLaunchArgument("scan", default_value="", description="Topic of a LaserScan; empty: the robot file's"),
         DeclareLaunchArgument("points", default_value="", description="Topic of a PointCloud2; empty: the robot file's"),

@@ -214,6 +214,8 @@ _CHANGES: Mapping[str, Callable[[Channels, Any, Body], None]] = {
     "wheels.one_reversed": _joints(lambda _, row: (row.detail,), lambda b, _: -1.0),
     "wheels.other_side": _other_side,
     "wheels.unit": _joints(lambda b, _: (*b.left, *b.right), _wheel_unit),
+    "wheels.angle_unit": _joints(lambda b, _: (*b.left, *b.right), lambda _, row: 1.0 / row.value),
+    "wheels.velocity_unit": lambda channels, row, body: channels.tags.update({row.id: math.nan}),
     "wheels.factor": _joints(lambda b, _: (*b.left, *b.right), lambda _, row: 1.0 / row.value),
     "wheels.factor_left": _joints(lambda b, _: b.left, lambda _, row: 1.0 / row.value),
     "wheels.factor_right": _joints(lambda b, _: b.right, lambda _, row: 1.0 / row.value),

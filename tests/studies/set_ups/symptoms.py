@@ -37,6 +37,7 @@ class Setting:
     has_angles: bool = True
     has_twists: bool = True
     """Whether the driver publishes twists beside its poses."""
+    has_rates: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -252,6 +253,24 @@ def _counts(rng: np.random.Generator, setting: Setting) -> Fault:
     return Fault(Truth("wheels.factor", value=1.0 / value), lambda records: on_topic(setting.topics["wheels"], edit)(scale(records)))
 
 
+def _one_field(row: str, field: str) -> Callable[[np.random.Generator, Setting], Fault]:
+    """Angles or velocities in another unit than the other field of the same messages."""
+
+    def draw(rng: np.random.Generator, setting: Setting) -> Fault:
+        factor = float(rng.choice(list(WHEEL_UNITS.values())))
+
+        def change(known: dict[str, float], name: str) -> dict[str, float]:
+            return {joint: factor * value if name == field else value for joint, value in known.items()}
+
+        return Fault(Truth(row, value=1.0 / factor), wheels_by(setting, change))
+
+    return draw
+
+
+def _has_both(setting: Setting) -> bool:
+    return setting.has_angles and setting.has_rates
+
+
 def _dead(rng: np.random.Generator, setting: Setting) -> Fault:
     name = str(rng.choice(setting.names))
     return Fault(Truth("wheels.dead", name), scaled_joints(setting, {name: 0.0}))
@@ -436,6 +455,8 @@ TABLE: tuple[Symptom, ...] = (
     Symptom("wheels.factor", _factor_since, "scale", weight=0.5),
     Symptom("wheels.factor_left", _wheel_factor("wheels.factor_left", lambda s: s.left), "scale", weight=0.5),
     Symptom("wheels.factor_right", _wheel_factor("wheels.factor_right", lambda s: s.right), "scale", weight=0.5),
+    Symptom("wheels.velocity_unit", _one_field("wheels.velocity_unit", "velocity"), "scale", weight=0.5, fits=_has_both),
+    Symptom("wheels.angle_unit", _one_field("wheels.angle_unit", "position"), "scale", weight=0.5, fits=_has_both),
     Symptom("wheels.dead", _dead, "wiring", weight=0.5, fits=_is_four),
     Symptom("driver.sides_exchanged", _driver("driver.sides_exchanged", lambda s: lambda v, w: (v, -w)), "wiring"),
     Symptom("driver.reversed", _driver("driver.reversed", lambda s: lambda v, w: (-v, -w)), "wiring"),

@@ -1,0 +1,26 @@
+"""What is no fault of the set-up is read as before, and accused of nothing."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from tests.helpers.extended import cases
+from tests.studies.set_ups.forms import FORMS, Form, compare, drawn, read
+
+USUAL = ["scans in bursts of 2.5 s", "gyro of another day", "wheels and gyro jump together"]
+OPEN = ["a second publisher of zeros", "angles that wrap at half a turn"]
+"""Rows that replay reads and the set-up does not, or hardly; `python -m tests.studies.set_ups.forms` counts them."""
+SOLVED = [form for form in FORMS if form.id not in OPEN]
+_drawn = cache(lambda source: drawn(1, source))
+_healthy = cache(lambda source: read(_drawn(source)[1], _drawn(source)[0], None, is_judged=False)[0])
+
+
+@pytest.mark.parametrize("form", cases(SOLVED, usual=USUAL, ids=[form.id for form in SOLVED]))
+def test_form_of_messages_is_read_as_before(form: Form) -> None:
+    robot, records = _drawn(form.source)
+    before = _healthy(form.source)
+    found, accused = read(records, robot, form, is_judged=form.id in USUAL)
+    assert {kind: compare(source, found.get(kind)) for kind, source in before.items()} == dict.fromkeys(before, "same")
+    assert accused == ()
