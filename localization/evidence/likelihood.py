@@ -95,10 +95,12 @@ class Stack:
         """The stack with alternative ``k`` alone."""
         return Stack(self.kind, [self.alternatives[k]], self.sizes, self.behind_s, self.t)
 
-    def alone(self, name: str, size: float) -> FloatArray:
-        """Evidence (A,) of a channel that no other source measures; ``size``: of the motion of usual robots. 0 where it is unknown."""
-        channel = self.channel(name)
-        assert channel is not None
+    @cached_property
+    def alone(self) -> Mapping[str, FloatArray]:
+        """Evidence (A,) by channel, where no other source measures it; 0 where it is unknown."""
+        return {name: self._alone(name, channel, _SIZES[name]) for name, channel in self._channels.items() if channel is not None}
+
+    def _alone(self, name: str, channel: FloatArray, size: float) -> FloatArray:
         known = np.isfinite(channel)
         mean_square = (np.where(known, channel, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         plausible = log_size_prior(0.5 * np.log(mean_square / size**2 + 1e-4))
@@ -204,7 +206,8 @@ def _evidence(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: s
         price = np.where(is_better, price_of_varying + _SKID_ODDS, price)
     is_alone = np.isfinite(z).any(axis=2).sum(axis=1) < 2
     found = of_bins + price[:, None] / z.shape[2]
-    found[is_alone] = (_of_one_source(stacks, choice, vary, name, used) / z.shape[2])[is_alone, None]
+    if is_alone.any():
+        found[is_alone] = (_of_one_source(stacks, choice, vary, name, used) / z.shape[2])[is_alone, None]
     return np.asarray(found)
 
 
@@ -215,7 +218,7 @@ def _of_one_source(stacks: Sequence[Stack], choice: Sequence[int], vary: int, na
     """
     found = np.zeros(len(stacks[vary].alternatives))
     for i in used:
-        mine = stacks[i].alone(name, _SIZES[name])
+        mine = stacks[i].alone[name]
         found = found + (mine if i == vary else mine[choice[i]])
     return found
 
