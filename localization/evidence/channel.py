@@ -33,15 +33,16 @@ def log_size_prior(log_size: FloatArray) -> FloatArray:
 
 @kernel
 def channel_evidence(
-    z: FloatArray, floor: FloatArray, relative: FloatArray, tau: FloatArray, bias_sigma: FloatArray, size: float
+    z: FloatArray, floor: FloatArray, relative: FloatArray, tau: FloatArray, bias_sigma: FloatArray, sizes: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Tempered evidence by bin (A, n); that of the size, the scales and the biases (A,); scales' logarithms and the data's information on
     them (A, k).
 
     ``z`` (A, k, n): A alternatives of k sources in n bins, NaN where unknown; ``floor``, ``bias_sigma`` (k,); ``relative``, ``tau`` (A, k);
-    ``size``: prior standard deviation of the motion.
+    ``sizes``: prior standard deviation of the motion, and the least one: maps by which the robot stands explain nothing.
     """
     A, k, n = z.shape
+    size, least = sizes
     of_bins, price = np.zeros((A, n)), np.zeros(A)
     c, information = np.zeros((A, k)), np.zeros((A, k))
     x, b = np.zeros(n), np.zeros(k)
@@ -54,7 +55,7 @@ def channel_evidence(
             if k > 1:
                 _scales(z[i], noise, (tau[i], bias_sigma), x, c[i], b, information[i])
         scale = np.exp(c[i])
-        own = _size_of_motion(z[i], noise, scale, b, size, x)
+        own = max(least, _size_of_motion(z[i], noise, scale, b, size, x))
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
         for m in range(n):
             of_bins[i, m] = TEMPER * _bin_evidence(z[i, :, m], noise, scale, b, own, x[m])

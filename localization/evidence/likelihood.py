@@ -51,8 +51,11 @@ NOISE: Mapping[Kind, Noise] = {
     "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),
 }
 """Measured on fr079, MIT-CSAIL, ACES and the Husky of `tests/data`; the level is estimated in each log (`LEVELS`)."""
-_SKID_ODDS, _SKID_SCALE = math.log(0.03), 1.0
-"""Logarithm of the odds of a k that changes with speed, floor or load within a log, and sigma of the logarithm of k there."""
+_SKID_ODDS, _VARYING_SIGMA, _UNUSUAL_SIGMA = math.log(0.03), 1.0, 0.5
+"""Logarithm of the odds of a k that changes with speed, floor or load within a log, or that is unusual; sigmas of its
+logarithm."""
+_STANDS_ODDS = math.log(0.03)
+"""Share of drives without a way, as turning in place, or without a turn."""
 _AT_REST = 0.05
 """Part of the root mean square of a source's rates up to which it stands."""
 _SIZES = {"way": WAY_M_S, "turn": TURN_RAD_S}
@@ -104,6 +107,8 @@ class Stack:
         known = np.isfinite(channel)
         mean_square = (np.where(known, channel, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         plausible = log_size_prior(0.5 * np.log(mean_square / size**2 + 1e-4))
+        stands = mean_square < (_AT_REST * self.sizes[name] * np.exp(self._log_unit(name).max(axis=1))) ** 2
+        plausible = np.where(stands, np.maximum(plausible, _STANDS_ODDS), plausible)
         log_size = math.log(self.sizes[name]) + 0.5 * (1.0 + math.log(math.tau))
         of_unit = self._jacobians_of(name).sum(axis=1)
         return np.asarray(np.where(known.any(axis=1), plausible - TEMPER * known.sum(axis=1) * log_size - of_unit, 0.0))
@@ -129,17 +134,21 @@ class Stack:
         assert channel is not None
         names = list(_SIZES) if self.kind == "driver" else [name]  # a driver reckons both of the same wheels
         has_noise = self.kind not in ("wheels", "driver")  # at rest as well
-        is_moving = np.isfinite(channel) if has_noise else np.any([self._is_moving(each) for each in names], axis=0)
-        shares = _SCALE_SHARE[self.kind]
-        share = np.array([shares[(name == "turn") != a.is_crossed] for a in self.alternatives])
-        of_bins = np.stack([np.broadcast_to(a.log_jacobian, channel.shape[1:]) for a in self.alternatives])
-        return np.asarray(TEMPER * share[:, None] * of_bins * is_moving)
+        counts = np.isfinite(channel) if has_noise else np.any([self._is_moving(each) for each in names], axis=0)
+        return np.asarray(TEMPER * self._log_unit(name) * counts)
+
+    def _log_unit(self, name: str) -> FloatArray:
+        """(A, n) logarithm of the unit of a channel."""
+        channel, shares = self.channel(name), _SCALE_SHARE[self.kind]
+        assert channel is not None
+        of_each = [np.broadcast_to(shares[(name == "turn") != a.is_crossed] * a.log_jacobian, channel.shape[1:]) for a in self.alternatives]
+        return np.stack(of_each)
 
     def _is_moving(self, name: str) -> BoolArray:
-        """(A, n)"""
+        """(A, n) whether a channel is of motion, by its size in any unit."""
         channel = self.channel(name)
         assert channel is not None
-        return np.array([np.abs(np.nan_to_num(z)) > _AT_REST * size_of(z) for z in channel])
+        return np.asarray(np.abs(np.nan_to_num(channel)) > _AT_REST * self.sizes[name] * np.exp(self._log_unit(name)))
 
     def channel(self, name: str) -> FloatArray | None:
         """(A, n) way or turn; None where it is not measured."""
@@ -186,7 +195,7 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
         inputs = _inputs(single, [0] * len(single), 0, name, 1.0, used)
-        _, _, c, information = channel_evidence(*inputs, _SIZES[name])
+        _, _, c, information = channel_evidence(*inputs, (_SIZES[name], 0.0))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
     return found
@@ -196,14 +205,16 @@ def _evidence(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: s
     """Evidence (A, n) by bin of one channel, at a level of the noise; what concerns all bins is spread over them."""
     used = [i for i, stack in enumerate(stacks) if stack.channel(name) is not None]
     inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choice, vary, name, level, used)
-    of_bins, price, _, _ = channel_evidence(*inputs, _SIZES[name])
+    sizes = _SIZES[name], min(stacks[i].sizes[name] for i in used)
+    of_bins, price, _, _ = channel_evidence(*inputs, sizes)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
-    if name == "turn" and skids.any():
-        varying = np.where(skids > 0.0, level * skids, relative), np.where(skids > 0.0, _SKID_SCALE, tau)
-        of_varying, price_of_varying, _, _ = channel_evidence(z, floor, *varying, bias_sigma, _SIZES[name])
-        is_better = of_varying.sum(axis=1) + price_of_varying + _SKID_ODDS > of_bins.sum(axis=1) + price
-        of_bins = np.where(is_better[:, None], of_varying, of_bins)
-        price = np.where(is_better, price_of_varying + _SKID_ODDS, price)
+    unusual = ((level * skids, _VARYING_SIGMA), (relative, _UNUSUAL_SIGMA)) if name == "turn" and skids.any() else ()
+    for share, sigma in unusual:
+        slides = np.where(skids > 0.0, share, relative), np.where(skids > 0.0, np.maximum(tau, sigma), tau)
+        of_sliding, price_of_sliding, _, _ = channel_evidence(z, floor, *slides, bias_sigma, sizes)
+        is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
+        of_bins = np.where(is_better[:, None], of_sliding, of_bins)
+        price = np.where(is_better, price_of_sliding + _SKID_ODDS, price)
     is_alone = np.isfinite(z).any(axis=2).sum(axis=1) < 2
     found = of_bins + price[:, None] / z.shape[2]
     if is_alone.any():

@@ -26,6 +26,8 @@ _SAME_DELAY_S = 0.15
 """Difference of delays that are the same alignment [s]: between candidates of three sources, and latencies."""
 _RESCORED = 50
 """Best choices whose evidence is integrated over the level of the noise."""
+_FAR = 30.0
+"""Logarithm of the evidence below the best at any level, beyond which no level brings a choice back."""
 _CHANGED = 3
 """Best choices of which one source is tried with a change within the log."""
 _CLEAR = 9.0
@@ -142,7 +144,7 @@ def search(stacks: Sequence[Stack]) -> Found:
     for level in _SEARCH_LEVELS:
         for key, value in _search_at(stacks, null, level, found).items():
             against[key] = min(value, against.get(key, math.inf))
-    best = sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED]
+    best = [choice for choice in sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED] if found[choice] > -_FAR]
     stacks, changed = with_changes(stacks, list(dict.fromkeys([*best[:_CHANGED], null])))
     kept = dict.fromkeys([null, *best, *changed])
     return Found({choice: _marginal(stacks, choice) for choice in kept}, against, stacks)
@@ -162,10 +164,11 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
     expand(null)
     against = _against(stacks, null, at_level)
     rivals = max((score for choice, score in at_level.items() if any(row.is_fault for row in rows_of(stacks, choice))), default=-math.inf)
-    for width in _WIDTHS if rivals > at_level[null] - _CLEAR else ():
+    is_clear = rivals <= at_level[null] - _CLEAR
+    for width in () if is_clear else _WIDTHS:
         for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
             expand(choice)
-    for choice in sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
+    for choice in () if is_clear else sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
         for twin in (*_mirrored(stacks, choice), *_shifted(stacks, choice)):
             if twin not in done:
                 expand(twin)

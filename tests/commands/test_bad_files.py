@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import functools
+import io
 import os
 import resource
 import signal
@@ -52,18 +54,20 @@ INPUTS: dict[str, tuple[str, ...]] = {
 }
 
 
-def _make_bomb(path: Path) -> None:
-    """1 MB that unpacks to 1 GB, as a map or a compressed log."""
-    if path.suffix == ".zstd":
-        with path.open("wb") as file:
-            compressor = zstd.ZstdCompressor()
-            for _ in range(1024):
-                file.write(compressor.compress(bytes(1 << 20)))
-            file.write(compressor.flush())
-        return
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("skidmap.json", "w", force_zip64=True) as member:
-        for _ in range(1024):
-            member.write(bytes(1 << 20))
+@functools.cache
+def _bomb(is_zstd: bool) -> bytes:
+    """Less than 1 MB that unpacks to half a GB, as a map or a compressed log."""
+    packed, piece = io.BytesIO(), bytes(1 << 20)
+    if is_zstd:
+        compressor = zstd.ZstdCompressor()
+        for _ in range(512):
+            packed.write(compressor.compress(piece))
+        packed.write(compressor.flush())
+        return packed.getvalue()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("skidmap.json", "w", force_zip64=True) as member:
+        for _ in range(512):
+            member.write(piece)
+    return packed.getvalue()
 
 
 def _make_sparse(path: Path) -> None:
@@ -76,7 +80,7 @@ KINDS: dict[str, Callable[[Path], object]] = {
     "/dev/zero": lambda path: path.symlink_to("/dev/zero"),
     "folder": Path.mkdir,
     "3 GB sparse": _make_sparse,
-    "bomb": _make_bomb,
+    "bomb": lambda path: path.write_bytes(_bomb(path.suffix == ".zstd")),
     "truncated": lambda path: path.write_bytes(b"PK\x03\x04\x14\x00\x89MCAP0\r\n#ROSBAG V2"),
     "foreign": lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 20),
     "not UTF-8": lambda path: path.write_bytes(b"log,robot\n\xff\xfe\xe9,\x80\n"),
