@@ -73,7 +73,7 @@ def _pairs(stack: Stack) -> Iterator[tuple[int, int, Row]]:
         for row in other.rows:
             rest = frozenset(each.key for each in other.rows if each is not row)
             base = by_rows.get((other.delay_s, rest))
-            if base is not None and row.is_fault and row.source != "clock" and not row.id.endswith(".unrelated"):
+            if base is not None and row.may_change:
                 yield base, k, row
 
 

@@ -54,8 +54,9 @@ def _log_likelihood(a: FloatArray, b: FloatArray) -> float:
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     if known.sum() < 16:
         return 0.0
-    r = np.linalg.svd(_white(a[known]).T @ _white(b[known]), compute_uv=False)[0]
-    return float(-0.5 * TEMPER * known.sum() * np.log(1.0 - min(float(r), 1.0) ** 2 + _FLOOR))
+    correlations = np.linalg.svd(_white(a[known]).T @ _white(b[known]), compute_uv=False)
+    r = min(float(correlations[0]), 1.0) if len(correlations) else 0.0  # a source that stands has none
+    return float(-0.5 * TEMPER * known.sum() * np.log(1.0 - r**2 + _FLOOR))
 
 
 def _white(channels: FloatArray) -> FloatArray:

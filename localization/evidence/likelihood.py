@@ -51,7 +51,7 @@ NOISE: Mapping[Kind, Noise] = {
     "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),
 }
 """Measured on fr079, MIT-CSAIL, ACES and the Husky of `tests/data`; the level is estimated in each log (`LEVELS`)."""
-_SKID_ODDS, _VARYING_SIGMA, _UNUSUAL_SIGMA = math.log(0.03), 1.0, 0.5
+_SKID_ODDS, _VARYING_SIGMA, _UNUSUAL_SIGMA = math.log(0.03), 0.4, 0.4
 """Logarithm of the odds of a k that changes with speed, floor or load within a log, or that is unusual; sigmas of its
 logarithm."""
 _STANDS_ODDS = math.log(0.03)
@@ -145,10 +145,10 @@ class Stack:
         return np.stack(of_each)
 
     def _is_moving(self, name: str) -> BoolArray:
-        """(A, n) whether a channel is of motion, by its size in any unit."""
+        """(A, n)"""
         channel = self.channel(name)
         assert channel is not None
-        return np.asarray(np.abs(np.nan_to_num(channel)) > _AT_REST * self.sizes[name] * np.exp(self._log_unit(name)))
+        return np.array([np.abs(np.nan_to_num(z)) > _AT_REST * size_of(z) for z in channel])
 
     def channel(self, name: str) -> FloatArray | None:
         """(A, n) way or turn; None where it is not measured."""

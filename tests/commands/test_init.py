@@ -116,13 +116,13 @@ def answer(monkeypatch: pytest.MonkeyPatch, answers: Iterable[str]) -> None:
 
 
 def test_init_in_a_terminal_asks_again_after_hostile_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answer(monkeypatch, ["maybe", "diff_drive", "-3", "nan", "0.1", "33", "[bold]", "0.33", "1e999", "", "0.25", "", "2", "n"])
+    answer(monkeypatch, ["maybe", "diff_drive", "-3", "nan", "0.1", "33", "[bold]", "0.33", "1e999", "", "0.25", "", "1.03", "n"])
     out = tmp_path / "r.toml"
     assert main(["init", str(DATA / "aces" / "aces.mcap"), "--out", str(out)]) == 0
     robot = load_robot(out)
     g = robot.geometry
     assert (g.wheel_radius_m, g.track_width_m, g.wheelbase_m, robot.drive) == (0.1, 0.33, 0.25, "diff_drive")
-    assert robot.driver.wheel_separation_multiplier == 2.0
+    assert robot.driver.wheel_separation_multiplier == 1.03
 
 
 @pytest.mark.parametrize("answers", [[], ["skid_steer", "0.1"], ["skid_steer", *["x"] * 9]], ids=["end", "end later", "no number"])

@@ -30,8 +30,10 @@ _SIDE_FLOOR_M_S, _SIDE_OF_WAY, _SIDE_OF_TURN_M = 0.02, 0.1, 0.05
 """Standard deviation of a robot's sideways speed: floor, part of the speed (slides are below 20 degrees in 99.9 % of three buildings), and
 metres per radian of turn beyond its centre of rotation."""
 
-_FREE_SIGMA, FACTOR_SIGMA = 2.5, 0.2
-"""Sigma of the logarithm of a factor that has no name, a gear or counts for radians; and of its measurement by the sizes of the motion."""
+_FREE_SIGMA = 2.5
+"""Sigma of the logarithm of a factor that has no name: a gear, or counts for radians."""
+FACTOR_SIGMA = 0.2
+"""Sigma of the logarithm of such a factor's measurement by the sizes of the motion."""
 
 Correction = Callable[[Robot], Robot]
 
@@ -54,6 +56,9 @@ class Row:
     """What to do where the robot file cannot express it."""
     is_fault: bool = True
     """False for what healthy robots have as well, as latencies: it competes with faults for the evidence, and accuses nobody."""
+    may_change: bool = False
+    """Whether practice has it from some time on, or until then: a restart at another resolution, a mount that is knocked. Wiring and units
+    stay while a driver runs."""
     since_s: float | None = None
     """Time from which on the source has it [s after the first reading]; None: all the time."""
     until_s: float | None = None

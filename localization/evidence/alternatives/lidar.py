@@ -124,7 +124,15 @@ def _mount_rows(frame: str, mount: Mount, is_flipped: bool, yaw: float, yaw_odds
         side = "left" if yaw > 0.0 else "right"
         angle = f"{abs(math.degrees(yaw)):.0f} deg" + ("" if abs(abs(yaw) - math.pi) < 1e-6 else f" to the {side}")
         rows.append(
-            Row("lidar.yaw", f"the LiDAR is turned by {angle}", yaw_odds, sector(yaw), yaw, correct=None if is_flipped else correct)
+            Row(
+                "lidar.yaw",
+                f"the LiDAR is turned by {angle}",
+                yaw_odds,
+                sector(yaw),
+                yaw,
+                correct=None if is_flipped else correct,
+                may_change=True,
+            )
         )
     return rows
 

@@ -188,7 +188,7 @@ def _units(robot: Robot) -> list[Unit]:
 
 def _factor_row(factor: float, sigma: float) -> Row:
     text = f"the wheels' rates are {1.0 / factor if factor < 1.0 else factor:.3g} times too {'large' if factor < 1.0 else 'small'}"
-    return Row("wheels.factor", text, _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor))
+    return Row("wheels.factor", text, _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor), may_change=True)
 
 
 def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float) -> Iterator[Alternative]:
