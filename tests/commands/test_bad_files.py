@@ -114,6 +114,8 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_no_such_file_ends_with_a_reason(name: str, log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before_bytes = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for kind, make in KINDS.items():
+        if (name, kind) == ("compare --out", "folder"):
+            continue  # the table is written in it
         folder = tmp_path / kind.replace("/", "")
         folder.mkdir()
         arguments = [part.format(log=log, bad=folder / "bad", out=folder / "out") for part in INPUTS[name]]
