@@ -210,8 +210,9 @@ def _evidence(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: s
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
     unusual = ((level * skids, _VARYING_SIGMA), (relative, _UNUSUAL_SIGMA)) if name == "turn" and skids.any() else ()
     for share, sigma in unusual:
-        slides = np.where(skids > 0.0, share, relative), np.where(skids > 0.0, np.maximum(tau, sigma), tau)
-        of_sliding, price_of_sliding, _, _ = channel_evidence(z, floor, *slides, bias_sigma, sizes)
+        of_share = np.ascontiguousarray(np.where(skids > 0.0, share, relative))
+        of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, sigma), tau))
+        of_sliding, price_of_sliding, _, _ = channel_evidence(z, floor, of_share, of_k, bias_sigma, sizes)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
         of_bins = np.where(is_better[:, None], of_sliding, of_bins)
         price = np.where(is_better, price_of_sliding + _SKID_ODDS, price)
@@ -248,4 +249,5 @@ def _inputs(
     relative = level * np.broadcast_to([n.relative for n in noise], (A, len(used)))
     tau = np.stack([np.broadcast_to(stacks[i].tau[name][r], A) for i, r in zip(used, rows, strict=True)], axis=1)
     bias_sigma = np.array([n.bias if is_turn else 0.0 for n in noise])
+    z, relative, tau = (np.ascontiguousarray(each) for each in (z, relative, tau))  # else each layout is compiled
     return z, floor, relative, tau, bias_sigma
