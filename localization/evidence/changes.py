@@ -15,7 +15,7 @@ import numpy as np
 
 from localization.evidence.alternatives import Alternative, Row
 from localization.evidence.alternatives.alternative import LEVELS
-from localization.evidence.likelihood import Stack, evidence_by_bin, log_posterior
+from localization.evidence.likelihood import Choice, Stack, evidence_by_bin, log_posterior
 from motion_models.se2 import FloatArray
 
 _ODDS = math.log(0.1)
@@ -25,8 +25,6 @@ _MIN_BINS = 6
 _TRIED, _EVERY = 8, 2
 """Pairs of alternatives that are tried with a change in each second bin, scale and all."""
 _REMEDY = "Drive with one set-up per log: cut the log there, and find what restarted."
-
-Choice = tuple[int, ...]
 
 
 def with_changes(stacks: Sequence[Stack], choices: Sequence[Choice]) -> tuple[list[Stack], list[Choice]]:
@@ -38,7 +36,7 @@ def with_changes(stacks: Sequence[Stack], choices: Sequence[Choice]) -> tuple[li
             composite = _best_change(stacks, choice, i)
             if composite is not None:
                 alternatives = [*found[i].alternatives, composite]
-                found[i] = Stack(stack.kind, alternatives, stack.sizes, stack.behind_s, stack.t)
+                found[i] = stack.of(alternatives)
                 changed.append((*choice[:i], len(alternatives) - 1, *choice[i + 1 :]))
     return found, changed
 
@@ -60,14 +58,14 @@ def _best_change(stacks: Sequence[Stack], choice: Choice, index: int) -> Alterna
     joined = [_joined(stack, base, k, row, m, is_since) for _, base, k, row, is_since in best for m in bins]
     if not joined:
         return None
-    tried = [Stack(stack.kind, joined, stack.sizes, stack.behind_s, stack.t) if i == index else other for i, other in enumerate(stacks)]
+    tried = [stack.of(joined) if i == index else other for i, other in enumerate(stacks)]
     scores = log_posterior(tried, choice, index, level)
     unchanged = log_posterior(stacks, choice, index, level)
     return joined[int(scores.argmax())] if scores.max() > unchanged.max() else None
 
 
 def _pairs(stack: Stack) -> Iterator[tuple[int, int, Row]]:
-    """Two alternatives at the same delay, of which the second has one fault more that a source can have, and that row."""
+    """Two alternatives at the same delay, of which the second has one row more that may change within a log, and that row."""
     by_rows = {(a.delay_s, frozenset(row.key for row in a.rows)): i for i, a in enumerate(stack.alternatives)}
     for k, other in enumerate(stack.alternatives):
         for row in other.rows:
@@ -83,8 +81,8 @@ def _joined(stack: Stack, of_base: int, k: int, row: Row, m: int, is_since: bool
     is_other = (np.arange(len(stack.t)) >= m) == is_since
     since_s, until_s = (at, None) if is_since else (None, at)
     text = f"{row.text} {'since' if is_since else 'until'} t = {at:.0f} s"
-    changed = replace(row, text=text, log_odds=row.log_odds + _ODDS - math.log(len(stack.t)), correct=None, remedy=_REMEDY)
-    changed = replace(changed, since_s=since_s, until_s=until_s)
+    odds = row.log_odds + _ODDS - math.log(len(stack.t))
+    changed = replace(row, text=text, log_odds=odds, correct=None, remedy=_REMEDY, since_s=since_s, until_s=until_s)
     share = float(is_other.mean())
     rows = (*base.rows, changed)
     return replace(

@@ -114,9 +114,7 @@ def _mean(z: FloatArray, noise: Noises, a: FloatArray, b: FloatArray, size: floa
 
 
 @subroutine
-def _scales(
-    z: FloatArray, noise: Noises, prior: Noises, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray
-) -> None:  # fmt: skip
+def _scales(z: FloatArray, noise: Noises, prior: Noises, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray) -> None:
     """Scales, biases and the information on the scales (k,) by the motion ``x``, with sigmas of their ``prior``."""
     tau, bias_sigma = prior
     for j in range(len(c)):

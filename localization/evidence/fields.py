@@ -1,4 +1,4 @@
-"""Fields of the same message are witnesses of each other: angles and velocities of a wheel, wheels of one side, steps of a counter.
+"""Fields of the same message check each other: angles and velocities of a wheel, wheels of one side, steps of a counter.
 
 What they show needs no other source. Where two fields differ, either may be wrong: both are alternatives of the source, and the other
 sources decide.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -51,14 +51,15 @@ NOISE: Mapping[Kind, Noise] = {
     "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),
 }
 """Measured on fr079, MIT-CSAIL, ACES and the Husky of `tests/data`; the level is estimated in each log (`LEVELS`)."""
-_SKID_ODDS, _VARYING_SIGMA, _UNUSUAL_SIGMA = math.log(0.03), 0.4, 0.4
-"""Logarithm of the odds of a k that changes with speed, floor or load within a log, or that is unusual; sigmas of its
-logarithm."""
+_SKID_ODDS, _SKID_SIGMA = math.log(0.03), 0.4
+"""Logarithm of the odds of a k that changes with speed, floor or load within a log, or that is unusual; sigma of its logarithm."""
 _STANDS_ODDS = math.log(0.03)
 """Share of drives without a way, as turning in place, or without a turn."""
 _AT_REST = 0.05
 """Part of the root mean square of a source's rates up to which it stands."""
 _SIZES = {"way": WAY_M_S, "turn": TURN_RAD_S}
+Choice = tuple[int, ...]
+"""Index of an alternative, by source."""
 _SCALE_SHARE: Mapping[Kind, tuple[float, float]] = {
     "wheels": (0.5, 0.5),
     "driver": (1.0, 0.0),
@@ -79,6 +80,8 @@ class Stack:
     """`sizes`, where ``alternatives`` are not all of them."""
     behind_s: float | None = None
     """`Source.behind_s`."""
+    t: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(n,) begin of each bin [s]."""
 
     @cached_property
     def sizes(self) -> Mapping[str, float]:
@@ -91,12 +94,13 @@ class Stack:
         of = {name: [size_of(c) for a in in_units if (c := getattr(a, name)) is not None and np.isfinite(c).any()] for name in sizes}
         return {name: max([least, *of[name]]) for name, least in sizes.items() if getattr(self.alternatives[0], name) is not None}
 
-    t: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """(n,) begin of each bin [s]."""
-
     def only(self, k: int) -> Stack:
         """The stack with alternative ``k`` alone."""
-        return Stack(self.kind, [self.alternatives[k]], self.sizes, self.behind_s, self.t)
+        return self.of([self.alternatives[k]])
+
+    def of(self, alternatives: Sequence[Alternative]) -> Stack:
+        """The stack with other ``alternatives`` of the source, its sizes as they are."""
+        return replace(self, alternatives=alternatives, raw=self.sizes)
 
     @cached_property
     def alone(self) -> Mapping[str, FloatArray]:
@@ -173,13 +177,8 @@ class Stack:
 
 def log_posterior(stacks: Sequence[Stack], choice: Sequence[int], vary: int, level: float) -> FloatArray:
     """Log posterior (A,) of all alternatives of source ``vary``, the others as in ``choice``, at a ``level`` of the noise."""
-    return np.asarray(own_posterior(stacks, choice, vary) + evidence_by_bin(stacks, choice, vary, level).sum(axis=1))
-
-
-def own_posterior(stacks: Sequence[Stack], choice: Sequence[int], vary: int) -> FloatArray:
-    """(A,) the part of `log_posterior` that each source has by itself."""
     others = sum(float(stack.own[c]) for i, (stack, c) in enumerate(zip(stacks, choice, strict=True)) if i != vary)
-    return np.asarray(stacks[vary].own + others)
+    return np.asarray(stacks[vary].own + others + evidence_by_bin(stacks, choice, vary, level).sum(axis=1))
 
 
 def evidence_by_bin(stacks: Sequence[Stack], choice: Sequence[int], vary: int, level: float) -> FloatArray:
@@ -208,10 +207,9 @@ def _evidence(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: s
     sizes = _SIZES[name], min(stacks[i].sizes[name] for i in used)
     of_bins, price, _, _ = channel_evidence(*inputs, sizes)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
-    unusual = ((level * skids, _VARYING_SIGMA), (relative, _UNUSUAL_SIGMA)) if name == "turn" and skids.any() else ()
-    for share, sigma in unusual:
+    for share in (level * skids, relative) if name == "turn" and skids.any() else ():  # k changes, or is unusual
         of_share = np.ascontiguousarray(np.where(skids > 0.0, share, relative))
-        of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, sigma), tau))
+        of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
         of_sliding, price_of_sliding, _, _ = channel_evidence(z, floor, of_share, of_k, bias_sigma, sizes)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
         of_bins = np.where(is_better[:, None], of_sliding, of_bins)

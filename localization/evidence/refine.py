@@ -8,15 +8,14 @@ from dataclasses import replace
 from functools import partial
 
 from localization.evidence.alternatives import Row
-from localization.evidence.alternatives.wheels import scale_unit
-from localization.evidence.likelihood import Stack, scales
+from localization.evidence.alternatives.wheels import factor_text, scale_unit
+from localization.evidence.likelihood import Choice, Stack, scales
 from motion_models.robot import Robot
 
 _FREE = 3.0
 """Sigma of the logarithm of a factor that is measured."""
 _NAMED_SIGMA = 0.03
 """Sigma of the logarithm of a measured factor by other errors of the radius; within twice that, a factor of two is one."""
-Choice = tuple[int, ...]
 
 
 def refined_rows(stacks: Sequence[Stack], choice: Choice, robot: Robot) -> tuple[Row, ...]:
@@ -43,7 +42,7 @@ def measured_scales(stacks: Sequence[Stack], choice: Choice) -> dict[tuple[str, 
 def _freed(single: Sequence[Stack], index: int) -> list[Stack]:
     """``single`` with the scale of one source free."""
     free = replace(single[index].alternatives[0], way_sigma=_FREE, turn_sigma=_FREE)
-    return [Stack(stack.kind, [free], stack.sizes) if i == index else stack for i, stack in enumerate(single)]
+    return [stack.of([free]) if i == index else stack for i, stack in enumerate(single)]
 
 
 def _with_factor(row: Row, single: Sequence[Stack]) -> Row:
@@ -53,7 +52,4 @@ def _with_factor(row: Row, single: Sequence[Stack]) -> Row:
     c, sigma = scales(_freed(single, index), "way" if has_way else "turn")[index]
     nominal = row.value or 1.0
     factor = nominal if abs(c) < 2.0 * max(sigma, _NAMED_SIGMA) and row.detail == "0.05" else float(f"{nominal * math.exp(-c):.4g}")
-    what = "large" if factor < 1.0 else "small"
-    size = 1.0 / factor if factor < 1.0 else factor
-    text = f"the wheels' rates are {size:.3g} (+- {100.0 * sigma:.0f} %) times too {what}"
-    return replace(row, value=factor, text=text, correct=partial(scale_unit, factor))
+    return replace(row, value=factor, text=factor_text(factor, f" (+- {100.0 * sigma:.0f} %)"), correct=partial(scale_unit, factor))

@@ -13,7 +13,7 @@ from localization.evidence.alternatives import MAKERS, Alternative, Row
 from localization.evidence.alternatives.alternative import LEVELS, STILL_M_S, STILL_RAD_S, size_of, unrelated_evidence
 from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
-from localization.evidence.likelihood import Stack, log_posterior
+from localization.evidence.likelihood import Choice, Stack, log_posterior
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -45,7 +45,6 @@ _LATENCY_SIGMA_S = 0.05
 _UNRELATED_ODDS = math.log(1e-5)
 """Prior odds of a source that measures another motion, or none: another robot's, a frozen sensor, a fault that no row has."""
 
-Choice = tuple[int, ...]
 IntArray = NDArray[np.intp]
 
 

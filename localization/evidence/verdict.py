@@ -10,9 +10,9 @@ from typing import Any, Literal
 import numpy as np
 
 from localization.evidence.alternatives import Row
-from localization.evidence.likelihood import Stack
+from localization.evidence.likelihood import Choice, Stack
 from localization.evidence.refine import measured_scales, refined_rows
-from localization.evidence.search import Choice, posterior, search
+from localization.evidence.search import posterior, search
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 
@@ -58,7 +58,7 @@ class SetUp:
     reason: str = ""
     """Why nothing could be compared."""
     by_file: float = 0.0
-    """Probability that all is as the robot file says."""
+    """Probability that all is as the robot file declares."""
     against: Mapping[str, float] = field(default_factory=dict)
     """By id of a row: logarithm of the Bayes factor against that fault alone."""
     scales: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict)

@@ -165,7 +165,7 @@ def size_of(channel: FloatArray) -> float:
 
 
 def _with_mount(frame: str, change: Callable[[Mount], Mount], mount: Mount, robot: Robot) -> Robot:
-    """``robot`` whose ``frame`` has the changed mount, before what /tf_static says: that of the robot file where it overrides already, as
+    """``robot`` whose ``frame`` has the changed mount, before that of /tf_static: the one of the robot file where it overrides already, as
     by another row, else ``mount``."""
     mount = robot.mounts[frame] if frame in robot.tf.overridden and frame in robot.mounts else mount
     overridden = tuple(dict.fromkeys((*robot.tf.overridden, frame)))

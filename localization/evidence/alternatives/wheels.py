@@ -186,9 +186,14 @@ def _units(robot: Robot) -> list[Unit]:
     return [*found, *((factor, _TWICE_SIGMA, (_factor_row(factor, _TWICE_SIGMA),)) for factor in _TWICE)]
 
 
+def factor_text(factor: float, spread: str = "") -> str:
+    """Clause on rates that have to be multiplied by ``factor``."""
+    size, what = (1.0 / factor, "large") if factor < 1.0 else (factor, "small")
+    return f"the wheels' rates are {size:.3g}{spread} times too {what}"
+
+
 def _factor_row(factor: float, sigma: float) -> Row:
-    text = f"the wheels' rates are {1.0 / factor if factor < 1.0 else factor:.3g} times too {'large' if factor < 1.0 else 'small'}"
-    return Row("wheels.factor", text, _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor), may_change=True)
+    return Row("wheels.factor", factor_text(factor), _ODDS["factor"], f"{sigma:g}", factor, partial(scale_unit, factor), may_change=True)
 
 
 def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float) -> Iterator[Alternative]:
