@@ -38,7 +38,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     ),
     "calibrate": ("Calibrate", "Fit a motion model to logs or tables and write the robot file."),
     "diagnose": ("Diagnose", "Find what a motion model gets wrong on a log, its cause, and the gain of correcting it."),
-    "twin": ("Twin", "Find what a simulator of the robot (MuJoCo) gets wrong on a log, and mend it."),
+    "twin": ("Twin", "Find what a simulator of the robot (MuJoCo, Gazebo) gets wrong on a log, and mend it."),
     "weigh": ("Weigh", "Estimate the centre of gravity and an unknown load from how the robot turns."),
     "init": ("Init", "Write a robot file for a new robot from a log and a URDF."),
     "check": ("Check", "Check signs, units, clocks and mounts of a robot file against a minute of driving."),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -12,12 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from localization.commands.common import write_json
+from localization.errors import SimulationError
 from localization.output import check_outputs
 from localization.simulation.experiments import EXPERIMENTS
 from localization.simulation.injected_faults import FAULTS, parse_faults
 from localization.simulation.open_loop_scores import OpenLoopScore, mean_scores_by_trajectory, score_open_loop_runs
 from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
+from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 
 _EXPERIMENTS = "; ".join(f"{e.name}: {e.meaning}" for e in EXPERIMENTS.values())
@@ -38,6 +40,10 @@ class Simulate:
     """Seed of all noise. The same seed gives the same log, byte for byte."""
     effect: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="ID=SIZE", help=_EFFECTS)] = ()
     """Difference of the robot from its file; may be given several times."""
+    engine: Literal["skidloc", "mujoco"] = "skidloc"
+    """What moves the robot: our model of a skid-steer vehicle, or MuJoCo with the file of --simulator."""
+    simulator: Path | None = None
+    """The robot in MuJoCo (MJCF), as `skidloc twin` takes it and writes it. Without one it is written from the robot file."""
     config: SimulationConfig = field(default_factory=SimulationConfig)
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write what is printed, and when each run began and ended, to this file as well."""
@@ -46,7 +52,7 @@ class Simulate:
         """Run the command, with output on ``console``."""
         check_outputs(self.out, self.json)
         robot, effects = load_robot(self.robot), parse_faults(self.effect)
-        simulation = simulate(self.experiment, robot, self.seed, effects, self.config)
+        simulation = self._simulation(robot, effects)
         with console.status("driving") as status:
             shown = 0
 
@@ -62,6 +68,19 @@ class Simulate:
         if self.json is not None:
             write_json(self.json, _content(simulation, self.seed, effects, count, scores))
         _print(console, simulation, self.out, count, scores)
+
+    def _simulation(self, robot: Robot, effects: dict[str, float]) -> Simulation:
+        if self.engine == "skidloc":
+            if self.simulator is not None:
+                raise SimulationError("--simulator is a file of MuJoCo: add --engine mujoco.")
+            return simulate(self.experiment, robot, self.seed, effects, self.config)
+        from localization.twin.mujoco_simulator import read_simulator
+        from localization.twin.robot_mjcf import mjcf_of
+        from localization.twin.simulated_drive import simulate_in_mujoco
+        from localization.twin.xml_file import load
+
+        file = mjcf_of(robot) if self.simulator is None else load(self.simulator)
+        return simulate_in_mujoco(self.experiment, robot, read_simulator(file, robot), self.seed, effects, self.config)
 
 
 def _content(simulation: Simulation, seed: int, effects: dict[str, float], count: int, scores: list[OpenLoopScore]) -> dict[str, Any]:

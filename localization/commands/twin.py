@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -16,28 +15,31 @@ from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import add_row, in_radians, new_folder, plain_table, print_line, print_table, write_json
 from localization.diagnosis.drive import drive_of_log, drive_of_table
+from localization.errors import SimulationError
 from localization.evidence import open_log_as_declared
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.twin_page import percent, write_twin_page
-from localization.twin.mjcf import Mjcf, load
+from localization.twin.other_names import usd_table
 from localization.twin.robot_mjcf import mjcf_of
-from localization.twin.twin import LAW_MODULE, Mended, TwinConfig, TwinResult, examine, provenance
-from localization.twin.urdf import is_urdf, mjcf_of_urdf
+from localization.twin.robot_sdf import sdf_of
+from localization.twin.simulator import Simulator
+from localization.twin.twin import Mended, TwinConfig, TwinResult, examine, provenance
+from localization.twin.xml_file import XmlFile, load, parse
 from motion_models.calibration.maneuvers import Maneuver, read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotations, rotations_as_maneuvers
+from motion_models.center_of_gravity.xacro_files import expand_xacro, is_xacro
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 
 _NOT_BETTER = "Not written: that is within their scatter."
-FOLDERS = {"numbers": "numbers", "contact law": "contact_law"}
-"""Folder of each repair."""
+EngineName = Literal["auto", "mujoco", "dart"]
 
 
 @dataclass(frozen=True)
 class Twin:
-    """Find what a simulator of the robot (MuJoCo) gets wrong on a log, and mend it."""
+    """Find what a simulator of the robot (MuJoCo, Gazebo) gets wrong on a log, and mend it."""
 
     source: tyro.conf.Positional[tuple[Path, ...]]
     """Logs (.bag, folder, .mcap), or tables (.csv) of rotations in place (cg_x_m, cg_y_m, rotation_ratio, cor_x_m, cor_y_m) or of windows
@@ -45,8 +47,11 @@ class Twin:
     robot: str
     """Name of a shipped robot, or path of a robot TOML file."""
     simulator: Path | None = None
-    """The robot in MuJoCo (MJCF, .xml), or its URDF, which is converted. Without one the file is written from the robot file, with MuJoCo's
+    """The robot in MuJoCo (MJCF, .xml) or Gazebo (SDF), or its URDF. Without one the file is written from the robot file, with the engine's
     default contacts."""
+    engine: EngineName = "auto"
+    """What plays it: MuJoCo, or DART, which is Gazebo's default physics. auto: DART for an SDF, MuJoCo for an MJCF, a URDF (which is then
+    converted) and the robot file."""
     out: Path | None = None
     """New folder for twin.json, report.html and, where it is better, the mended simulator."""
     motion_reference: MotionReferenceName = "auto"
@@ -70,11 +75,11 @@ class Twin:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
-        mjcf, notes = self._simulator(robot)
+        simulator, notes = self._simulator(robot)
         with console.status("reading"):
             maneuvers = [m for path in self.source for m in self._maneuvers(path, robot)]
         with console.status("simulating"):
-            result = examine(maneuvers, robot, mjcf, self.config)
+            result = examine(maneuvers, robot, simulator, self.config)
             result = dataclasses.replace(result, notes=(*notes, *result.notes))
         print_twin(console, result)
         names = ", ".join(path.name for path in self.source)
@@ -85,19 +90,29 @@ class Twin:
                 write_json(folder / "twin.json", result.to_dict())
                 write_twin_page(folder / "report.html", result, robot, names)
                 for repair in (m for m in result.repaired if m.is_better):
-                    write_repair(folder / FOLDERS[repair.name], self.out / FOLDERS[repair.name], repair, provenance(result, repair, names))
+                    write_repair(folder / folder_of(repair), self.out / folder_of(repair), repair, provenance(result, repair, names))
             print_line(console, f"report: {self.out / 'report.html'}")
             for repair in (m for m in result.repaired if m.is_better):
                 is_best = " (the better one)" if repair is result.best and len(result.repaired) > 1 else ""
-                print_line(console, f"simulator with {repair.name}{is_best}: {self.out / FOLDERS[repair.name] / repair.file.name}")
+                print_line(console, f"simulator with {repair.name}{is_best}: {self.out / folder_of(repair) / repair.file.name}")
 
-    def _simulator(self, robot: Robot) -> tuple[Mjcf, tuple[str, ...]]:
-        """The simulator's file, and what was left out of it."""
-        if self.simulator is None:
-            return mjcf_of(robot), ()
-        if is_urdf(self.simulator):
-            return mjcf_of_urdf(self.simulator, robot)
-        return load(self.simulator), ()
+    def _simulator(self, robot: Robot) -> tuple[Simulator, tuple[str, ...]]:
+        """The simulator, and what was left out of its file."""
+        file = None if self.simulator is None else _load(self.simulator)
+        is_dart = self.engine == "dart" or (self.engine == "auto" and file is not None and file.root.tag == "sdf")
+        if is_dart:
+            if file is not None and file.root.tag == "mujoco":
+                raise SimulationError(f"simulator '{self.simulator}' is an MJCF, which DART does not read. Leave out --engine dart.")
+            from localization.twin.gazebo_simulator import read_gazebo_simulator
+
+            return read_gazebo_simulator(file or sdf_of(robot), robot), ()
+        from localization.twin.gazebo_mjcf import mjcf_of_gazebo
+        from localization.twin.mujoco_simulator import read_simulator
+
+        notes: tuple[str, ...] = ()
+        if file is not None and file.root.tag != "mujoco":
+            file, notes = mjcf_of_gazebo(file, robot)
+        return read_simulator(file or mjcf_of(robot), robot, self.config.threads), notes
 
     def _maneuvers(self, path: Path, robot: Robot) -> list[Maneuver]:
         """Maneuvers of one log or table."""
@@ -112,12 +127,24 @@ class Twin:
         return list(drive_of_table(path.name, robot, maneuvers, kind).maneuvers)
 
 
+def _load(path: Path) -> XmlFile:
+    """The simulator's file; a xacro file is expanded."""
+    if not is_xacro(path):
+        return load(path)
+    urdf = path.with_name(f"{path.name.removesuffix('.xacro').removesuffix('.urdf')}.urdf")
+    return parse({urdf.name: expand_xacro(path, {}, {}).encode()}, urdf, "robot")
+
+
+def folder_of(repair: Mended) -> str:
+    """Name of the folder of a repair."""
+    return repair.name.replace(" ", "_")
+
+
 def write_repair(folder: Path, shown: Path, repair: Mended, comment: str) -> None:
-    """Write the file and those that it includes to ``folder``, which will be ``shown``, and the contact law's module beside it."""
+    """Write the file and those that it includes to ``folder``, which will be ``shown``, and what belongs beside it."""
     folder.mkdir(exist_ok=True)
-    if repair.name == "contact law":
-        module = files("localization.twin").joinpath(LAW_MODULE).read_text(encoding="utf-8")
-        write_text_file(folder / LAW_MODULE, module)
+    for name, text in (*repair.beside.items(), ("usd.csv", usd_table(repair.changes))):
+        write_text_file(folder / name, text)
     for name, data in repair.file.with_folders_of(shown).with_comment(comment).files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -151,7 +178,7 @@ def print_twin(console: Console, result: TwinResult) -> None:
     for repair in result.repaired:
         gain = f"root mean square error on windows held out smaller by {repair.gain} m; {repair.judged.touch}"
         print_line(console, f"{repair.name}: {gain}{'' if repair.is_better else '. ' + _NOT_BETTER}")
-        for meaning, attribute, old, new in repair.changes:
-            print_line(console, f"  {attribute}: {'none' if math.isnan(old) else f'{old:.4g}'} -> {new:.4g} ({meaning})")
+        for change in repair.changes:
+            print_line(console, f"  {change.describe()}")
     for note in result.notes:
         print_line(console, f"! {note}")

@@ -57,8 +57,8 @@ def twin_page(result: TwinResult, robot: Robot, source: str) -> str:
         html.Section("Remarks", html.bullets(result.notes)),
         html.glossary(_TERMS),
     ]
-    facts = f"{robot.name} · {result.fitted} windows fitted, {len(result.windows)} held out · MuJoCo"
-    title = f"{result.simulator.mjcf.path.name} against {source}"
+    facts = f"{robot.name} · {result.fitted} windows fitted, {len(result.windows)} held out · {result.simulator.engine_name}"
+    title = f"{result.simulator.file.path.name} against {source}"
     return html.render(html.Page(title, facts, [result.sentence], sections))
 
 
@@ -109,12 +109,12 @@ def percent(share: float) -> str:
 def _changes(m: Mended) -> html.Table:
     rows = [
         [
-            html.Cell(meaning),
-            html.Cell(attribute, is_code=True),
-            html.Cell("" if math.isnan(old) else f"{old:.4g}"),
-            html.Cell(f"{new:.4g}"),
+            html.Cell(c.meaning),
+            html.Cell(c.attribute, is_code=True),
+            html.Cell("" if math.isnan(c.old) else f"{c.old:.4g}"),
+            html.Cell(f"{c.new:.4g}"),
         ]
-        for meaning, attribute, old, new in m.changes
+        for c in m.changes
     ]
     return html.Table([html.Cell(head) for head in ("Number", "Attribute", "File", "Now")], rows)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,7 +20,7 @@ class Touch:
     shares: FloatArray
     """(n + 1,) share of the time steps in which 0, 1, ... n wheels touch."""
     load_scatter: float
-    """Standard deviation of a wheel's load from step to step over its mean [-]."""
+    """Standard deviation of a wheel's load from step to step over its mean [-]; NaN where loads are not known."""
 
     @property
     def all_wheels(self) -> float:
@@ -35,10 +36,8 @@ class Touch:
         """
         numbers = {2: "two", 3: "three", 4: "four", 6: "six", 8: "eight"}
         count = len(self.shares) - 1
-        return (
-            f"all {numbers.get(count, str(count))} wheels touch in {100 * self.all_wheels:.0f} % of the time steps; their loads scatter by"
-            f" {100 * self.load_scatter:.0f} %"
-        )
+        scatter = "" if math.isnan(self.load_scatter) else f"; their loads scatter by {100 * self.load_scatter:.0f} %"
+        return f"all {numbers.get(count, str(count))} wheels touch in {100 * self.all_wheels:.0f} % of the time steps{scatter}"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,9 @@
     x = argmin  sum_w |L_w^-1 r_w(x)|^2 + sum_i ((x_i - m_i) / sigma_i)^2
 
 r_w is the motion that the engine makes of a window relative to the measured one, and its wheels' rates relative to the measured ones; L_w
-the root of their covariance. Engines are not smooth where wheels hop, so that derivatives are secants over a share of the prior's sigma.
+the root of their covariance. Engines are chaotic where wheels hop: a change of any number by 2 % of its prior's sigma moves a Husky's
+window by 3 mm and 12 mrad. Derivatives are therefore secants as long as a prior's sigma, which each step updates (Broyden 1965), and the
+scatter counts as noise, whose size is that of the residuals.
 """
 
 from __future__ import annotations
@@ -15,25 +17,26 @@ import numpy as np
 
 from localization.errors import SimulationError
 from localization.twin.engine import Played
-from localization.twin.numbers import Numbers, Simulator
 from localization.twin.parameters import Hypotheses
+from localization.twin.simulator import Numbers, Simulator
 from localization.twin.windows import Window
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
-SECANT = 0.15
-"""Length of a secant over the prior's sigma."""
+SECANT = 0.7
+"""Least length of a secant over the prior's sigma. At 0.15 the chaos of a Husky's contacts is 5 times the effect of its radius."""
 RATE_SIGMA = (0.02, 0.02)
 """Sigma of a wheel's mean rate in a window: absolute [rad/s], the smallest step of encoders and servos, and relative, that of a servo."""
 AIRBORNE_SIGMA = 0.1
-"""Share of the time that a wheel of a robot on a floor is in the air: none, but for rough ground."""
-_MAX_STEP = 1.5
+"""Share of the time that a wheel of a robot on a floor is in the air, mean over the windows: none, but for rough ground."""
+_MAX_STEP = 3.0
 """Longest step of a parameter in an iteration, over its prior sigma."""
 _DAMPING, _DAMPINGS = 1e-2, 5
 _SMALL = 0.3
 """Change over the prior's sigma that is small."""
 _STARTS = 2
-_CONVERGED = 0.2
+_MAX_LEVERAGE, _NOISE_PASSES = 0.9, 3
+_CONVERGED = 1.0
 """Gain of an iteration [nats] below which the search ends."""
 NOISE_BOUNDS = (0.01, 10.0)
 """Bounds of the factor of a component's covariance that residuals show."""
@@ -122,42 +125,64 @@ class Problem:
         return J
 
     def minimize(self, at: Point, columns: Sequence[int], iterations: int) -> Point:
-        """Gauss-Newton from ``at`` in the parameters ``columns``."""
-        damping = _DAMPING
-        low, high = self.hypotheses.bounds(at.base)
-        sigmas, priors = self.hypotheses.sigmas[list(columns)], self.hypotheses.priors[list(columns)]
+        """Gauss-Newton from ``at`` in the parameters ``columns``, with secants that steps update."""
+        chosen = list(columns)
+        if self.is_late:
+            return at
+        low, high = (bound[chosen] for bound in self.hypotheses.bounds(at.base))
+        sigmas, priors = self.hypotheses.sigmas[chosen], self.hypotheses.priors[chosen]
+        damping, J, is_new = _DAMPING, self._scaled_jacobian(at, chosen), True
         for _ in range(iterations):
             if self.is_late:
                 break
-            J = self.jacobian(at, columns).reshape(-1, len(columns)) * sigmas
-            r = self.whitened(at.residuals).ravel()
-            z = (at.x[list(columns)] - priors) / sigmas
-            A, b = J.T @ J + np.eye(len(columns)), J.T @ r + z
             better = None
             for _ in range(_DAMPINGS):
+                A, b = J.T @ J + np.eye(len(chosen)), J.T @ self.whitened(at.residuals).ravel() + (at.x[chosen] - priors) / sigmas
                 step = -np.linalg.solve(A + damping * np.diag(np.diag(A)), b)
                 step *= min(1.0, _MAX_STEP / max(float(np.abs(step).max()), 1e-12))
                 x = at.x.copy()
-                x[list(columns)] = np.clip(x[list(columns)] + step * sigmas, low[list(columns)], high[list(columns)])
+                x[chosen] = np.clip(x[chosen] + step * sigmas, low, high)
                 tried = self.point(at.base, x)
+                if tried is not None:
+                    J = self._updated(J, (x - at.x)[chosen] / sigmas, tried.residuals - at.residuals)
                 if tried is not None and tried.cost < at.cost:
                     better, damping = tried, damping * 0.2
                     break
                 damping *= 8.0
-            if better is None:
-                break
-            gained = at.cost - better.cost
-            at = better
+            gained = 0.0 if better is None else at.cost - better.cost
+            at = better or at
             if gained < _CONVERGED:
-                break
+                if is_new:
+                    break
+                damping, J, is_new = _DAMPING, self._scaled_jacobian(at, chosen), True
+            else:
+                is_new = False
         return at
 
+    def _scaled_jacobian(self, at: Point, columns: Sequence[int]) -> FloatArray:
+        """(6 W, c) secants of the whitened residuals by the prior's sigmas."""
+        return np.asarray(self.jacobian(at, columns).reshape(-1, len(columns)) * self.hypotheses.sigmas[list(columns)])
+
+    def _updated(self, J: FloatArray, step: FloatArray, moved: FloatArray) -> FloatArray:
+        """``J`` (6 W, c) that agrees with what a ``step`` (c,) has ``moved`` (W, 6), where that is longer than chaos (Broyden 1965)."""
+        square = float(step @ step)
+        return J if square < SECANT**2 else J + np.outer(self.whitened(moved).ravel() - J @ step, step) / square
+
     def estimate_noise(self, at: Point) -> Point:
-        """Scale the components' covariances to the scatter of the residuals ``at`` a point, and return it under them."""
-        squares = (at.residuals / sigmas_of(self.windows)) ** 2
+        """Scale the components' covariances to the scatter of the residuals ``at`` a point, and return it under them.
+
+        A residual of leverage h has the variance (1 - h) sigma^2: fitted numbers follow a part of the noise.
+        """
+        J = self._scaled_jacobian(at, range(len(at.x)))
         known = np.isfinite(sigmas_of(self.windows))
-        factors = [float(np.median(squares[known[:, c], c])) / CHI_SQUARE_MEDIAN if known[:, c].any() else 1.0 for c in range(5)]
-        self.noise = np.append(np.clip(factors, *NOISE_BOUNDS), 1.0)
+        squares = (at.residuals / sigmas_of(self.windows)) ** 2
+        for _ in range(_NOISE_PASSES):
+            leverage = np.einsum("ij,ji->i", J, np.linalg.solve(J.T @ J + np.eye(J.shape[1]), J.T)).reshape(squares.shape)
+            left = squares / (1.0 - np.minimum(leverage, _MAX_LEVERAGE))
+            factors = [float(np.median(left[known[:, c], c])) / CHI_SQUARE_MEDIAN if known[:, c].any() else 1.0 for c in range(5)]
+            noise = np.append(np.clip(factors, *NOISE_BOUNDS), 1.0)
+            J *= np.tile(np.sqrt(self.noise / noise), len(self.windows))[:, None]
+            self.noise = noise
         return self.scored(at.base, at.x, at.residuals)
 
 
@@ -184,7 +209,8 @@ def sigmas_of(windows: Sequence[Window]) -> FloatArray:
     rates = np.array([w.mean_rates for w in windows])
     largest = np.abs(rates).max(axis=1, keepdims=True)
     of_rates = np.broadcast_to(RATE_SIGMA[0] + RATE_SIGMA[1] * largest, rates.shape)
-    return np.column_stack([poses, of_rates, np.full(len(windows), AIRBORNE_SIGMA)])
+    airborne = AIRBORNE_SIGMA * np.sqrt(len(windows))  # they share the engine's contacts
+    return np.column_stack([poses, of_rates, np.full(len(windows), airborne)])
 
 
 def start(problem: Problem) -> Point:
@@ -197,14 +223,17 @@ def start(problem: Problem) -> Point:
 
 
 def fit_all(problem: Problem, iterations: int = 12) -> Point:
-    """All numbers together, from the file as it is and with each of its switches; then again under the noise that is left."""
+    """All numbers together, from the file as it is, with the robot file's robot, with each switch and on grounded contacts; then again
+    under the noise that is left."""
     columns = list(range(len(problem.hypotheses.parameters)))
     first = start(problem)
     switched = [replace(first.base, **{s.field: s.value}) for s in problem.hypotheses.switches]
     starts = [first, *(p for base in switched if (p := problem.point(base, first.x)) is not None)]
-    for base in (first.base, *switched):
+    for base in (first.base, *switched) if problem.hypotheses.has_grounded else ():
         at = problem.point(base, problem.hypotheses.grounded(base))
         starts += [] if at is None else [at]
+    described = problem.point(first.base, problem.hypotheses.priors)
+    starts += [] if described is None else [described]
     tried = [problem.minimize(s, columns, 2) for s in sorted(starts, key=lambda point: point.cost)[:_STARTS]]
     best = min(tried, key=lambda point: point.cost)
     best = problem.minimize(best, columns, iterations)

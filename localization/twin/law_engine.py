@@ -18,6 +18,10 @@ CREEP_M_S = 0.02
 class LawEngine(MujocoEngine):
     """`MujocoEngine` of a file that has a contact law, which is called in each time step."""
 
+    def law(self, model: Any) -> ContactLaw:
+        """See `MujocoEngine.law`."""
+        return ContactLaw(model)
+
     def _roll(self, models: Sequence[Any], start: FloatArray, control: FloatArray) -> tuple[FloatArray, FloatArray]:
         states = np.empty((*control.shape[:2], start.shape[1]))
         sensors = np.empty((*control.shape[:2], models[0].nsensordata))

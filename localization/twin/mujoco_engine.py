@@ -10,16 +10,15 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from localization.errors import SimulationError
 from localization.twin.engine import Played, Touch
-from localization.twin.mjcf import Mjcf
 from localization.twin.wheels import Hinge, Wheels, find_wheels
 from localization.twin.windows import LEAD_S, Window
+from localization.twin.xml_file import XmlFile
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, between
@@ -64,7 +63,7 @@ class MujocoRobot:
     notes: tuple[str, ...] = ()
 
 
-def compile_robot(mjcf: Mjcf, robot: Robot) -> MujocoRobot:
+def compile_robot(mjcf: XmlFile, robot: Robot) -> MujocoRobot:
     """Compile ``mjcf``. Raises `SimulationError` with the engine's own message, and where there is no robot on wheels."""
     spec = _read(mjcf)
     notes: list[str] = []
@@ -95,17 +94,7 @@ def compile_robot(mjcf: Mjcf, robot: Robot) -> MujocoRobot:
     return MujocoRobot(mjcf.path.name, model, wheels, base, joints, geoms, radius, gears, has_servos, tuple(notes))
 
 
-def converted(urdf: str, path: Path) -> str:
-    """MJCF text of a ``urdf``. Raises `SimulationError` with the engine's own message."""
-    try:
-        spec = mujoco.MjSpec.from_string(urdf)
-        spec.compile()
-    except ValueError as error:
-        raise SimulationError(f"simulator '{path}' does not load in MuJoCo: {_one_line(error)}") from error
-    return str(spec.to_xml())
-
-
-def _read(mjcf: Mjcf) -> mujoco.MjSpec:
+def _read(mjcf: XmlFile) -> mujoco.MjSpec:
     text = mjcf.files[mjcf.name].decode("utf-8", errors="replace")
     included = {name: data for name, data in mjcf.files.items() if name != mjcf.name}
     try:
@@ -116,7 +105,7 @@ def _read(mjcf: Mjcf) -> mujoco.MjSpec:
     return spec
 
 
-def _compile(spec: mujoco.MjSpec, mjcf: Mjcf) -> mujoco.MjModel:
+def _compile(spec: mujoco.MjSpec, mjcf: XmlFile) -> mujoco.MjModel:
     try:
         return spec.compile()
     except ValueError as error:
@@ -132,7 +121,7 @@ def _has_ground(spec: mujoco.MjSpec) -> bool:
     return any(geom.type in ground and (geom.contype or geom.conaffinity or spec.pairs) for geom in spec.worldbody.geoms)
 
 
-def _hinges(model: mujoco.MjModel, mjcf: Mjcf) -> tuple[list[Hinge], int]:
+def _hinges(model: mujoco.MjModel, mjcf: XmlFile) -> tuple[list[Hinge], int]:
     """Hinges on the body that moves freely, in its frame, and that body."""
     free = [int(model.jnt_bodyid[j]) for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
     turning = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
@@ -298,7 +287,7 @@ class MujocoEngine:
     def _play_batch(self, windows: Sequence[Window], counts: IntArray) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
         model, r = self.robot.model, self.robot
         steps, lead = int(counts.max()), round(LEAD_S / model.opt.timestep)
-        models = [self._with_cg(w.cg) for w in windows]
+        models = [self.with_cg(w.cg, self.robot.model) for w in windows]
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         start = np.empty((len(windows), mujoco.mj_stateSize(model, spec)))
         control = np.empty((len(windows), steps, model.nu))
@@ -337,12 +326,16 @@ class MujocoEngine:
         model = self.robot.model
         return int(model.jnt_qposadr[model.body_jntadr[self.robot.base]])
 
-    def _with_cg(self, cg: FloatArray) -> mujoco.MjModel:
-        """The model with its centre of gravity moved as a window's is from the robot file's."""
+    def law(self, model: mujoco.MjModel) -> Callable[[Any, Any], None] | None:
+        """Forces to apply in each time step; None where contacts have all of them."""
+        return None
+
+    def with_cg(self, cg: FloatArray, nominal: mujoco.MjModel) -> mujoco.MjModel:
+        """The ``nominal`` model with its centre of gravity moved as ``cg`` (2,) is from the robot file's."""
         moved = cg - self.nominal_cg
         if not moved.any():
-            return self.robot.model
-        w, model = self.robot.wheels, copy.copy(self.robot.model)
+            return nominal
+        w, model = self.robot.wheels, copy.copy(nominal)
         shift = moved[0] * w.forward + moved[1] * np.array([-w.forward[1], w.forward[0]])
         mass = float(model.body_subtreemass[self.robot.base])
         model.body_ipos[self.robot.base, :2] += shift * mass / float(model.body_mass[self.robot.base])
@@ -426,6 +419,79 @@ class MujocoEngine:
     def geom_kind(self, geom: int) -> str:
         """Name of a geom's shape."""
         return str(mujoco.mjtGeom(int(self.robot.model.geom_type[geom])).name.removeprefix("mjGEOM_").lower())
+
+
+class MujocoDrive:
+    """One robot that is driven on and on, from a pose in the world."""
+
+    def __init__(self, engine: MujocoEngine, start: FloatArray, slope: float = 0.0) -> None:
+        """``start`` (3,) is the pose of the body frame [m, m, rad], ``slope`` that of the ground, up along x [rad]."""
+        self._engine, self._robot = engine, engine.robot
+        self._data = copy.copy(engine._data)
+        self._nominal = copy.copy(engine.robot.model)
+        self._nominal.opt.gravity[:] = 9.81 * np.array([-math.sin(slope), 0.0, -math.cos(slope)])
+        self._model, self._cg = self._nominal, engine.nominal_cg
+        self._place(start)
+        self._law = engine.law(self._model)
+        self._angles = [int(self._model.jnt_qposadr[j]) for j in self._robot.joints]
+        self._rates = [int(self._model.jnt_dofadr[j]) for j in self._robot.joints]
+        self._base_dof = int(self._model.jnt_dofadr[self._model.body_jntadr[self._robot.base]])
+        self.radius_m = self._robot.radius_m
+
+    def _place(self, start: FloatArray) -> None:
+        at, data = self._engine._base_at, self._data
+        turn = float(start[2]) - float(self._engine._planar(data.qpos[None])[0, 2])
+        turned = np.zeros(4)
+        mujoco.mju_mulQuat(turned, np.array([math.cos(0.5 * turn), 0.0, 0.0, math.sin(0.5 * turn)]), data.qpos[at + 3 : at + 7])
+        data.qpos[at + 3 : at + 7] = turned
+        data.qpos[at : at + 2] += start[:2] - self._engine._planar(data.qpos[None])[0, :2]
+        data.qvel[:] = 0.0
+        data.time = 0.0
+        mujoco.mj_forward(self._model, data)
+
+    def advance(self, rates: FloatArray, steps: int, cg: FloatArray) -> None:
+        """So many time steps with set points ``rates`` (2,) of the left and right wheels and the centre of gravity ``cg`` (2,).
+
+        Raises `SimulationError` where the state does not stay finite.
+        """
+        if not np.array_equal(cg, self._cg):
+            self._cg, self._model = cg.copy(), self._engine.with_cg(cg, self._nominal)
+        r, data = self._robot, self._data
+        sides = np.repeat(rates, [len(r.wheels.left), len(r.wheels.right)])
+        data.ctrl[:] = np.where((r.gears != 0.0).any(axis=1), r.gears @ sides, data.ctrl)
+        before = data.time
+        for _ in range(steps):
+            if self._law is None:
+                mujoco.mj_step(self._model, data)
+            else:
+                advance(self._model, data, self._law)
+        if data.time <= before or not np.isfinite(data.qpos).all():
+            raise SimulationError(f"simulator '{r.file}': the state is no longer finite {before:.2f} s into the drive.")
+
+    def pose(self) -> FloatArray:
+        """(3,) of the body frame in the world."""
+        return np.asarray(self._engine._planar(self._data.qpos[None])[0])
+
+    def twist(self) -> FloatArray:
+        """(3,) of the body frame, in it [m/s, m/s, rad/s]."""
+        velocity, turn = self._data.qvel[self._base_dof : self._base_dof + 2], float(self._data.qvel[self._base_dof + 5])
+        arm = self._data.xmat[self._robot.base].reshape(3, 3)[:2, :2] @ self._robot.wheels.origin
+        vx, vy = velocity + turn * np.array([-arm[1], arm[0]])
+        heading = self.pose()[2]
+        c, s = math.cos(heading), math.sin(heading)
+        return np.array([c * vx + s * vy, -s * vx + c * vy, turn])
+
+    def wheel_rates(self) -> FloatArray:
+        """(2,) means of the left and the right wheels [rad/s]."""
+        return self._sides(self._data.qvel[self._rates])
+
+    def wheel_angles(self) -> FloatArray:
+        """(2,) means of the left and the right wheels [rad]."""
+        return self._sides(self._data.qpos[self._angles])
+
+    def _sides(self, values: FloatArray) -> FloatArray:
+        signed, left = values * self._robot.wheels.signs, len(self._robot.wheels.left)
+        return np.array([signed[:left].mean(), signed[left:].mean()])
 
 
 def put_state(model: mujoco.MjModel, state: FloatArray) -> mujoco.MjData:

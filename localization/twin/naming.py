@@ -1,31 +1,35 @@
-"""Which numbers of a simulator are wrong: one after another, each the one that explains most of what is left, beside its rivals.
+"""Which numbers of a simulator are wrong: Bayesian selection among all of them, at the simulator that explains the motion.
 
-Evidence of a number is the gain of the posterior by it alone, less what a free number gains by chance (Laplace's approximation;
-MacKay 2003, ch. 28): D = cost before - cost after - ln(1 + sigma^2 J^T J) / 2. Numbers whose evidence is within ``SEPARATED_NATS`` of the
-best cannot be separated from it by these data.
+About the fitted simulator, motion is linear in its numbers: y = J z + e with whitened noise e, z over the priors' sigmas, and z = 0 the
+file's own value. A set S of wrong numbers has the evidence (MacKay 2003, ch. 28)
+
+    ln p(y | S) = -(c - b' M^-1 b) / 2 - ln det M / 2,    M = I + J_S' J_S,  b = J_S' (y - J_S m),  c = |y - J_S m|^2
+
+with m the robot file's value, and a prior: each number is right with odds of 20 to 1, times what the robot file says of the file's value.
+Numbers that may take another's place in S within odds of 20 to 1 cannot be separated from it by these data.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from localization.twin.fit import Point, Problem
-from localization.twin.numbers import Numbers
-from localization.twin.parameters import GROUNDED, Parameter, value_of
+from localization.twin.parameters import GROUNDED, Switch, value_of
+from localization.twin.simulator import Numbers
+from motion_models.se2 import FloatArray
 
 SEPARATED_NATS = math.log(20.0)
 """Odds of 20 to 1."""
-_MOST_FINDINGS = 4
-_TRIED = 6
-"""Numbers that are searched for themselves, the best ones by secants."""
-_ITERATIONS = 2
-_CONVERGING = 8
-"""Iterations after which a finding's own number has converged: else what is left of it is taken for another's."""
+_ITERATIONS = 6
 CONTACTS = "contacts"
 _HOP = "contacts at which the wheels hop, time that a wheel is on the ground"
+_HOPS = 0.1
+"""Share of the time that contacts return a wheel to the ground from which on they are named together."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class Candidate:
     value: float
     """Value that explains the motion."""
     evidence: float
-    """[nats]"""
+    """Logarithm of the odds that the file's value is wrong [nats]."""
 
     def describe(self) -> str:
         """One sentence.
@@ -70,90 +74,111 @@ class Finding:
         return f"{self.best.describe()}; these data cannot separate it from: {others}."
 
 
-def name_causes(problem: Problem, start: Point, floor: float) -> tuple[list[Finding], Point]:
-    """Findings, strongest first, and the simulator with all of them; until nothing has evidence, or ``floor`` is reached: the cost of the
-    simulator whose numbers are all fitted [nats]."""
-    found: list[Finding] = []
-    at = start
-    chosen = [i for i, p in enumerate(problem.hypotheses.parameters) if p.area == "reference"]
-    at = problem.minimize(at, chosen, _ITERATIONS) if chosen else at
-    while len(found) < _MOST_FINDINGS and at.cost > floor + SEPARATED_NATS and not problem.is_late:
-        tried = _tried(problem, at, chosen)
-        if not tried or tried[0][0].evidence < SEPARATED_NATS:
-            break
-        best, point, columns = tried[0]
-        rivals = tuple(c for c, _, _ in tried[1:] if c.evidence > best.evidence - SEPARATED_NATS)
-        found.append(Finding(best, rivals))
-        at, chosen = problem.minimize(point, columns, _CONVERGING), columns
-    return found, at
+@dataclass(frozen=True)
+class Selection:
+    """Linear model of a simulator's numbers about a fitted one."""
+
+    information: FloatArray
+    """(p, p) J' J."""
+    projection: FloatArray
+    """(p,) J' y."""
+    square: float
+    """|y|^2"""
+    priors: FloatArray
+    """(p,) values of the robot file over the priors' sigmas."""
+    free: tuple[int, ...]
+    """Numbers of the reference: never the simulator's fault."""
+
+    def evidence(self, chosen: Sequence[int]) -> float:
+        """Logarithm of the posterior of the set ``chosen`` without constants [nats]."""
+        M, b, c = self._system(chosen)
+        root = np.linalg.cholesky(M)
+        half = np.linalg.solve(root, b)
+        right = [i for i in range(len(self.priors)) if i not in chosen and i not in self.free]
+        return float(
+            -0.5 * (c - half @ half) - np.log(np.diag(root)).sum() - 0.5 * (self.priors[right] ** 2).sum() - SEPARATED_NATS * len(chosen)
+        )
+
+    def values(self, chosen: Sequence[int]) -> FloatArray:
+        """(p,) posterior means over the priors' sigmas; 0 for numbers that are not ``chosen``."""
+        M, b, _ = self._system(chosen)
+        index = [*self.free, *chosen]
+        z = np.zeros(len(self.priors))
+        z[index] = self.priors[index] + np.linalg.solve(M, b)
+        return z
+
+    def _system(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray, float]:
+        index = [*self.free, *chosen]
+        G, g, m = self.information[np.ix_(index, index)], self.projection[index], self.priors[index]
+        return np.eye(len(index)) + G, g - G @ m, self.square - 2.0 * float(m @ g) + float(m @ G @ m)
+
+    def best_set(self) -> tuple[int, ...]:
+        """The set of highest posterior: the best pair, then added to, dropped from and exchanged as long as that is better."""
+        others = [i for i in range(len(self.priors)) if i not in self.free]
+        best = max((s for n in range(3) for s in itertools.combinations(others, n)), key=self.evidence)
+        while True:
+            more = [(*best, j) for j in others if j not in best]
+            fewer = [tuple(k for k in best if k != i) for i in best]
+            exchanged = [(*rest, j) for rest in fewer for j in others if j not in best]
+            better = max((*more, *fewer, *exchanged), key=self.evidence)
+            if self.evidence(better) <= self.evidence(best):
+                return best
+            best = better
 
 
-def _tried(problem: Problem, at: Point, chosen: list[int]) -> list[tuple[Candidate, Point, list[int]]]:
-    """Candidates beside those that are ``chosen``, best first, each with its simulator."""
+def name_causes(problem: Problem, start: Point, whole: Point) -> tuple[list[Finding], Point]:
+    """Findings, strongest first, and the simulator with their numbers alone. ``start`` is the file, ``whole`` has all numbers fitted."""
     h = problem.hypotheses
-    others = [i for i in range(len(h.parameters)) if i not in chosen]
-    J = problem.jacobian(at, others).reshape(-1, len(others)) * h.sigmas[others]
-    z = (at.x[others] - h.priors[others]) / h.sigmas[others]
-    b = J.T @ problem.whitened(at.residuals).ravel() + z
-    information = 1.0 + (J**2).sum(axis=0)
-    promise = 0.5 * b**2 / information
-    tried = []
-    for k in np.argsort(-promise)[:_TRIED]:
-        if promise[k] < 1.0:
-            break
-        columns = [*chosen, others[k]]
-        point = problem.minimize(at, columns, _ITERATIONS)
-        evidence = at.cost - point.cost - 0.5 * math.log(information[k])
-        tried.append((_candidate(h.parameters[others[k]], at.base, point, others[k], evidence), point, columns))
-    if not any(h.parameters[i].field in GROUNDED for i in chosen) and (hopping := _grounded(problem, at, chosen)) is not None:
-        tried.append(hopping)
-    for switch in h.switches:
-        base = replace(at.base, **{switch.field: switch.value})
-        switched = problem.point(base, at.x)
-        if switched is not None and getattr(at.base, switch.field) != getattr(base, switch.field):
-            file = float(getattr(at.base, switch.field))
-            candidate = Candidate(
-                switch.field, switch.meaning, "", switch.attribute, "contact", file, switch.value, at.cost - switched.cost
-            )
-            tried.append((candidate, switched, chosen))
-    return sorted(tried, key=lambda of: -of[0].evidence)
+    everything = range(len(h.parameters))
+    J = (problem.jacobian(whole, everything) * h.sigmas).reshape(-1, len(h.parameters))
+    y = J @ (whole.x / h.sigmas) - problem.whitened(whole.residuals).ravel()
+    free = tuple(i for i in everything if h.parameters[i].area == "reference")
+    selection = Selection(J.T @ J, J.T @ y, float(y @ y), h.priors / h.sigmas, free)
+    chosen = selection.best_set()
+    values = selection.values(chosen) * h.sigmas
+    low, high = h.bounds(whole.base)
+    first = problem.point(whole.base, np.clip(values, low, high))
+    sparse = whole if first is None else problem.minimize(first, [*free, *chosen], _ITERATIONS)
+    findings = [_finding(problem, selection, chosen, i, whole.base) for i in chosen]
+    findings += [Finding(c, ()) for s in h.switches if (c := _switched(problem, start, whole, s)) is not None]
+    findings = _together(findings, start, whole)
+    return sorted(findings, key=lambda finding: -finding.best.evidence), sparse
 
 
-def _grounded(problem: Problem, at: Point, chosen: list[int]) -> tuple[Candidate, Point, list[int]] | None:
-    """All numbers of the contacts together, from where wheels keep to the ground."""
-    h = problem.hypotheses
-    columns = [*chosen, *(i for i, p in enumerate(h.parameters) if p.field in GROUNDED or p.field == "mu")]
-    columns = list(dict.fromkeys(columns))
-    starts = []
-    for is_elliptic in (0.0, 1.0):
-        base = replace(at.base, is_elliptic=is_elliptic)
-        x = np.where(np.isin(np.arange(len(at.x)), columns[len(chosen) :]), h.grounded(base), at.x)
-        starts.append(problem.point(base, x))
-    stood = [start for start in starts if start is not None]
-    if not stood:
+def _finding(problem: Problem, selection: Selection, chosen: Sequence[int], index: int, file: Numbers) -> Finding:
+    """The number ``index`` of those that are ``chosen``, with those that may take its place."""
+    rest = tuple(i for i in chosen if i != index)
+    alone, whole = selection.evidence(rest), selection.evidence(chosen)
+    rivals = []
+    for j in range(len(selection.priors)):
+        if j not in selection.free and j not in chosen and (other := selection.evidence((*rest, j))) > whole - SEPARATED_NATS:
+            rivals.append(_candidate(problem, selection, (*rest, j), j, file, other - alone))
+    best = _candidate(problem, selection, chosen, index, file, whole - alone)
+    return Finding(best, tuple(sorted(rivals, key=lambda c: -c.evidence)))
+
+
+def _candidate(problem: Problem, selection: Selection, chosen: Sequence[int], index: int, file: Numbers, evidence: float) -> Candidate:
+    p = problem.hypotheses.parameters[index]
+    old, z = value_of(file, p), float(selection.values(chosen)[index]) * p.sigma
+    return Candidate(p.field, p.meaning, p.unit, p.attribute, p.area, old, old * math.exp(z) if p.is_log else old + z, evidence)
+
+
+def _switched(problem: Problem, start: Point, whole: Point, switch: Switch) -> Candidate | None:
+    """A choice of the file that ``whole`` has changed, with its evidence there."""
+    old, new = (float(getattr(of.base, switch.field)) for of in (start, whole))
+    kept = None if old == new else problem.point(start.base, whole.x)
+    if kept is None or kept.cost - whole.cost < SEPARATED_NATS:
         return None
-    point = problem.minimize(min(stood, key=lambda start: start.cost), columns, _ITERATIONS)
-    J = problem.jacobian(point, columns[len(chosen) :]).reshape(-1, len(columns) - len(chosen)) * h.sigmas[columns[len(chosen) :]]
-    occam = 0.5 * float(np.linalg.slogdet(np.eye(J.shape[1]) + J.T @ J)[1])
-    old, new = (100.0 * (1.0 - float(of.residuals[:, 5].mean())) for of in (at, point))
-    candidate = Candidate(
-        CONTACTS, _HOP, "%", "geom solref, solimp; option impratio, cone", "contact", old, new, at.cost - point.cost - occam
-    )
-    return candidate, point, columns
+    return Candidate(switch.field, switch.meaning, "", switch.attribute, "contact", old, new, kept.cost - whole.cost - SEPARATED_NATS)
 
 
-def _candidate(p: Parameter, file: Numbers, point: Point, index: int, evidence: float) -> Candidate:
-    old = value_of(file, p)
-    new = old * math.exp(point.x[index]) if p.is_log else old + point.x[index]
-    return Candidate(p.field, p.meaning, p.unit, p.attribute, p.area, old, float(new), evidence)
-
-
-def changed_numbers(problem: Problem, at: Point) -> list[tuple[Parameter, float, float]]:
-    """Each number that differs from the file's, with the file's value and its own."""
-    found = []
-    for i, p in enumerate(problem.hypotheses.parameters):
-        old = value_of(at.base, p)
-        new = old * math.exp(at.x[i]) if p.is_log else old + float(at.x[i])
-        if at.x[i] != 0.0:
-            found.append((p, old, new))
-    return found
+def _together(findings: list[Finding], start: Point, whole: Point) -> list[Finding]:
+    """Numbers of contacts at which wheels hop as one finding, where the motion takes contacts at which they do not."""
+    of_hop = [f for f in findings if f.best.field in GROUNDED or f.best.field == "is_elliptic"]
+    old, new = (1.0 - float(of.residuals[:, 5].mean()) for of in (start, whole))
+    if len(of_hop) < 2 or new - old < _HOPS:
+        return findings
+    evidence = max(f.best.evidence for f in of_hop)
+    attribute = "geom solref, solimp; option impratio, cone"
+    together = Candidate(CONTACTS, _HOP, "%", attribute, "contact", 100.0 * old, 100.0 * new, evidence)
+    return [Finding(together, ()), *(f for f in findings if f not in of_hop)]

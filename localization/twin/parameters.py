@@ -13,7 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from localization.twin.numbers import Numbers, Simulator, has_places
+from localization.twin.other_names import GAZEBO
+from localization.twin.simulator import Numbers, Simulator
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -116,6 +117,11 @@ class Hypotheses:
             high.append(_log_ratio(p.high, base) if p.is_log else p.high - base)
         return np.array(low), np.array(high)
 
+    @property
+    def has_grounded(self) -> bool:
+        """Whether the engine has contacts that may keep wheels to the ground."""
+        return any(p.field in GROUNDED for p in self.parameters)
+
     def grounded(self, numbers: Numbers) -> FloatArray:
         """(p,) start of a search where wheels keep to the ground, as searched."""
         x, (low, high) = np.zeros(len(self.parameters)), self.bounds(numbers)
@@ -142,7 +148,6 @@ def value_of(numbers: Numbers, parameter: Parameter) -> float:
 def hypotheses_of(simulator: Simulator, robot: Robot) -> Hypotheses:
     """What can be wrong with ``simulator``: parameters that its file has."""
     n, g = simulator.numbers, robot.geometry
-    kinds = {simulator.engine.geom_kind(index) for of_wheel in simulator.geoms for _, index in of_wheel}
     known: Mapping[str, tuple[float, float]] = {
         "mass_kg": (n.mass_kg, g.mass_kg),
         "cg_x_m": (n.cg_x_m, g.cg_x_m),
@@ -152,22 +157,21 @@ def hypotheses_of(simulator: Simulator, robot: Robot) -> Hypotheses:
         "track_scale": (n.track_m, g.track_width_m),
         "wheelbase_scale": (n.wheelbase_m, g.wheelbase_m),
     }
-    absent = set()
-    absent |= {"time_constant_s", "damping_ratio"} if math.isnan(n.time_constant_s) else set()
-    absent |= {"torsional_m"} if n.condim < 4 else set()
-    absent |= {"servo_gain"} if math.isnan(n.servo_gain) else set()
-    absent |= {"width_scale"} if kinds != {"cylinder"} else set()
-    absent |= {"radius_scale", "radius_difference"} if "mesh" in kinds or "box" in kinds else set()
-    absent |= {"track_scale", "wheelbase_scale"} if not has_places(simulator) else set()
-    absent |= {"wheelbase_scale"} if n.wheelbase_m <= 0.0 else set()
-    parameters = tuple(p for p in (*_ENGINE, *_ROBOT, *_REFERENCE) if p.field not in absent)
+    slip = () if math.isnan(n.slip_stiffness) else (SLIP,)
+    parameters = tuple(p for p in (*_ENGINE, *slip, *_ROBOT, *_REFERENCE) if p.field not in simulator.absent)
+    parameters = tuple(_named_for(simulator, p) for p in parameters)
     return _hypotheses(parameters, known, n)
 
 
-def law_hypotheses(hypotheses: Hypotheses) -> Hypotheses:
-    """Those of a simulator with the contact law."""
+def _named_for(simulator: Simulator, p: Parameter) -> Parameter:
+    """With the place that the simulator's format has for it."""
+    return replace(p, attribute=GAZEBO[p.field]) if simulator.engine_name == "DART" and p.field in GAZEBO else p
+
+
+def law_hypotheses(simulator: Simulator, hypotheses: Hypotheses) -> Hypotheses:
+    """Those of a simulator with friction in proportion to slip."""
     kept = [i for i, p in enumerate(hypotheses.parameters) if p.field in LAW_FIELDS]
-    parameters = (SLIP, *(hypotheses.parameters[i] for i in kept))
+    parameters = (_named_for(simulator, SLIP), *(hypotheses.parameters[i] for i in kept))
     return Hypotheses(parameters, np.append(0.0, hypotheses.priors[kept]), ())
 
 
@@ -177,8 +181,8 @@ def _hypotheses(parameters: tuple[Parameter, ...], known: Mapping[str, tuple[flo
     for p in parameters:
         file, true = known.get(p.field, (0.0, 0.0))
         priors.append(0.0 if p.field not in known else _log_ratio(true, file) if p.is_log else true - file)
-    switches = (Switch("is_elliptic", 1.0 - n.is_elliptic, f"{'pyramidal' if n.is_elliptic else 'elliptic'} cones", "option cone"),)
-    return Hypotheses(parameters, np.array(priors), switches)
+    other = Switch("is_elliptic", 1.0 - n.is_elliptic, f"{'pyramidal' if n.is_elliptic else 'elliptic'} cones", "option cone")
+    return Hypotheses(parameters, np.array(priors), () if math.isnan(n.is_elliptic) else (other,))
 
 
 def _log_ratio(value: float, base: float) -> float:

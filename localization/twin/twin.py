@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,26 +12,23 @@ import numpy as np
 from localization.twin import fit
 from localization.twin.discrepancy import Row, compare, words
 from localization.twin.engine import Played
-from localization.twin.mjcf import Mjcf
-from localization.twin.naming import Finding, changed_numbers, name_causes
-from localization.twin.numbers import Numbers, Simulator, read_simulator
-from localization.twin.parameters import SLIP, hypotheses_of, law_hypotheses
+from localization.twin.naming import Finding, name_causes
+from localization.twin.parameters import hypotheses_of, law_hypotheses
+from localization.twin.simulator import NumberChange, Numbers, Simulator
 from localization.twin.windows import Window, halves, spread, windows_of
+from localization.twin.xml_file import XmlFile
 from motion_models.calibration.cross_validation import Interval, root_mean_gain
 from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.friction.model import FrictionModel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-LAW_MODULE = "skidloc_contact.py"
-"""Module that is written beside a file with the contact law."""
-
 
 @dataclass(frozen=True)
 class TwinConfig:
     """Settings of the search."""
 
-    windows: int = 10
+    windows: int = 20
     """Windows that numbers are fitted to, those that differ most among one half of the drive."""
     budget_steps: int = 6_000_000
     """Time steps of the engine that the search may take: 3 to 4 minutes on two cores."""
@@ -60,11 +57,12 @@ class Mended:
     """The simulator with the numbers that explain the motion."""
 
     name: str
-    """numbers, or contact law."""
+    """numbers, contact law, or wheel slip."""
     numbers: Numbers
-    file: Mjcf
-    changes: tuple[tuple[str, str, float, float], ...]
-    """What changed of each number: meaning, attribute, the file's value, and its own."""
+    file: XmlFile
+    beside: Mapping[str, str]
+    """Files that are written beside it, by name."""
+    changes: tuple[NumberChange, ...]
     judged: Judged
     gain: Interval
     """Root mean square error of the file less that of this one, on the windows held out [m]."""
@@ -81,7 +79,7 @@ class Mended:
             "rows": [row.to_dict() for row in self.judged.rows],
             "touch": self.judged.touch,
             "frame_m": self.judged.frame.tolist(),
-            "changes": [{"meaning": a, "attribute": b, "file": c, "value": d} for a, b, c, d in self.changes],
+            "changes": [change.to_dict() for change in self.changes],
             "gain_m": [self.gain.value, self.gain.low, self.gain.high],
             "is_better": self.is_better,
         }
@@ -101,7 +99,7 @@ class TwinResult:
     mended: Mended
     """With other numbers of the engine."""
     extended: Mended | None
-    """With the friction model's contact law; None where the robot does not stand with it."""
+    """With friction in proportion to slip; None where the file has it, or the robot does not stand with it."""
     notes: tuple[str, ...]
     steps: int
     """Time steps that the search took."""
@@ -126,8 +124,8 @@ class TwinResult:
             return "The simulator moves as the robot did, within the scatter of these windows."
         first = f"The simulator is wrong: {self.words[0]}."
         if not best.is_better:
-            return f"{first} Neither numbers of its engine nor the contact law make it better on windows held out."
-        means = "other numbers" if best.name == "numbers" else "the contact law"
+            return f"{first} No numbers of its engine make it better on windows held out, nor does the {self.simulator.law_name}."
+        means = "other numbers" if best.name == "numbers" else f"the {best.name}"
         errors = [
             f"{old:.3f} to {new:.3f} {unit}"
             for old, new, unit in (
@@ -151,14 +149,13 @@ class TwinResult:
         }
 
 
-def examine(maneuvers: Sequence[Maneuver], robot: Robot, mjcf: Mjcf, config: TwinConfig | None = None) -> TwinResult:
-    """Compare the simulator ``mjcf`` of ``robot`` with measured ``maneuvers``, find its wrong numbers and judge them on the other half.
+def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, config: TwinConfig | None = None) -> TwinResult:
+    """Compare the ``simulator`` of ``robot`` with measured ``maneuvers``, find its wrong numbers and judge them on the other half.
 
     Raises `SimulationError` for a file without a robot on wheels, `CalibrationError` for a drive that shows nothing.
     """
     config = config or TwinConfig()
     windows = windows_of(maneuvers, robot)
-    simulator = read_simulator(mjcf, robot, config.threads)
     first, second = halves(windows)
     fitted = [windows[i] for i in first[spread([windows[i] for i in first], robot, config.windows)]]
     held = [windows[i] for i in second[spread([windows[i] for i in second], robot, config.held_windows)]]
@@ -166,14 +163,22 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, mjcf: Mjcf, config: Twi
     problem = fit.Problem(simulator, hypotheses, fitted, config.budget_steps)
     whole = fit.fit_all(problem)
     start = fit.start(problem)
-    findings, sparse = name_causes(problem, start, whole.cost)
+    findings, sparse = name_causes(problem, start, whole)
     best = whole if whole.cost < sparse.cost - _occam(problem, whole, sparse) else sparse
     before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
     mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)
     extended = extend(problem, held, robot, before)
-    notes = (*simulator.engine.robot.notes, *simulator.missing)
     return TwinResult(
-        simulator, tuple(held), len(fitted), before, tuple(findings), mended, extended, notes, problem.steps, tuple(words(before.rows))
+        simulator,
+        tuple(held),
+        len(fitted),
+        before,
+        tuple(findings),
+        mended,
+        extended,
+        simulator.notes,
+        problem.steps,
+        tuple(words(before.rows)),
     )
 
 
@@ -208,14 +213,16 @@ def judged(played: Played, windows: Sequence[Window], robot: Robot, frame: Float
 
 
 def extend(problem: fit.Problem, windows: Sequence[Window], robot: Robot, before: Judged) -> Mended | None:
-    """The simulator with the contact law in place of its friction, with the stiffness of the robot's friction model, judged as `mend`."""
-    model = FrictionModel.from_robot(robot)
+    """The simulator with friction in proportion to slip in place of its own, from the robot's friction model's on, judged as `mend`."""
+    simulator, model = problem.simulator, FrictionModel.from_robot(robot)
+    if not math.isnan(simulator.numbers.slip_stiffness):
+        return None
     mu, stiffness = (float(model.nominal[model.param_names.index(name)]) for name in ("mu", "slip_stiffness"))
-    of_law = fit.Problem(problem.simulator, law_hypotheses(problem.hypotheses), problem.windows, problem.budget_steps)
+    of_law = fit.Problem(simulator, law_hypotheses(simulator, problem.hypotheses), problem.windows, problem.budget_steps)
     of_law.noise = problem.noise
-    at = fit.fit_law(of_law, replace(problem.simulator.numbers, mu=mu, slip_stiffness=stiffness))
+    at = fit.fit_law(of_law, simulator.with_law(mu, stiffness))
     problem.steps += of_law.steps
-    return None if at is None else mend("contact law", of_law, fit.pruned(of_law, at), windows, robot, before)
+    return None if at is None else mend(simulator.law_name, of_law, fit.pruned(of_law, at), windows, robot, before)
 
 
 def mend(name: str, problem: fit.Problem, at: fit.Point, windows: Sequence[Window], robot: Robot, before: Judged) -> Mended:
@@ -223,14 +230,13 @@ def mend(name: str, problem: fit.Problem, at: fit.Point, windows: Sequence[Windo
     simulator = problem.simulator
     numbers = problem.hypotheses.applied(at.base, at.x)
     after = judge(simulator, numbers, windows, robot, problem.frame(at.x))
-    changes = [(p.meaning, p.attribute, old, new) for p, old, new in changed_numbers(problem, at) if p.area != "reference" and p != SLIP]
-    if not math.isnan(numbers.slip_stiffness):
-        changes += [(SLIP.meaning, SLIP.attribute, math.nan, numbers.slip_stiffness)]
-    for switch in problem.hypotheses.switches:
-        old, new = (float(getattr(n, switch.field)) for n in (simulator.numbers, numbers))
-        changes += [] if old == new else [(switch.meaning, switch.attribute, old, new)]
+    changed = [(p.field, p.meaning, p.attribute) for p in problem.hypotheses.parameters if p.area != "reference"]
+    changed += [(switch.field, switch.meaning, switch.attribute) for switch in problem.hypotheses.switches]
+    values = [(float(getattr(simulator.numbers, field)), float(getattr(numbers, field))) for field, _, _ in changed]
+    changes = [NumberChange(*of, old, new) for of, (old, new) in zip(changed, values, strict=True) if old != new]
     gain = root_mean_gain(before.errors, after.errors, _blocks(windows), np.random.default_rng(0))
-    return Mended(name, numbers, simulator.with_numbers(numbers), tuple(changes), after, gain)
+    beside = {} if name == "numbers" else simulator.law_files
+    return Mended(name, numbers, simulator.with_numbers(numbers), beside, tuple(changes), after, gain)
 
 
 def _blocks(windows: Sequence[Window]) -> IntArray:
@@ -242,8 +248,7 @@ def _blocks(windows: Sequence[Window]) -> IntArray:
 def provenance(result: TwinResult, m: Mended, source: str) -> str:
     """Comment of a written file: where its numbers are from, and how well they do."""
     lines = [f"Numbers found by skidloc twin on {source}: {result.fitted} windows fitted, {len(result.windows)} held out."]
-    lines += [f"{attribute}: {old:.4g} -> {new:.4g} ({meaning})" for meaning, attribute, old, new in m.changes]
-    if m.name == "contact law":
-        lines.append(f"The wheels' friction is that of {LAW_MODULE} beside this file: without it they have none.")
+    lines += [change.describe() for change in m.changes]
+    lines += [f"The wheels' friction is that of {name} beside this file: without it they have none." for name in m.beside]
     lines.append(f"Held out: root mean square error smaller by {m.gain} m; {m.judged.touch}.")
     return "\n     ".join(lines)

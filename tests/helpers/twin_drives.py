@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.twin.numbers import Numbers, Simulator, read_simulator
+from localization.twin.mujoco_simulator import MujocoSimulator, read_simulator
 from localization.twin.robot_mjcf import mjcf_of
+from localization.twin.simulator import Numbers
 from localization.twin.windows import windows_of
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
@@ -20,14 +21,14 @@ _SIGMA = np.array([0.003, 0.003, 0.005])
 _STEP_S = 0.1
 
 
-def true_simulator(robot: Robot, **numbers: float) -> Simulator:
+def true_simulator(robot: Robot, **numbers: float) -> MujocoSimulator:
     """The robot as it is: its file on grounded contacts with a stiff servo, changed by ``numbers``."""
     stock = read_simulator(mjcf_of(robot), robot)
     true = replace(stock.numbers, **{**GROUNDED, "servo_gain": 5.0 * stock.numbers.servo_gain, **numbers})
     return read_simulator(stock.with_numbers(true), robot)
 
 
-def drive(true: Simulator, robot: Robot, seed: int, count: int = 48) -> list[Maneuver]:
+def drive(true: MujocoSimulator, robot: Robot, seed: int, count: int = 48) -> list[Maneuver]:
     """Windows of two seconds with ramps: turns in place, arcs and straight ways to both sides at several speeds, with noise."""
     rng = np.random.default_rng(seed)
     maneuvers = []
@@ -46,7 +47,7 @@ def drive(true: Simulator, robot: Robot, seed: int, count: int = 48) -> list[Man
     return [replace(m, measured=se2.compose(p, e)[None], cov=cov) for m, p, e in zip(maneuvers, played.poses, noise, strict=True)]
 
 
-def spoiled(true: Simulator, **numbers: float) -> Simulator:
+def spoiled(true: MujocoSimulator, **numbers: float) -> MujocoSimulator:
     """The file of ``true`` with other ``numbers``."""
     changed: Numbers = replace(true.numbers, **numbers)
     return read_simulator(true.with_numbers(changed), true.robot)

@@ -3,6 +3,8 @@
 python -m tests.studies.twin rotations      VaultBot's 68 rotations against MuJoCo's default contacts
 python -m tests.studies.twin husky          DRIVE's Husky windows, beside the friction model calibrated on the same windows
 python -m tests.studies.twin spoiled [--seed 1] [--only mu,servo]     five spoiled copies of a true simulator, and an untouched one
+python -m tests.studies.twin dart           VaultBot's rotations in DART with Gazebo's default friction
+python -m tests.studies.twin own            the project's own simulator beside MuJoCo with the contact law, on the same commands
 
 Rotations are fitted on every second row of x_G and judged on the others. Needs the extra `twin`.
 """
@@ -11,14 +13,21 @@ from __future__ import annotations
 
 import argparse
 import math
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
 
 from localization.commands.twin import print_twin
+from localization.simulation.simulator import simulate
 from localization.twin.discrepancy import centres, turns
+from localization.twin.gazebo_simulator import read_gazebo_simulator
+from localization.twin.mujoco_simulator import read_simulator
 from localization.twin.robot_mjcf import mjcf_of
+from localization.twin.robot_sdf import sdf_of
+from localization.twin.simulated_drive import simulate_in_mujoco
 from localization.twin.twin import Judged, TwinConfig, TwinResult, examine
 from motion_models import se2
 from motion_models.calibration.fit import fit
@@ -53,11 +62,43 @@ def k_and_centre(result: TwinResult, judged: Judged, robot: Robot) -> tuple[floa
 def study_rotations(console: Console) -> None:
     """Print the comparison of the thesis's rotations."""
     robot = load_robot("vaultbot")
-    result = examine(rotations_as_maneuvers(grid(), robot), robot, mjcf_of(robot))
+    print_rotations(console, examine(rotations_as_maneuvers(grid(), robot), robot, read_simulator(mjcf_of(robot), robot)), robot)
+
+
+def print_rotations(console: Console, result: TwinResult, robot: Robot) -> None:
+    """Print the comparison, and errors of k and of the centre of rotation."""
     print_twin(console, result)
     for name, judged in (("file", result.before), *((m.name, m.judged) for m in result.repaired)):
         k, x, y, r = k_and_centre(result, judged, robot)
         console.print(f"{name}: k rms {k:.3f}, centre of rotation {1e3 * x:.0f}, {1e3 * y:.0f} mm, r of k {r:.3f}", soft_wrap=True)
+
+
+def study_dart(console: Console) -> None:
+    """Print the comparison of the thesis's rotations in DART."""
+    robot = load_robot("vaultbot")
+    print_rotations(console, examine(rotations_as_maneuvers(grid(), robot), robot, read_gazebo_simulator(sdf_of(robot), robot)), robot)
+
+
+def study_own(console: Console) -> None:
+    """Print how far the project's own simulator is from MuJoCo with the contact law after two seconds of the same commands."""
+    robot = load_robot("husky_a200")
+    model, stock = make_model("friction", robot), read_simulator(mjcf_of(robot), robot)
+    mu, stiffness = (float(model.nominal[model.param_names.index(name)]) for name in ("mu", "slip_stiffness"))
+    numbers = replace(stock.numbers, mu=mu, slip_stiffness=stiffness, servo_gain=20.0 * stock.numbers.servo_gain)
+    law = read_simulator(stock.with_numbers(numbers), robot)
+    for name, rates in {"in place": (-2.0, 2.0), "arc": (1.0, 4.0), "tight arc": (-1.0, 4.0), "straight": (4.0, 4.0)}.items():
+        both = (simulate("laps", robot), simulate_in_mujoco("laps", robot, law))
+        ends, seconds = [], []
+        for simulation in both:
+            start, begin = np.array(simulation.experiment.start), time.process_time()
+            count = round(2.0 / simulation.config.vehicle.step_s)
+            rows = simulation._move(np.arange(count) * simulation.config.vehicle.step_s, np.tile(rates, (count, 1)))
+            seconds.append(time.process_time() - begin)
+            ends.append(se2.between(start, rows[-1, :3]))
+        off = se2.between(*ends)
+        console.print(
+            f"{name}: {1e3 * np.hypot(*off[:2]):.0f} mm, {off[2]:+.3f} rad of {ends[0][2]:+.3f} apart; CPU", *np.round(seconds, 2)
+        )
 
 
 def husky_maneuvers(steps: int) -> list[Maneuver]:
@@ -77,7 +118,7 @@ def study_husky(console: Console, steps: int = 100) -> None:
     """Print the comparison of DRIVE's Husky, beside the friction model fitted to the other half of the windows."""
     robot = drive_husky.robot()
     maneuvers = husky_maneuvers(steps)
-    result = examine(maneuvers, robot, mjcf_of(robot))
+    result = examine(maneuvers, robot, read_simulator(mjcf_of(robot), robot))
     print_twin(console, result)
     held = {w.group for w in result.windows}
     fitted = fit(make_model("friction", robot), [m for m in maneuvers if m.group not in held], FRICTION)
@@ -102,21 +143,20 @@ def study_spoiled(console: Console, seed: int, only: Sequence[str], config: Twin
         "mass": {"mass_kg": 0.7 * n.mass_kg},
     }
     for name in only:
-        result = examine(maneuvers, robot, spoiled(true, **changes[name]).mjcf, config)
+        result = examine(maneuvers, robot, spoiled(true, **changes[name]), config)
         named = "; ".join(f"{f.best.field} ({', '.join(r.field for r in f.rivals) or 'alone'})" for f in result.findings) or "nothing"
         console.print(f"{name}: {named}; better: {', '.join(m.name for m in result.repaired if m.is_better) or 'none'}", soft_wrap=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("rotations", "husky", "spoiled"))
+    parser.add_argument("what", choices=("rotations", "husky", "spoiled", "dart", "own"))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", default=",".join(SPOILS))
     given = parser.parse_args()
     terminal = Console(width=200, highlight=False)
-    if given.what == "rotations":
-        study_rotations(terminal)
-    elif given.what == "husky":
-        study_husky(terminal)
+    studies = {"rotations": study_rotations, "husky": study_husky, "dart": study_dart, "own": study_own}
+    if given.what in studies:
+        studies[given.what](terminal)
     else:
         study_spoiled(terminal, given.seed, given.only.split(","))

@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("mujoco", reason="needs the extra 'twin'")
 
 from localization.errors import SimulationError
-from localization.twin.mjcf import parse
 from localization.twin.mujoco_engine import compile_robot
-from localization.twin.numbers import read_simulator
+from localization.twin.mujoco_simulator import read_simulator
 from localization.twin.robot_mjcf import mjcf_of
 from localization.twin.windows import LEAD_S, Window, windows_of
+from localization.twin.xml_file import parse
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
@@ -64,7 +64,7 @@ def test_sizes_and_places_written_are_those_read_again() -> None:
 
 def test_same_numbers_leave_the_file_as_it_is() -> None:
     simulator = read_simulator(mjcf_of(ROBOT), ROBOT)
-    assert simulator.with_numbers(simulator.numbers).files == simulator.mjcf.files
+    assert simulator.with_numbers(simulator.numbers).files == simulator.file.files
 
 
 def test_straight_drive_goes_as_far_as_its_wheels_roll() -> None:

@@ -8,20 +8,24 @@ file has <pair>s, those get it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
 from localization.errors import SimulationError
 from localization.twin.law_engine import CREEP_M_S, LawEngine
-from localization.twin.mjcf import Change, Element, Mjcf
 from localization.twin.mujoco_engine import MujocoEngine, compile_robot, contact_numbers
+from localization.twin.simulator import Numbers
 from localization.twin.skidloc_contact import NAME, SITE
+from localization.twin.xml_file import Change, Element, XmlFile
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
+LAW_MODULE = "skidloc_contact.py"
+"""Module that is written beside a file with the contact law."""
 _CONTACT = ("mu", "torsional_m", "time_constant_s", "damping_ratio", "softness", "condim")
 _INERTIAL = ("mass_kg", "inertia_scale", "cg_x_m", "cg_y_m", "cg_z_m")
 _WHEELS = ("radius_scale", "radius_difference", "width_scale")
@@ -33,57 +37,10 @@ _OVERRIDE = 1
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """Numbers of an engine and of the robot in it. NaN for those that the file does not have."""
+class MujocoSimulator:
+    """`localization.twin.simulator.Simulator` of an MJCF: the user's file, compiled, with its numbers and the elements that have them."""
 
-    mu: float
-    """Friction of a wheel's contact [-]."""
-    torsional_m: float
-    """Torsional friction, which acts from condim 4 on [m]."""
-    time_constant_s: float
-    """solref's time constant [s]."""
-    damping_ratio: float
-    """solref's damping ratio [-]."""
-    softness: float
-    """1 - solimp's impedance under load [-]."""
-    condim: float
-    impratio: float
-    is_elliptic: float
-    """Friction cones: 1 elliptic, 0 pyramidal."""
-    time_step_s: float
-    servo_gain: float
-    """kv, mean over the wheels' servos [N m s/rad]."""
-    rotor_inertia: float
-    """Inertia of a wheel about its axle with its motor's armature, mean over the wheels [kg m^2]."""
-    mass_kg: float
-    """Mass of the whole robot."""
-    cg_x_m: float
-    """Ahead of the middle of the wheels [m]."""
-    cg_y_m: float
-    """Left of it [m]."""
-    cg_z_m: float
-    """Above the wheels' lowest points [m]."""
-    radius_m: float
-    track_m: float
-    wheelbase_m: float
-    slip_stiffness: float = math.nan
-    """K of the contact law that takes the place of the engine's friction [-]; NaN where friction is the engine's own."""
-    inertia_scale: float = 1.0
-    """Factor of the body's moments of inertia."""
-    radius_scale: float = 1.0
-    radius_difference: float = 0.0
-    """Radius of the left wheels over that of the right ones, less 1."""
-    width_scale: float = 1.0
-    """Factor of the width of cylinders."""
-    track_scale: float = 1.0
-    wheelbase_scale: float = 1.0
-
-
-@dataclass(frozen=True)
-class Simulator:
-    """The user's file, compiled, with its numbers and the elements that have them."""
-
-    mjcf: Mjcf
+    file: XmlFile
     robot: Robot
     engine: MujocoEngine
     numbers: Numbers
@@ -99,10 +56,39 @@ class Simulator:
     base: Element
     missing: tuple[str, ...] = ()
     """What of it no attribute of the file changes, and why."""
+    engine_name = "MuJoCo"
+    law_name = "contact law"
 
-    def with_numbers(self, numbers: Numbers) -> Mjcf:
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """See `localization.twin.simulator.Simulator.notes`."""
+        return (*self.engine.robot.notes, *self.missing)
+
+    @property
+    def absent(self) -> frozenset[str]:
+        """See `localization.twin.simulator.Simulator.absent`."""
+        n, kinds = self.numbers, {self.engine.geom_kind(index) for of_wheel in self.geoms for _, index in of_wheel}
+        absent = {"time_constant_s", "damping_ratio"} if math.isnan(n.time_constant_s) else set()
+        absent |= {"torsional_m"} if n.condim < 4 else set()
+        absent |= {"servo_gain"} if math.isnan(n.servo_gain) else set()
+        absent |= {"width_scale"} if kinds != {"cylinder"} else set()
+        absent |= {"radius_scale", "radius_difference"} if "mesh" in kinds or "box" in kinds else set()
+        absent |= {"track_scale", "wheelbase_scale"} if not has_places(self) else set()
+        absent |= set() if math.isnan(n.slip_stiffness) else {p for p in _CONTACT if p != "mu"}  # contacts carry loads alone
+        return frozenset(absent | ({"wheelbase_scale"} if n.wheelbase_m <= 0.0 else set()))
+
+    @property
+    def law_files(self) -> Mapping[str, str]:
+        """See `localization.twin.simulator.Simulator.law_files`."""
+        return {LAW_MODULE: files("localization.twin").joinpath(LAW_MODULE).read_text(encoding="utf-8")}
+
+    def with_law(self, mu: float, stiffness: float) -> Numbers:
+        """See `localization.twin.simulator.Simulator.with_law`."""
+        return replace(self.numbers, mu=mu, slip_stiffness=stiffness)
+
+    def with_numbers(self, numbers: Numbers) -> XmlFile:
         """The file with these ``numbers``; all bytes that do not hold one of them are the same."""
-        return self.mjcf.changed(_changes(self, numbers))
+        return self.file.changed(_changes(self, numbers))
 
     def compiled(self, numbers: Numbers) -> MujocoEngine:
         """The engine with these ``numbers``. Raises `SimulationError` where the robot does not stand with them."""
@@ -111,10 +97,11 @@ class Simulator:
         return kind(robot, self.engine.nominal_cg, self.engine.threads)
 
 
-def read_simulator(mjcf: Mjcf, robot: Robot, threads: int = 2) -> Simulator:
+def read_simulator(mjcf: XmlFile, robot: Robot, threads: int = 2) -> MujocoSimulator:
     """Compile the file and find its numbers. Raises `SimulationError`."""
     compiled = compile_robot(mjcf, robot)
-    engine = MujocoEngine(compiled, robot.center_of_gravity, threads)
+    law = mjcf.named("numeric", NAME)
+    engine = (MujocoEngine if law is None else LawEngine)(compiled, robot.center_of_gravity, threads)
     model, contact = compiled.model, contact_numbers(engine)
     missing: list[str] = []
     joints = [mjcf.named("joint", model.joint(j).name) for j in compiled.joints]
@@ -133,6 +120,9 @@ def read_simulator(mjcf: Mjcf, robot: Robot, threads: int = 2) -> Simulator:
     if base is None:
         raise SimulationError(f"simulator '{mjcf.path}': the body with the free joint is not in the file's own text.")
     numbers = _read_numbers(engine, contact, servos)
+    if law is not None:
+        mu, stiffness = (float(v) for v in model.numeric(NAME).data[:2])
+        numbers = replace(numbers, mu=mu, slip_stiffness=stiffness)
     if contact["solref"][0] <= 0.0:
         missing.append("solref has stiffness and damping: time constant and damping ratio are not searched")
     if int(model.opt.enableflags) & _OVERRIDE:
@@ -140,10 +130,10 @@ def read_simulator(mjcf: Mjcf, robot: Robot, threads: int = 2) -> Simulator:
     if not compiled.has_servos:
         missing.append("the file has no velocity servos on its wheels: servo gain is not judged")
     whole = np.concatenate([contact["friction"], contact["solref"], contact["solimp"], contact["dim"]])
-    return Simulator(mjcf, robot, engine, numbers, whole, geoms, pairs, tuple(found), servos, base, tuple(missing))
+    return MujocoSimulator(mjcf, robot, engine, numbers, whole, geoms, pairs, tuple(found), servos, base, tuple(missing))
 
 
-def _geom_elements(compiled: Any, mjcf: Mjcf, joint: Element, wheel: int) -> tuple[tuple[Element, int], ...]:
+def _geom_elements(compiled: Any, mjcf: XmlFile, joint: Element, wheel: int) -> tuple[tuple[Element, int], ...]:
     """Elements of the geoms of a wheel that collide: by name, or by their order below its body."""
     model, body = compiled.model, joint.parent
     assert body is not None
@@ -167,7 +157,7 @@ def _geom_elements(compiled: Any, mjcf: Mjcf, joint: Element, wheel: int) -> tup
     return tuple(found)
 
 
-def _servo_elements(mjcf: Mjcf, engine: MujocoEngine) -> tuple[tuple[Element, int], ...]:
+def _servo_elements(mjcf: XmlFile, engine: MujocoEngine) -> tuple[tuple[Element, int], ...]:
     """Elements of the velocity servos, by their order in <actuator>."""
     elements = [e for section in mjcf.root.own("actuator") for e in section.children]
     if len(elements) != engine.robot.model.nu:
@@ -203,7 +193,7 @@ def _read_numbers(engine: MujocoEngine, contact: Any, servos: Sequence[tuple[Ele
     )
 
 
-def _changes(simulator: Simulator, new: Numbers) -> list[Change]:
+def _changes(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """Attributes that hold what differs from the file's own numbers."""
     old = simulator.numbers
     differs = {name for name in old.__dataclass_fields__ if not _same(getattr(old, name), getattr(new, name))}
@@ -230,7 +220,7 @@ def _same(a: float, b: float) -> bool:
     return a == b or (a != a and b != b)
 
 
-def _option(simulator: Simulator, new: Numbers, differs: set[str]) -> list[Change]:
+def _option(simulator: MujocoSimulator, new: Numbers, differs: set[str]) -> list[Change]:
     attributes = {}
     if "impratio" in differs:
         attributes["impratio"] = _n(new.impratio)
@@ -240,11 +230,11 @@ def _option(simulator: Simulator, new: Numbers, differs: set[str]) -> list[Chang
         attributes["timestep"] = _n(new.time_step_s)
     if not attributes:
         return []
-    options = simulator.mjcf.root.own("option")
-    return [Change(options[-1], attributes) if options else Change(simulator.mjcf.root, attributes, "option")]
+    options = simulator.file.root.own("option")
+    return [Change(options[-1], attributes) if options else Change(simulator.file.root, attributes, "option")]
 
 
-def _contact(simulator: Simulator, new: Numbers) -> list[Change]:
+def _contact(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """The whole contact, on the pairs of the wheels or their geoms."""
     c = simulator.contact
     slide, roll = new.mu, c[3]
@@ -264,8 +254,12 @@ def _contact(simulator: Simulator, new: Numbers) -> list[Change]:
     return [Change(element, attributes) for of_wheel in simulator.geoms for element, _ in of_wheel]
 
 
-def _law(simulator: Simulator, new: Numbers) -> list[Change]:
+def _law(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """Wheels without friction of the engine's, and what the module of the contact law reads."""
+    old = simulator.file.named("numeric", NAME)
+    if old is not None:
+        rest = simulator.engine.robot.model.numeric(NAME).data[2:4]
+        return [Change(old, {"data": " ".join(map(_n, (new.mu, new.slip_stiffness, *rest)))})]
     changes = _contact(simulator, replace(new, condim=1.0))
     sensors = ""
     for i, (joint, of_wheel) in enumerate(zip(simulator.joints, simulator.geoms, strict=True)):
@@ -279,10 +273,10 @@ def _law(simulator: Simulator, new: Numbers) -> list[Change]:
         sensors += f'<touch name="{SITE}{i}" site="{SITE}{i}_zone"/>'
     law = " ".join(map(_n, (new.mu, new.slip_stiffness, 1.0, CREEP_M_S)))
     text = f'<custom><numeric name="{NAME}" data="{law}"/></custom><sensor>{sensors}</sensor>'
-    return [*changes, Change(simulator.mjcf.root, {}, text=text)]
+    return [*changes, Change(simulator.file.root, {}, text=text)]
 
 
-def _servo(element: Element, index: int, simulator: Simulator, scale: float) -> Change:
+def _servo(element: Element, index: int, simulator: MujocoSimulator, scale: float) -> Change:
     model = simulator.engine.robot.model
     gain = float(model.actuator_gainprm[index, 0]) * scale
     if element.tag == "velocity":
@@ -290,7 +284,7 @@ def _servo(element: Element, index: int, simulator: Simulator, scale: float) -> 
     return Change(element, {"gainprm": _n(gain), "biasprm": f"0 0 {_n(float(model.actuator_biasprm[index, 2]) * scale)}"})
 
 
-def _inertial(simulator: Simulator, new: Numbers) -> Change:
+def _inertial(simulator: MujocoSimulator, new: Numbers) -> Change:
     """The body's <inertial>, so that the whole robot has the new mass and centre of gravity."""
     old, r = simulator.numbers, simulator.engine.robot
     model, w = r.model, r.wheels
@@ -316,7 +310,7 @@ def _inertial(simulator: Simulator, new: Numbers) -> Change:
     return Change(inertials[0], attributes) if inertials else Change(simulator.base, attributes, "inertial")
 
 
-def _sizes(simulator: Simulator, new: Numbers) -> list[Change]:
+def _sizes(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """Radii and widths of the wheels' geoms."""
     changes, model = [], simulator.engine.robot.model
     left = len(simulator.engine.robot.wheels.left)
@@ -339,7 +333,7 @@ def _sizes(simulator: Simulator, new: Numbers) -> list[Change]:
     return changes
 
 
-def _positions(simulator: Simulator, new: Numbers) -> list[Change]:
+def _positions(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """Places of the wheels' bodies, which the free body carries."""
     r = simulator.engine.robot
     model, w = r.model, r.wheels
@@ -356,7 +350,7 @@ def _positions(simulator: Simulator, new: Numbers) -> list[Change]:
     return changes
 
 
-def has_places(simulator: Simulator) -> bool:
+def has_places(simulator: MujocoSimulator) -> bool:
     """Whether the wheels' bodies are carried by the free body itself, so that their places are in its frame."""
     model, base = simulator.engine.robot.model, simulator.engine.robot.base
     return all(int(model.body_parentid[model.jnt_bodyid[j]]) == base for j in simulator.engine.robot.joints)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from localization.errors import SimulationError
-from localization.twin.mjcf import Change, load, parse
+from localization.twin.xml_file import Change, load, parse
 
 TEXT = b"""<?xml version="1.0"?>
 <!-- a comment with <geom friction="9"/> in it -->

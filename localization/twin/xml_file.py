@@ -1,7 +1,7 @@
-"""MJCF as text: elements with their places in the file, so that single attributes are changed and every other byte stays.
+"""A simulator's XML file (MJCF, SDF, URDF) as text: elements with their places, so that single numbers change and all other bytes stay.
 
-MuJoCo's own writer (`MjSpec.to_xml`) loses comments, defaults and the order of attributes. Here an attribute is replaced inside the
-bytes of its start tag. Format: https://mujoco.readthedocs.io/en/stable/XMLreference.html.
+Writers of the engines (`MjSpec.to_xml`) lose comments, defaults and the order of attributes. Here an attribute is replaced inside the
+bytes of its start tag, and an element's content between its tags. Format of MJCF: https://mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from pathlib import Path
 from localization.errors import SimulationError
 from motion_models.input_files import read_bytes
 
+ROOTS = ("mujoco", "sdf", "robot")
+"""Root elements of MJCF, SDF and URDF."""
 _ATTRIBUTE = re.compile(rb"""([\w:.-]+)(\s*=\s*)("[^"]*"|'[^']*')""")
 
 
@@ -30,6 +32,8 @@ class Element:
     """Offset after its start tag."""
     file: str
     """Name of the file that it is in."""
+    close: int = 0
+    """Offset of its end tag; that after its start tag where it has none."""
     parent: Element | None = None
     children: list[Element] = field(default_factory=list)
 
@@ -54,23 +58,29 @@ class Change:
     new_tag: str = ""
     """Tag of a new child with these attributes; "" where those of the element itself change."""
     text: str = ""
-    """New children as text, in place of attributes."""
+    """New children as text after its start tag, in place of attributes."""
+    content: str | None = None
+    """What is between its tags, in place of attributes."""
 
 
 @dataclass(frozen=True)
-class Mjcf:
+class XmlFile:
     """A simulator's file with those that it includes, as bytes by name; the first is the file itself."""
 
     path: Path
     """Where it is, for messages and for meshes beside it."""
     files: Mapping[str, bytes]
     root: Element
-    """<mujoco> with the contents of included files in it."""
+    """<mujoco>, <sdf> or <robot>, with the contents of included files in it."""
 
     @property
     def name(self) -> str:
         """Name of the file itself."""
         return next(iter(self.files))
+
+    def content(self, element: Element) -> str:
+        """Text between the tags of ``element``."""
+        return self.files[element.file][element.end : element.close].decode("utf-8", errors="replace").strip()
 
     def elements(self, *tags: str) -> list[Element]:
         """All elements with one of ``tags``, but for those in defaults."""
@@ -80,16 +90,15 @@ class Mjcf:
         """The element ``tag`` with this ``name``."""
         return next((e for e in self.elements(tag) if e.attributes.get("name") == name), None)
 
-    def changed(self, changes: Sequence[Change]) -> Mjcf:
+    def changed(self, changes: Sequence[Change]) -> XmlFile:
         """These files with ``changes``; all other bytes are the same."""
         merged: dict[tuple[Element, str], dict[str, str | None]] = {}
-        for change in (c for c in changes if not c.text):
+        for change in (c for c in changes if not c.text and c.content is None):
             merged.setdefault((change.element, change.new_tag), {}).update(change.attributes)
         edits: dict[str, list[tuple[int, int, bytes]]] = {}
         for change in changes:
-            if change.text:
-                end = change.element.end
-                edits.setdefault(change.element.file, []).append((end, end, change.text.encode()))
+            if change.text or change.content is not None:
+                edits.setdefault(change.element.file, []).append(self._filled(change.element, change.text, change.content))
         for (element, new_tag), attributes in merged.items():
             edits.setdefault(element.file, []).append(self._edit(element, new_tag, attributes))
         files = dict(self.files)
@@ -98,7 +107,15 @@ class Mjcf:
             for start, end, text in sorted(of_file, key=lambda edit: edit[:2], reverse=True):
                 data = data[:start] + text + data[end:]
             files[name] = data
-        return parse(files, self.path)
+        return parse(files, self.path, self.root.tag)
+
+    def _filled(self, element: Element, text: str, content: str | None) -> tuple[int, int, bytes]:
+        """Offsets of the bytes that are replaced by new children or another content, and by what."""
+        inner = (text if content is None else content).encode()
+        if self.files[element.file][element.start : element.end].endswith(b"/>"):
+            tag = self.files[element.file][element.start : element.end - 2].rstrip()
+            return element.start, element.end, tag + b">" + inner + f"</{element.tag}>".encode()
+        return element.end, element.end if content is None else element.close, inner
 
     def _edit(self, element: Element, new_tag: str, attributes: Mapping[str, str | None]) -> tuple[int, int, bytes]:
         """Offsets of the bytes that are replaced, and by what."""
@@ -113,16 +130,18 @@ class Mjcf:
             tag = _with_attribute(tag, name, value)
         return element.start, element.end, tag
 
-    def with_comment(self, comment: str) -> Mjcf:
+    def with_comment(self, comment: str) -> XmlFile:
         """These files with ``comment`` before the end of its first line, or first element."""
         text = f"\n<!-- {comment.replace('--', '- -')} -->\n".encode()
         at = self.root.start
         data = self.files[self.name]
-        return parse({**self.files, self.name: data[:at] + text.lstrip() + data[at:]}, self.path)
+        return parse({**self.files, self.name: data[:at] + text.lstrip() + data[at:]}, self.path, self.root.tag)
 
-    def with_folders_of(self, folder: Path) -> Mjcf:
+    def with_folders_of(self, folder: Path) -> XmlFile:
         """These files for one in another ``folder``: paths of meshes and textures start there."""
-        if not any("file" in e.attributes for e in self.elements("mesh", "texture", "hfield", "skin", "flexcomp")):
+        if self.root.tag != "mujoco" or not any(
+            "file" in e.attributes for e in self.elements("mesh", "texture", "hfield", "skin", "flexcomp")
+        ):
             return self
         compiler = next(iter(self.root.own("compiler")), None)
         given = {} if compiler is None else compiler.attributes
@@ -135,11 +154,11 @@ class Mjcf:
         return self.changed([change])
 
 
-def load(path: Path) -> Mjcf:
-    """The MJCF at ``path`` with its includes. Raises `SimulationError`, naming file and line."""
+def load(path: Path) -> XmlFile:
+    """The file at ``path``, an MJCF with its includes. Raises `SimulationError`, naming file and line."""
     files: dict[str, bytes] = {}
     _collect(path, path.parent, path.name, files)
-    return parse(files, path)
+    return parse(files, path, _parse_file(files[path.name], path.name, path).tag)
 
 
 def _collect(path: Path, folder: Path, name: str, files: dict[str, bytes]) -> None:
@@ -153,14 +172,14 @@ def _collect(path: Path, folder: Path, name: str, files: dict[str, bytes]) -> No
             _collect(folder / included, folder, included, files)
 
 
-def parse(files: Mapping[str, bytes], path: Path) -> Mjcf:
-    """MJCF of ``files``, the first of which is the main one. Raises `SimulationError`, naming file and line."""
+def parse(files: Mapping[str, bytes], path: Path, tag: str = "mujoco") -> XmlFile:
+    """What ``files`` are, the first of which is the main one; its root is a ``tag``. Raises `SimulationError`, naming file and line."""
     roots = {name: _parse_file(data, name, path) for name, data in files.items()}
     root = next(iter(roots.values()))
-    if root.tag != "mujoco":
-        raise SimulationError(f"simulator '{path}' is no MJCF: its root is <{root.tag}>, and must be <mujoco>.")
+    if root.tag != tag or tag not in ROOTS:
+        raise SimulationError(f"simulator '{path}' is no MJCF, SDF or URDF: its root is <{root.tag}>, and must be <{'>, <'.join(ROOTS)}>.")
     _splice(root, roots)
-    return Mjcf(path, files, root)
+    return XmlFile(path, files, root)
 
 
 def _splice(element: Element, roots: Mapping[str, Element]) -> None:
@@ -182,12 +201,16 @@ def _parse_file(data: bytes, name: str, path: Path) -> Element:
 
     def open_element(tag: str, attributes: dict[str, str]) -> None:
         start = parser.CurrentByteIndex
-        element = Element(tag, attributes, start, _tag_end(data, start), name, stack[-1] if stack else None)
+        end = _tag_end(data, start)
+        element = Element(tag, attributes, start, end, name, end, stack[-1] if stack else None)
         (stack[-1].children if stack else found).append(element)
         stack.append(element)
 
-    parser.StartElementHandler = open_element
-    parser.EndElementHandler = lambda tag: stack.pop()
+    def close_element(tag: str) -> None:
+        element = stack.pop()
+        element.close = max(element.end, parser.CurrentByteIndex)
+
+    parser.StartElementHandler, parser.EndElementHandler = open_element, close_element
     try:
         parser.Parse(data, True)
     except xml.parsers.expat.ExpatError as error:

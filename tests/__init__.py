@@ -1,0 +1,1 @@
+"""Tests and studies: a package, since dartpy installs one of the same name."""
