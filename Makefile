@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 .venv/installed: pyproject.toml constraints.txt
 	@echo "Making .venv with skidloc and what it needs (700 MB; a minute at the first time)."
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt --editable '.[twin]'
 	$(BIN)/python -m compileall -qq -j 2 .venv/lib  # pip takes one core for it
 	touch $@
 
@@ -41,8 +41,12 @@ demo: .venv/installed
 	replayed=$$?; \
 	echo "3. Two such laps with a load of 8 kg in the gripper that the robot file does not have: where is the centre of gravity, and what is wrong with the model?"; \
 	$(BIN)/skidloc weigh $(DEMO)/load.mcap --robot vaultbot --page $(DEMO)/weigh.html; weighed=$$?; wait $$load; diagnosed=$$?; \
-	cat $(DEMO)/load.txt; exit $$((studied + replayed + weighed + diagnosed))
-	@echo "Open $(DEMO)/laps/report.html, $(DEMO)/weigh.html and $(DEMO)/load/diagnosis.html in a browser. Long real logs: make demo-buildings."
+	cat $(DEMO)/load.txt; \
+	echo "4. The same 68 rotations in MuJoCo with its default contacts: what that simulator gets wrong, and the file that is better."; \
+	$(BIN)/skidloc twin $(DATA)/vaultbot/rotation_grid.csv --robot vaultbot --config.windows 4 --config.held-windows 8 \
+		--config.budget-steps 40000 --out $(DEMO)/twin; mended=$$?; \
+	exit $$((studied + replayed + weighed + diagnosed + mended))
+	@echo "Open $(DEMO)/laps/report.html, $(DEMO)/weigh.html, $(DEMO)/load/diagnosis.html and $(DEMO)/twin/report.html in a browser. Long real logs: make demo-buildings."
 
 # Minutes: the Husky outdoors and two real buildings.
 demo-buildings: .venv/installed

@@ -32,8 +32,8 @@ SHORTER = {
 ABSOLUTE_PATH = re.compile(r"(?<![\w.])/(?:home|root|tmp|work|usr|opt|var|mnt|Users)/|[A-Z]:\\\\")
 
 
-def test_notebooks_are_eleven_and_each_title_is_one_claim():
-    assert [source.name.split("_")[0] for source in sources()] == [str(number) for number in range(11)]
+def test_notebooks_are_twelve_and_each_title_is_one_claim():
+    assert [source.name.split("_")[0] for source in sources()] == [str(number) for number in range(12)]
     for source in sources():
         text = source.read_text(encoding="utf-8")
         assert len(re.findall(r"^# \*\*Claim: ", text, flags=re.MULTILINE)) == 1
