@@ -12,8 +12,9 @@
 # friction model's contact law in their place, no number fitted, it turns as far as the real one at each centre of gravity.**
 #
 # 68 rotations in place were measured (Ebersole 2016), each at another centre of gravity (CG). Their wheel rates are played in MuJoCo, two
-# seconds each: in a file that is written from the robot file as one would by hand, and in the same file with the contact law and servos that
-# keep the rates, as the real ones did. It needs the extra `twin`. `skidloc twin` does this with a file and a log of your own, fits what is wrong, and writes the better file.
+# seconds each: in a file that is written from the robot file as one would by hand, and in the same file with the contact law and servos
+# that keep the rates, as the real ones did. It needs the extra `twin`. `skidloc twin` does this with a file and a log of your own, fits
+# what is wrong, and writes the better file.
 
 # %%
 from dataclasses import replace

@@ -51,7 +51,7 @@ class DartBody:
     mass: float
     com: FloatArray
     inertia: FloatArray
-    """Of all but the wheels, in the model's frame."""
+    """(3, 3) moments of inertia of all but the wheels, in the model's frame [kg m^2]."""
     radii: FloatArray
     """(n,) of the wheels [m], left ones first."""
     lengths: FloatArray
@@ -76,7 +76,7 @@ class DartEngine:
 
     @property
     def body(self) -> DartBody:
-        """As it is simulated."""
+        """What is simulated."""
         return self._body
 
     @property

@@ -114,7 +114,7 @@ class GazeboRobot:
 
     @property
     def mass(self) -> float:
-        """Of the whole robot [kg]."""
+        """Mass of the whole robot [kg]."""
         return sum(link.mass for link in self.links.values())
 
     def rigid(self, links: Sequence[Link] | None = None) -> tuple[float, FloatArray, FloatArray]:
@@ -137,7 +137,7 @@ class GazeboRobot:
         return min(float(wheel_centre(w)[2]) - w.shape.radius for w in self.driven)
 
     def center_of_mass(self) -> tuple[float, float, float]:
-        """Of the whole robot: ahead and left of the middle of the wheels, above their lowest points [m]."""
+        """Centre of mass of the whole robot: ahead and left of the middle of the wheels, above their lowest points [m]."""
         _, com, _ = self.rigid(list(self.links.values()))
         off, f = com[:2] - self.wheels.origin, self.wheels.forward
         return float(off @ f), float(off @ np.array([-f[1], f[0]])), float(com[2] - self.ground_z)
@@ -217,7 +217,7 @@ class _SdfReader:
         return links, [self._joint(e, links) for e in self._model.own("joint")]
 
     def _pose(self, element: Element, depth: int = 0) -> Pose:
-        """Of a link, joint or frame in the model's frame."""
+        """Pose of a link, joint or frame in the model's frame."""
         if depth > len(self._named):
             raise SimulationError(f"simulator '{self._file.path}': the poses of its frames go round in a circle.")
         poses = element.own("pose")

@@ -67,7 +67,7 @@ def _wheel(w: GazeboWheel) -> str:
 
 
 def _moments(inertia: FloatArray) -> str:
-    """As MuJoCo takes them: positive, and no moment larger than the sum of the others."""
+    """Moments as MuJoCo takes them: positive, and no moment larger than the sum of the others."""
     values, axes = np.linalg.eigh(0.5 * (inertia + inertia.T))
     values = np.maximum(values, 1e-6)
     values[2] = min(values[2], values[0] + values[1])

@@ -29,6 +29,7 @@ try:
 except ImportError as error:
     raise SimulationError("MuJoCo is not installed. Install the extra: pip install 'skidloc[twin]'.") from error
 
+mujoco.set_mju_user_warning(lambda message: None)  # else MuJoCo writes MUJOCO_LOG.TXT into the working folder; states are checked here
 _SETTLE_S = 0.5
 _K = 0.55
 """Turn over that of ideal wheels from which a window's lead starts: between the published Huskies' .43 and .67."""

@@ -63,7 +63,7 @@ class NumberChange:
     """A number that a repair changes."""
 
     field: str
-    """Of `Numbers`."""
+    """Field of `Numbers`."""
     meaning: str
     attribute: str
     """Where the file has it."""
@@ -90,11 +90,11 @@ class Simulator(Protocol):
 
     @property
     def file(self) -> XmlFile:
-        """As the user has it."""
+        """The file as the user has it."""
 
     @property
     def numbers(self) -> Numbers:
-        """As the file has them."""
+        """The numbers that the file has."""
 
     @property
     def engine(self) -> Engine:
