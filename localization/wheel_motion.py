@@ -12,11 +12,12 @@ from localization.wheel_buffer import WheelBuffer, WheelWindow
 from localization.wheel_gaps import VelocityWithinIntervals
 from motion_models import se2
 from motion_models.base import MotionModel
-from motion_models.extended_model import SampleSeries, in_series, needs_series
+from motion_models.extended_model import horizon_s, in_series, needs_series
 from motion_models.motion import Motion, Twist
 from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray, Twist2
+from motion_models.term_memory import SampleSeries
 
 
 class WheelMotion:
@@ -26,6 +27,7 @@ class WheelMotion:
         """``max_hold_s``: how long the last rates are held [s]; ``unknown_sigma`` (3,): of the twist where no wheel shows it;
         ``has_slopes``: gravity acts where the ground tilts."""
         self.model, self.params, self._needs_series = model, model.nominal, needs_series(model)
+        self._horizon_ns = round(horizon_s(model) * 1e9)
         self.buffer = WheelBuffer(robot.center_of_gravity)
         self._noise, self._max_hold_s = noise_vector(robot.wheel_noise), max_hold_s
         self._within = VelocityWithinIntervals(unknown_sigma)
@@ -45,13 +47,13 @@ class WheelMotion:
         dt, rates, cg = window.dt, window.rates, window.cg
         if not len(dt):
             return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
-        before, before_cg = self.buffer.at(start_ns - 1, self._max_hold_s)
-        n = len(before)
+        ago, before, before_cg = self._before(start_ns)
+        n = len(ago)
         rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
         model = self.model
         if self._needs_series:
-            since = np.r_[np.zeros(n), np.cumsum(dt) - dt] + (start_ns - (self.buffer.first_ns or start_ns)) * 1e-9
-            model = in_series(model, SampleSeries(np.r_[np.zeros(n), dt], since))
+            since = np.cumsum(np.r_[ago, dt]) - np.r_[ago, dt] - ago.sum() + (start_ns - (self.buffer.first_ns or start_ns)) * 1e-9
+            model = in_series(model, SampleSeries(np.r_[ago, dt], since))
         if tilt is None or self.on_slopes is None:
             twist = model.twist(rates, cg, self.params)
             inside = Twist(twist.value[n:], twist.d_wheels[n:], twist.d_cg[n:], twist.d_params[n:])
@@ -59,5 +61,15 @@ class WheelMotion:
         else:
             twist, motion = self.on_slopes.integrate(model, self.params, dt, rates, cg, tilt)
         motion = replace(motion, cov=motion.cov + self._within.add(window, twist.value[n:]))
-        first, last = twist.value[0], twist.value[-1]
+        first, last = twist.value[max(n - 1, 0)], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
+
+    def _before(self, start_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Lengths (n,) [s], rates (n, 2) and CG (n, 2) of the samples before ``start_ns`` that the step depends on: the last one, which has
+        no length here, or all within the memory of the model's terms."""
+        if self._horizon_ns:
+            past = self.buffer.window(start_ns - self._horizon_ns, start_ns, self._max_hold_s)
+            if len(past.dt):
+                return past.dt, past.rates, past.cg
+        rates, cg = self.buffer.at(start_ns - 1, self._max_hold_s)
+        return np.zeros(len(rates)), rates, cg

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -14,7 +14,8 @@ from motion_models.errors import ModelError
 from motion_models.motion import Twist
 from motion_models.param import Free, Param, Scale
 from motion_models.se2 import FloatArray
-from motion_models.terms import COMPONENTS, Term
+from motion_models.term_memory import HORIZON_S, SampleSeries
+from motion_models.terms import COMPONENTS, Term, with_memory
 
 _NEWTON_STEPS = 50
 """Most Newton steps of the inverse; commands that have a solution take under ten."""
@@ -23,15 +24,6 @@ _CONVERGED = 1e-10
 _LAST = 90
 """Rank of terms among what calibration fits: after the model's own parameters."""
 _OWN, _SERIES = ("v", "wz"), ("dv", "dwz", "t")
-
-
-class SampleSeries(NamedTuple):
-    """When samples were taken, for terms of accelerations and of time."""
-
-    dt: FloatArray
-    """(n,) time from the sample before to each sample [s]; 0 where there is none before, so that nothing accelerates."""
-    t: FloatArray
-    """(n,) time since the drive began [s]."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +122,8 @@ class ExtendedModel(ModelWrapper):
         if self.series is None or self.series.dt.shape != lead:
             return {**values, "dv": np.zeros(lead), "dwz": np.zeros(lead), "t": np.zeros(lead)}
         rate = np.divide(1.0, self.series.dt, out=np.zeros(lead), where=self.series.dt > 0.0)
-        changes = {"dv": np.diff(v, prepend=v[:1]) * rate, "dwz": np.diff(wz, prepend=wz[:1]) * rate}
-        return {**values, **changes, "t": self.series.t}
+        values |= {"dv": np.diff(v, prepend=v[:1]) * rate, "dwz": np.diff(wz, prepend=wz[:1]) * rate, "t": self.series.t}
+        return with_memory((term.expression for term in self.terms), values, self.series)
 
 
 def _param(term: Term) -> Param:
@@ -150,12 +142,17 @@ def terms_of(model: object) -> tuple[Term, ...]:
 
 
 def needs_series(model: object) -> bool:
-    """Whether a term of ``model`` depends on accelerations or time."""
-    return any(name in _SERIES for term in terms_of(model) for name in term.expression.variables)
+    """Whether a term of ``model`` depends on accelerations, on time, or on the samples before."""
+    return any(f.variable in _SERIES or f.has_memory for term in terms_of(model) for f in term.expression.factors)
+
+
+def horizon_s(model: object) -> float:
+    """Time before a step that the terms of ``model`` depend on [s]; 0 without a memory."""
+    return HORIZON_S if any(f.has_memory for term in terms_of(model) for f in term.expression.factors) else 0.0
 
 
 def in_series(model: Any, series: SampleSeries) -> Any:
-    """``model`` for samples taken as ``series`` has it, where its terms depend on accelerations or time; else the same."""
+    """``model`` for samples taken as ``series`` has it, where its terms depend on such a series; else the same."""
     if isinstance(model, ExtendedModel):
         return dataclasses.replace(model, series=series) if needs_series(model) else model
     inner = getattr(model, "inner", None)

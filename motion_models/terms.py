@@ -4,8 +4,9 @@
     vy = {"wz*abs(wz)" = [-0.12, 0.01, "m s"]}      # vy = the model's + c wz |wz| with c = -0.12 +- 0.01 m s
 
 A term is a coefficient times a product of `VARIABLES`, each as it is, to a power (v^2), or in abs() or sign(); max(wz,0) is what acts in
-left turns alone, min(wz,0) in right ones; rise(t,T) is what warms up with the time constant T [s], 1 - exp(-t/T). Its sigma is that of the
-coefficient, and the unit may be left out. Terms are zero at rest: at least one factor is a motion.
+left turns alone, min(wz,0) in right ones; rise(t,T) is what warms up with the time constant T [s], 1 - exp(-t/T). Factors with a memory
+are lag(wz,T), swing(v,f,d) and play(wz,r) (`motion_models.term_memory`): what follows late, swings, or stays behind by r. Its sigma is that
+of the coefficient, and the unit may be left out. Terms are zero at rest, but for what fades: at least one factor is a motion.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,6 +22,7 @@ import numpy as np
 
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
+from motion_models.term_memory import CONSTANTS, SampleSeries, respond
 
 COMPONENTS = ("vx", "vy", "wz")
 """Components of the twist, in the order of `Twist.value`."""
@@ -28,8 +30,8 @@ _MAX_POWER = 4
 """Largest power of a variable: higher ones of noisy rates are noise."""
 _LARGEST = 1e6
 """Largest coefficient, in SI units."""
-_TIME_CONSTANTS_S = (0.1, 1e5)
-"""Least and largest time constant of a rise [s]: a sample, and more than a day."""
+_LIMITS: Mapping[str, tuple[tuple[float, float], ...]] = {"rise": ((0.1, 1e5),), **CONSTANTS}
+"""Least and largest constants by form: of a rise its time constant [s], a sample, and more than a day."""
 MOST_TERMS = 32
 """Most terms of one model: each is a parameter that the filter may correct."""
 
@@ -80,7 +82,15 @@ _SYNONYMS = {
 _FORMS = ("", "abs", "sign", "max", "min")
 """Forms of a variable, in the order in which expressions have them; max and min are of the variable and 0."""
 _FACTOR = re.compile(r"(?:(abs|sign)\(([a-z_]+)\)|(max|min)\(([a-z_]+),0\)|([a-z_]+))(?:(?:\^|\*\*)(\d+))?")
-_RISE = re.compile(r"rise\(t,(\d+(?:\.\d+)?(?:e\+?\d+)?)\)")
+_WITH_CONSTANTS = re.compile(r"(rise|lag|swing|play)\((.*)\)")
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
+_CONSTANT_WORDS = {
+    "rise": "a time constant of {} s",
+    "lag": "a time constant of {} s",
+    "swing": "a frequency of {} Hz and a damping ratio of {}",
+    "play": "half the width of {} in its unit",
+}
+_EXAMPLES = {"rise": "rise(t,30)", "lag": "lag(wz,0.4)", "swing": "swing(v,0.8,0.2)", "play": "play(wz,0.1)"}
 
 
 class Factor(NamedTuple):
@@ -88,10 +98,15 @@ class Factor(NamedTuple):
 
     variable: str
     form: str
-    """Empty, abs, sign, max, min or rise."""
+    """Empty, abs, sign, max, min, rise, lag, swing or play."""
     power: int
-    time_constant_s: float = 0.0
-    """Time constant of a rise [s]."""
+    constants: tuple[float, ...] = ()
+    """Of a rise, or of what has a memory."""
+
+    @property
+    def has_memory(self) -> bool:
+        """Whether it depends on the samples before."""
+        return self.form in CONSTANTS
 
     @property
     def is_one_sided(self) -> bool:
@@ -107,17 +122,20 @@ class Factor(NamedTuple):
         return 0 if self.is_one_sided and sign != 1 else sign**self.power
 
     def __str__(self) -> str:
-        if self.form == "rise":
-            return f"rise({self.variable},{self.time_constant_s:.4g})"
+        if self.constants:
+            return f"{self.form}({self.variable},{','.join(f'{c:.4g}' for c in self.constants)})"
         other = ",0" if self.is_one_sided else ""
         name = f"{self.form}({self.variable}{other})" if self.form else self.variable
         return name if self.power == 1 else f"{name}^{self.power}"
 
     def at(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Value and derivative by the variable ``x`` (n,); at kinks the derivative is the mean of both sides'."""
+        """Value and derivative by the variable ``x`` (n,), in steady motion; at kinks the derivative is the mean of both sides', and what
+        has a memory has none: its past is an input."""
+        if self.has_memory:
+            return respond(self.form, self.constants, x, None), np.zeros_like(x)
         if self.form == "rise":
-            left = np.exp(-x / self.time_constant_s)
-            return np.asarray(1.0 - left), np.asarray(left / self.time_constant_s)
+            left = np.exp(-x / self.constants[0])
+            return np.asarray(1.0 - left), np.asarray(left / self.constants[0])
         if self.form == "sign":
             return np.asarray(np.sign(x) ** self.power), np.zeros_like(x)
         if self.is_one_sided:
@@ -155,19 +173,30 @@ class Expression:
 
     @property
     def typical(self) -> float:
-        """Its size on an ordinary drive, where each variable has its typical size on the side on which it acts."""
+        """Its size on an ordinary drive, where each variable has its typical size on the side on which it acts, and a swing all of it."""
         sides = ((VARIABLES[f.variable].typical * np.array([-1.0, 1.0])) for f in self.factors)
-        return math.prod(float(np.max(np.abs(f.at(x)[0]))) for f, x in zip(self.factors, sides, strict=True))
+        shapes = (x if f.has_memory else f.at(x)[0] for f, x in zip(self.factors, sides, strict=True))
+        return math.prod(float(np.max(np.abs(shape))) for shape in shapes)
 
     def evaluate(self, values: Mapping[str, FloatArray]) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """Value (n,) at the variables' ``values`` (n,) each, and derivatives (n,) by the variables in it."""
-        parts = [f.at(values[f.variable]) for f in self.factors]
+        """Value (n,) at the variables' ``values`` (n,) each, and derivatives (n,) by the variables in it. What has a memory is among the
+        values by the factor's text (`with_memory`), else it is that of steady motion."""
+        parts = [
+            (values[str(f)], np.zeros_like(values[str(f)])) if f.has_memory and str(f) in values else f.at(values[f.variable])
+            for f in self.factors
+        ]
         value = np.asarray(math.prod(part for part, _ in parts))
         slopes: dict[str, FloatArray] = {}
         for i, (factor, (_, slope)) in enumerate(zip(self.factors, parts, strict=True)):
             others = math.prod((part for j, (part, _) in enumerate(parts) if j != i), start=1.0)
             slopes[factor.variable] = slopes.get(factor.variable, 0.0) + slope * others
         return value, slopes
+
+
+def with_memory(expressions: Iterable[Expression], values: Mapping[str, FloatArray], series: SampleSeries | None) -> dict[str, FloatArray]:
+    """``values`` (n,) of the variables with those of all factors of ``expressions`` that have a memory, along the ``series`` of samples."""
+    factors = {f for e in expressions for f in e.factors if f.has_memory}
+    return {**values, **{str(f): respond(f.form, f.constants, values[f.variable], series) for f in factors}}
 
 
 def parse_expression(text: str, where: str = "term") -> Expression:
@@ -177,10 +206,10 @@ def parse_expression(text: str, where: str = "term") -> Expression:
     'wz*abs(wz)'
     """
     powers: dict[tuple[str, str], int] = {}
-    rises: list[Factor] = []
+    last: list[Factor] = []
     for part in re.sub(r"\*\*", "^", text.replace(" ", "")).split("*"):
-        if part.startswith("rise("):
-            rises.append(_rise(part, text, where))
+        if (found := _WITH_CONSTANTS.fullmatch(part)) is not None:
+            last.append(_with_constants(found[1], found[2].split(","), text, where))
             continue
         found = _FACTOR.fullmatch(part)
         if found is None:
@@ -196,23 +225,30 @@ def parse_expression(text: str, where: str = "term") -> Expression:
         if not 1 <= powers[name, form] <= _MAX_POWER:
             raise RobotError(f"{where}: power {powers[name, form]} of {name} in {text[:60]!r}; powers are 1 to {_MAX_POWER}.")
     order = sorted(powers, key=lambda key: (_NAMES.index(key[0]), _FORMS.index(key[1])))
-    expression = Expression((*(Factor(name, form, powers[name, form]) for name, form in order), *rises))
+    expression = Expression((*(Factor(name, form, powers[name, form]) for name, form in order), *last))
     if not any(VARIABLES[f.variable].is_motion for f in expression.factors):
         motions = ", ".join(name for name, v in VARIABLES.items() if v.is_motion)
         raise RobotError(f"{where}: {text[:60]!r} would move a robot that stands; multiply it by one of {motions}.")
     return expression
 
 
-def _rise(part: str, text: str, where: str) -> Factor:
-    """The factor that ``part`` of ``text`` writes, as ``rise(t,30)``. Raises `RobotError`."""
-    found = _RISE.fullmatch(part)
-    low, high = _TIME_CONSTANTS_S
-    if found is None or not low <= float(found[1]) <= high:
+def _with_constants(form: str, arguments: list[str], text: str, where: str) -> Factor:
+    """The factor ``form`` of these ``arguments``, as rise(t,30) or swing(v,0.8,0.2). Raises `RobotError`."""
+    name, *written = arguments
+    limits = _LIMITS[form]
+    is_possible = name == "t" if form == "rise" else name in VARIABLES and VARIABLES[name].is_motion
+    constants = tuple(float(c) for c in written if _NUMBER.fullmatch(c))
+    in_limits = len(constants) == len(written) == len(limits) and all(
+        low <= c <= high for c, (low, high) in zip(constants, limits, strict=True)
+    )
+    if not (is_possible and in_limits):
+        of = "t" if form == "rise" else "a motion (v, wz, left, right, dv, dwz)"
+        words = _CONSTANT_WORDS[form].format(*(f"{low:g} to {high:g}" for low, high in limits))
         raise RobotError(
-            f"{where}: cannot read {part[:40]!r} in {text[:60]!r}; a rise is of t, with a time constant of {low:g} to {high:g} s, "
-            "as rise(t,30)."
+            f"{where}: cannot read {form}({','.join(arguments)[:40]}) in {text[:60]!r}; a {form} is of {of}, with {words}, as "
+            f"{_EXAMPLES[form]}."
         )
-    return Factor("t", "rise", 1, float(found[1]))
+    return Factor(name, form, 1, constants)
 
 
 @dataclass(frozen=True)

@@ -458,6 +458,7 @@ def _conclude(searched: _Searched, chosen: tuple[int, ...], rng: np.random.Gener
         windows=len(drive.maneuvers),
         warnings=(*_clock_warnings(predictor, findings), *noise_notes(rows), *_contact_notes(predictor, error), *drive.warnings),
         suspected=None if suspected is None else suspected[0],
+        joint_p=problem.joint_p(chosen, sizes),
     )
     named = [f.definition.key for f in correctable_findings(result)] or [causes[i].key for i in chosen]
     result = dataclasses.replace(result, handover=check_findings(predictor, linearization, named))

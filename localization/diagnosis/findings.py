@@ -33,6 +33,8 @@ _NOT_SHOWN = "This drive cannot show what is wrong with {}."
 _TWO_SIDED_95 = 1.96
 _USUAL_SHARE = 0.75  # three of the four sigma up to which a size is plausible
 _MAX_MOVED_SHARE = 0.1  # of a size that is right although another finding beside it is not: accuracy of signatures
+_JOINT_LEVEL = 0.001
+"""Probability of all sizes within tolerance together below which it is said: a thousand healthy robots have one such."""
 _MAX_SUSPECTED_ALIASES = 3  # that a sentence names
 
 _CHANNEL_WORDS = {
@@ -260,6 +262,8 @@ class Diagnosis:
     """Why the drive was not searched for causes: too little was measured."""
     suspected: Finding | None = None
     """Where the verdict is consistent: the strongest cause, too weak to be named, but stronger than four in five healthy drives show."""
+    joint_p: float = 1.0
+    """Probability that a healthy robot has as much within tolerance as this drive shows, of all causes together."""
     handover: HandoverCheck | None = None
     """Gain of the corrected robot file on the second half of the drive."""
     extension: Extension | None = None
@@ -306,6 +310,7 @@ class Diagnosis:
             "outlier_windows_s": list(self.outliers_s),
             "witness": self.motion_reference,
             "windows": self.windows,
+            "within_tolerance_p": self.joint_p,
             "within_tolerance": {name: list(value) for name, value in self.within.items()},
             "smallest_visible": dict(self.detectable_sizes),
             "notes": list(self.warnings),
@@ -486,6 +491,8 @@ def sentence(d: Diagnosis) -> str:
     added = [] if d.extension is None else [text for text in (d.extension.describe(), d.extension.describe_refused()) if text]
     if d.verdict == "consistent":
         text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
+        if d.joint_p < _JOINT_LEVEL:
+            text = f"Each cause by itself is within its tolerance, and {_joint(d)}"
         tolerated = describe_tolerated(d)
         text += f"; within tolerance: {', '.join(tolerated)}." if tolerated else "."
         text = text if d.suspected is None else f"{text} {_suspicion(d.suspected)}"
@@ -495,12 +502,23 @@ def sentence(d: Diagnosis) -> str:
     refused = not_written(d)
     if refused:
         orders.append(f"Not written: {'; '.join(f'{_further(f)}, as {why}' for f, why in refused)}")
+    if d.joint_p < _JOINT_LEVEL and d.verdict == "explained":
+        missing.append(f"of what is within tolerance, {_joint(d)}")
     parts = [f"{part[0].upper()}{part[1:]}".removesuffix(".") for part in orders + missing]
     left = _left(d) if d.verdict == "unexplained" else ""
     if left:
         unnamed = "Something without a name is left" if parts else f"{d.model} is wrong here, but not in a way that has a name"
         parts.append(f"{unnamed}: {left}")
     return (". ".join(parts) + "." * bool(parts) + contradiction).strip()
+
+
+def _joint(d: Diagnosis) -> str:
+    """That sizes within tolerance are too many to be a healthy robot's, as a clause."""
+    robots = f"{1.0 / _JOINT_LEVEL:,.0f}"
+    return (
+        f"all together are more than one healthy robot in {robots} has (p = {d.joint_p:.1g}): a small law may be spread over them. Record a"
+        " drive of the robot while it is right, and diagnose with --healthy"
+    )
 
 
 def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import chi2
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.causes.cause import Cause, Hypothesis, Setting, with_sizes
@@ -141,6 +142,19 @@ class Regression:
         limit[i] = 0.0
         moment = self.moment - self.gram[:, i] @ (sizes / self.scale[i])
         return np.asarray(bounded_minimum(self.gram + np.diag(1.0 / np.square(self.tolerance)), moment, limit) * self.scale)
+
+    def joint_p(self, chosen: tuple[int, ...], sizes: FloatArray) -> float:
+        """Probability that all causes that are not named, each with the sigma of its tolerance, make together as much as they do beside
+        those ``chosen`` with their ``sizes`` (k,): the prior predictive check (Box 1980) of the directions of sizes that the drive
+        determines better than the prior. With moment m = G u + e of unit sizes u, cov(e) = G and cov(m) = G + G^2."""
+        i = list(chosen)
+        rest = np.setdiff1d(np.arange(len(self.moment)), i)
+        tolerance = self.tolerance[rest]
+        moment = (self.moment - self.gram[:, i] @ (sizes / self.scale[i]))[rest] * tolerance
+        values, vectors = np.linalg.eigh(self.gram[np.ix_(rest, rest)] * np.outer(tolerance, tolerance))
+        shown = values > 1.0
+        squares = (vectors.T @ moment)[shown] ** 2 / (values * (1.0 + values))[shown]
+        return float(chi2.sf(squares.sum(), np.count_nonzero(shown))) if shown.any() else 1.0
 
     def scores(self, given: tuple[int, ...], wanted: list[int]) -> tuple[FloatArray, FloatArray]:
         """(n,) scores of the ``wanted`` causes with those ``given`` free and all others within tolerance, and their (n, n) covariance if

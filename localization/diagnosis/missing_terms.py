@@ -29,18 +29,19 @@ from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, mov
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
 from localization.diagnosis.model_extension import FoundEffect, FoundTerm
 from localization.diagnosis.noise import FLAT, Noise, reference_noise
-from localization.diagnosis.placebos import LEVEL, Candidates, free, modulated, placebo_p, placebo_statistics
+from localization.diagnosis.placebos import LEVEL, Candidates, free, joint_statistic, modulated, placebo_p, placebo_statistics
 from localization.diagnosis.result import DiagnosisResult
 from motion_models.calibration.prediction import series_of
 from motion_models.extended_model import ExtendedModel
 from motion_models.se2 import FloatArray
-from motion_models.terms import COMPONENTS, VARIABLES, Expression, Term, parse_expression
+from motion_models.term_memory import CONSTANTS
+from motion_models.terms import COMPONENTS, VARIABLES, Expression, Term, parse_expression, with_memory
 
 _POWERS = ("", "{0}", "abs({0})", "{0}^2", "{0}*abs({0})", "sign({0})", "{0}^3")
 """Shapes of one variable: even and odd, to the third power, as slip grows."""
 _ONE_SIDED = ("max({0},0)", "min({0},0)")
-"""Shapes that act to one side alone, as a slip in left turns. By abs() such a law is half in a term, and half in what is tolerated of the
-causes, which no file holds."""
+"""Shapes that act to one side alone, as a slip in left turns, or in arcs to the left backwards. By abs() such a law is half in a term, and
+half in what is tolerated of the causes, which no file holds."""
 _OF_CAUSES = frozenset({("vx", "v"), ("vx", "wz"), ("vy", "v"), ("vy", "wz"), ("wz", "v"), ("wz", "wz")})
 """Shapes of causes of the catalogue: radii, rotation scaling, centre of rotation, yaw of the reference. A term has them only where such a
 cause would be larger than robots have it."""
@@ -62,11 +63,17 @@ _TIME_CONSTANTS = (0.125, 0.25, 0.5, 1.0)
 and what is faster is over before it is measured."""
 _SHORTEST_S = 16.0
 """Drive in which what warms up can be measured: eight windows [s]."""
-_OF_CG = {
-    "vx": ("v*cg_x", "wz*cg_y", "v*cg_y", "abs(wz)*cg_x"),
-    "vy": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x"),
-    "wz": ("wz*cg_x", "v*cg_y", "abs(wz)*cg_y", "wz*abs(wz)*cg_x", "wz*cg_x^2"),
-}
+_OF_CG = [f"{motion}*cg_{axis}" for motion in ("v", "wz", "abs(v)", "abs(wz)", "wz*abs(wz)") for axis in "xy"]
+"""Motions whose share differs with the posture: a radius by the load on it, how far turns go, and slip to the side."""
+_LAGS_S = (0.15, 0.3, 0.6, 1.2)
+_SWINGS = tuple(itertools.product((0.3, 0.5, 0.8, 1.3), (0.1, 0.3)))
+"""Frequencies [Hz] and damping ratios of loads that swing."""
+_PLAYS = (0.15, 0.4)
+"""Half the width of a hysteresis, over the root mean square of its variable."""
+_PROFILED = (1.5, 1.25, 1.25, 1.12, 1.12, 1.06, 1.06)
+"""Ratios by which constants of a memory are changed, one after the other: from a half of the steps of the library to 6 %."""
+_LEAST_PLAY = 0.01
+"""Rate below which a hysteresis is noise [m/s, rad/s]."""
 _CG_MOVES_M = 0.005
 _COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
 _ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
@@ -207,20 +214,34 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
     """Candidates for a drive in which ``count`` numbers were measured, beside so many ``others``; CG products only where the CG moves."""
     powers = list(itertools.product(_POWERS, _POWERS))[1:]
     powers += [pair for x, y in itertools.product(_ONE_SIDED, _POWERS) for pair in ((x, y), (y, x))]
+    powers += itertools.product(_ONE_SIDED, _ONE_SIDED)
     texts = ["*".join(p for p in (a.format("v"), b.format("wz")) if p) for a, b in powers]
     has_cg = bool(np.std(predictor.batch.cg, axis=0).max() > _CG_MOVES_M)
     whole = float(predictor.batch.t.max(initial=0.0))
     rises = [f"rise(t,{float(f'{share * whole:.2g}'):g})" for share in _TIME_CONSTANTS if whole > _SHORTEST_S]
+    memory = _with_memory(predictor) if predictor.drive.kind == "log" and whole > _SHORTEST_S else []
     found: dict[tuple[str, Expression], None] = {}
     for component in COMPONENTS:
         warming = [f"{motion}*{rise}" for motion in _WARMING[component] for rise in rises]
-        for text in (*texts, *_MORE[component], *warming, *(_OF_CG[component] if has_cg else ())):
+        for text in (*texts, *_MORE[component], *warming, *memory, *(_OF_CG if has_cg else ())):
             expression = parse_expression(text)
             if _degree(expression) <= _MAX_DEGREE:
                 found.setdefault((component, expression))
     base = 2.0 * math.log(len(found) + others) + math.log(max(count, 2))
     more = {(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
     return tuple(CandidateTerm(c, e, base + _complexity(Term(c, e, 0.0)) + more.get((c, e), 0.0)) for c, e in found)
+
+
+def _with_memory(predictor: DrivePredictor) -> list[str]:
+    """Texts of what follows late, swings, or has a hysteresis."""
+    twist = predictor.corrected_twist(Hypothesis())
+    found = []
+    for name, values in (("v", twist[:, 0]), ("wz", twist[:, 2])):
+        size = float(np.sqrt(np.mean(values**2)))
+        found += [f"lag({name},{constant:g})" for constant in _LAGS_S]
+        found += [f"swing({name},{frequency:g},{damping:g})" for frequency, damping in _SWINGS]
+        found += [f"play({name},{share * size:.2g})" for share in _PLAYS if share * size > _LEAST_PLAY]
+    return found
 
 
 def _fading_pairs(candidates: Sequence[CandidateTerm]) -> list[tuple[int, int]]:
@@ -236,7 +257,7 @@ def _degree(expression: Expression) -> int:
 
 
 def _complexity(term: Term) -> float:
-    factors = sum(f.power for f in term.expression.factors)
+    factors = sum(f.power + f.has_memory * len(f.constants) for f in term.expression.factors)
     return _COMPLEXITY_PRICE * (factors - 1) + (0.0 if term.is_symmetric else _ASYMMETRIC_PRICE)
 
 
@@ -253,6 +274,7 @@ def term_columns(
     values = {"v": v, "wz": wz, "cg_x": batch.cg[:, 0], "cg_y": batch.cg[:, 1], "t": series.t}
     values |= {"dv": np.diff(v, prepend=v[:1]) * rate, "dwz": np.diff(wz, prepend=wz[:1]) * rate}
     expressions = list(dict.fromkeys(c.expression for c in candidates))
+    values = with_memory(expressions, values, series)
     shapes = np.column_stack([e.evaluate(values)[0] for e in expressions])
     moved = np.zeros((len(batch.ends), 3, 3, len(expressions)))
     for i, inside in enumerate(batch.intervals()):
@@ -338,6 +360,7 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
         noise = noise_beside(predictor, state, design.columns[..., list(terms)])
     if any(finding.definition.is_clock for finding in found.diagnosis.findings):
         chosen = _with_clock_for_gains(design.problem(noise), state.causes, candidates, chosen)
+    design, candidates = _profiled(predictor, with_sizes(sizes), design, noise, (candidates, f), chosen)
     chosen, stability = _supported(design, noise, chosen, f, rng)
     searched = _searched_candidates(design, noise, prices, f, bound.motions)
     chosen, placebos = _beyond_placebos(design, noise, (chosen, f), searched, rng)
@@ -347,6 +370,40 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(
         has_sides=has_sides, refused=refused
     )
+
+
+def _profiled(
+    predictor: DrivePredictor,
+    hypothesis: Hypothesis,
+    design: Design,
+    noise: Noise,
+    known: tuple[Sequence[CandidateTerm], int],
+    chosen: tuple[int, ...],
+) -> tuple[Design, tuple[CandidateTerm, ...]]:
+    """``design`` and the ``known`` candidates, from a first column on: those of the ``chosen`` columns that have a memory have the
+    constants by which they gain most beside the others, by steps that become smaller."""
+    found, f, columns = list(known[0]), known[1], design.columns.copy()
+    remembering = [i for i in chosen if f <= i < f + len(found) and any(x.has_memory for x in found[i - f].expression.factors)]
+    for ratio, i in itertools.product(_PROFILED, remembering):
+        near, others = _near(found[i - f], ratio), [j for j in chosen if j != i]
+        tried = np.concatenate([columns[..., [i]], term_columns(predictor, hypothesis, near)], axis=-1)
+        problem = design._replace(columns=np.concatenate([columns[..., others], tried], axis=-1)).problem(noise)
+        best = int(np.argmax(problem.gains_beside(range(len(others)))[len(others) :]))
+        if best:
+            found[i - f], columns[..., i] = near[best - 1], tried[..., best]
+    return design._replace(columns=columns), tuple(found)
+
+
+def _near(candidate: CandidateTerm, ratio: float) -> list[CandidateTerm]:
+    """``candidate`` with one constant of a memory larger or smaller by this ``ratio``."""
+    factors, found = candidate.expression.factors, []
+    for n, factor in enumerate(factors):
+        for k, (low, high) in enumerate(CONSTANTS.get(factor.form, ())):
+            for constant in (factor.constants[k] * ratio, factor.constants[k] / ratio):
+                constants = (*factor.constants[:k], float(f"{min(max(constant, low), high):.3g}"), *factor.constants[k + 1 :])
+                changed = Expression((*factors[:n], factor._replace(constants=constants), *factors[n + 1 :]))
+                found.append(dataclasses.replace(candidate, expression=changed))
+    return found
 
 
 def _searched_candidates(design: Design, noise: Noise, prices: FloatArray, f: int, motions: FloatArray) -> Candidates:
@@ -360,24 +417,35 @@ def _beyond_placebos(
     design: Design, noise: Noise, found: tuple[tuple[int, ...], int], searched: Candidates, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], dict[int, str]]:
     """The ``found`` columns (and the first of a term) without terms and effects that are no better than the best of a placebo search beside
-    the others; and why these are none."""
+    the others; and why these are none. Columns of which the drive shows the sum alone are one group, for which k placebos count."""
     (chosen, f), refused = found, {}
-    y, base = noise.whiten(design.linear).reshape(-1, 1), noise.whiten(design.base).reshape(design.linear.size, -1)
-    columns = noise.whiten(design.columns[..., list(chosen)]).reshape(design.linear.size, -1)
+    y, base = noise.whiten(design.linear).ravel(), noise.whiten(design.base).reshape(design.linear.size, -1)
+    columns = {i: noise.whiten(design.columns[..., i]).ravel() for i in chosen}
     while any(i >= f for i in chosen):
-        p: dict[int, float] = {}
-        for i in chosen:
-            if i >= f:
-                others = columns[:, [j != i for j in chosen]]
-                real, placebos = placebo_statistics(y, np.concatenate([base, free(others)], axis=1), searched, rng)
-                p[i] = placebo_p(float(real[i - f, 0]), placebos[:, 0])
-        worst = max(p, key=lambda i: p[i])
+        p: dict[tuple[int, ...], float] = {}
+        for group in _inseparable(design.problem(noise), [i for i in chosen if i >= f]):
+            others = np.column_stack([np.zeros(len(y)), *(columns[j] for j in chosen if j not in group)])
+            beside = np.concatenate([base, free(others)], axis=1)
+            price = float(sum(searched.prices[i - f] for i in group))
+            real = joint_statistic(y, beside, np.column_stack([columns[i] for i in group]), price)
+            p[group] = placebo_p(real, len(group) * placebo_statistics(y[:, None], beside, searched, rng)[1][:, 0])
+        worst = max(p, key=lambda group: p[group])
         if p[worst] <= LEVEL:
             break
-        refused[worst] = f"placebo terms of this drive explain as much (p = {p[worst]:.2g} over the whole search)"
-        columns = columns[:, [j != worst for j in chosen]]
-        chosen = tuple(j for j in chosen if j != worst)
+        why = f"placebo terms of this drive explain as much (p = {p[worst]:.2g} over the whole search)"
+        refused |= dict.fromkeys(worst, why)
+        chosen = tuple(j for j in chosen if j not in worst)
     return chosen, refused
+
+
+def _inseparable(problem: Regressor, chosen: Sequence[int]) -> list[tuple[int, ...]]:
+    """The ``chosen`` columns in groups of those that correlate by more than `_ALIKE` beside all that is tolerated."""
+    groups: list[tuple[int, ...]] = []
+    for i in chosen:
+        G = problem.gram
+        near = [g for g in groups if any(abs(G[i, j]) > _ALIKE * math.sqrt(max(G[i, i] * G[j, j], 1e-18)) for j in g)]
+        groups = [g for g in groups if g not in near] + [(*(j for g in near for j in g), i)]
+    return groups
 
 
 def _with_clock_for_gains(

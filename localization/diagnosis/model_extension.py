@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from localization.diagnosis.bound_effects import BoundShape
 from localization.diagnosis.gate import HandoverCheck
+from localization.diagnosis.term_words import describe_memory, describe_parameter
 from motion_models.terms import Term
 
 _TWO_SIDED_95 = 1.96
@@ -171,9 +172,10 @@ def _rounded(values: Sequence[float], sigma: float) -> list[str]:
 
 
 def describe_term(term: Term) -> str:
-    """A term as an addition to its component, as ``vy is -0.12 (+- 0.01) m s x wz*abs(wz)``."""
+    """A term as an addition to its component, as ``vy is -0.12 (+- 0.01) m s x wz*abs(wz)``, with what it is in words."""
     unit = "" if term.unit == "1" else f" {term.unit}"
-    return f"{term.component} is {term.value:+.3g} (+- {term.sigma:.1g}){unit} x {term.expression}"
+    words = describe_parameter(term) or describe_memory(term.expression.factors)
+    return f"{term.component} is {term.value:+.3g} (+- {term.sigma:.1g}){unit} x {term.expression}{f' ({words})' if words else ''}"
 
 
 def describe_effect(effect: FoundEffect) -> str:

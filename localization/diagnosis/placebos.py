@@ -3,8 +3,9 @@
 The level of a search over many shapes, places and times is that of the same search with placebos. For terms, functions of the motion
 alone, what tolerances leave of the discrepancies is permuted in blocks of windows longer than the columns' correlation (Freedman & Lane
 1983). What modulates a motion (place, time, a wheel's angle, tilt) is shifted along the drive, while motion and discrepancies stay: errors
-of the model that follow the motion count as well. With the best statistic s of the search, and s_1 .. s_n of n placebo searches,
-p = (1 + #(s_i >= s)) / (n + 1) (Phipson & Smyth 2010).
+of the model that follow the motion count as well. A candidate that takes the squares R of N numbers to R' has the statistic
+N log(R / R') less its price: by the noise that is left beside it, as what is permuted contains the law that is tested. With the best
+statistic s of the search, and s_1 .. s_n of n placebo searches, p = (1 + #(s_i >= s)) / (n + 1) (Phipson & Smyth 2010).
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ _CORRELATED = 2.0
 _FREE = 1e6
 """Prior sigma of columns that may have any size, in whitened numbers."""
 _COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
+_LEAST_LEFT = 1e-9  # share of squares that a candidate leaves: rounding
 
 
 class Candidates(NamedTuple):
@@ -83,7 +85,7 @@ def placebo_statistics(
     """(K, r) twice the log-likelihood less its price that each candidate gains for each of the whitened discrepancies ``y`` (n, r), beside
     columns (n, b) times their prior sigmas; and (draws, r) the best of each placebo search."""
     windows, channels, _ = candidates.columns.shape
-    q = np.linalg.qr(np.vstack([beside, np.eye(beside.shape[1])]))[0][: len(beside)]
+    q = _basis(beside)
 
     def left_of(values: FloatArray) -> FloatArray:
         return np.asarray(values - q @ (q.T @ values))
@@ -95,22 +97,48 @@ def placebo_statistics(
         left = squares - np.sum((q.T @ T) ** 2, axis=0)
         return T * np.where(left > _COLLINEAR * np.maximum(squares, 1e-12), 1.0 / np.sqrt(np.maximum(left, 1e-12)), 0.0)
 
+    def of(columns: FloatArray, values: FloatArray, prices: FloatArray) -> FloatArray:
+        """(k, r) statistics of ``columns`` (n, k) for ``values`` (n, r)."""
+        left = left_of(values)
+        return _statistic((columns.T @ left) ** 2, np.sum(values * left, axis=0), count) - prices
+
     rest, length, is_modulated = left_of(y), block_length(candidates.columns), candidates.is_modulated
     whole, prices = usable(candidates.columns), candidates.prices[:, None]
+    count = np.count_nonzero(np.any(y, axis=1))
     terms, of_terms = whole[:, ~is_modulated], prices[~is_modulated]
     kept = (1.0 - np.sum(q**2, axis=1)).sum() / len(q)  # of the variance of white noise
     loose = (rest / np.sqrt(max(kept, 1e-3))).reshape(windows, channels, -1)
     found = np.full((draws, y.shape[1]), -np.inf)
     for draw in range(draws):
         if len(of_terms):
-            permuted = left_of(loose[permute_blocks(windows, length, rng)].reshape(rest.shape))
-            found[draw] = ((terms.T @ permuted) ** 2 - of_terms).max(axis=0)
+            permuted = loose[permute_blocks(windows, length, rng)].reshape(rest.shape)
+            found[draw] = of(terms, permuted, of_terms).max(axis=0)
         if is_modulated.any():
             shift = int(rng.integers(length, max(windows - length, length + 1)))
             moved = np.roll(candidates.modulators[:, is_modulated][:: rng.choice((-1, 1))], shift, axis=0)
             columns = usable(candidates.motions[..., is_modulated] * moved[:, None])
-            found[draw] = np.maximum(found[draw], ((columns.T @ rest) ** 2 - prices[is_modulated]).max(axis=0))
-    return (whole.T @ rest) ** 2 - prices, found
+            found[draw] = np.maximum(found[draw], of(columns, y, prices[is_modulated]).max(axis=0))
+    return of(whole, y, prices), found
+
+
+def joint_statistic(y: FloatArray, beside: FloatArray, columns: FloatArray, price: float) -> float:
+    """Statistic of ``columns`` (n, k) together, at this ``price`` of them all, for ``y`` (n,) beside columns (n, b) times their sigmas."""
+    q = _basis(beside)
+    rest, left = (values - q @ (q.T @ values) for values in (y, columns))
+    moment = columns.T @ rest
+    gain = float(moment @ np.linalg.lstsq(columns.T @ left, moment, rcond=_COLLINEAR**2)[0])
+    return float(_statistic(gain, float(y @ rest), np.count_nonzero(y))) - price
+
+
+def _statistic(gain: FloatArray | float, squares: FloatArray | float, count: int) -> FloatArray:
+    """``count`` log(R / R') where R, the ``squares``, falls by ``gain`` to R'."""
+    return np.asarray(-count * np.log(np.maximum(1.0 - gain / np.maximum(squares, 1e-12), _LEAST_LEFT)))
+
+
+def _basis(beside: FloatArray) -> FloatArray:
+    """(n, b) q with I - q q^T = (I + B B^T)^-1 for columns ``beside`` B (n, b) times their prior sigmas: y^T (I - q q^T) y are the squares
+    of y by the covariance of noise and tolerated sizes."""
+    return np.asarray(np.linalg.qr(np.vstack([beside, np.eye(beside.shape[1])]))[0][: len(beside)])
 
 
 def free(columns: FloatArray) -> FloatArray:

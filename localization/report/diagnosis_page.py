@@ -24,6 +24,7 @@ from localization.report import page as html
 from localization.report.diagnosis_charts import COMPONENTS, diagnosis_charts, motion_in_windows
 from localization.report.figures import Axes, svg
 from localization.report.figures import Figure as Canvas
+from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _MAX_PANELS = 4
@@ -56,6 +57,7 @@ def diagnosis_page(found: DiagnosisResult, is_interactive: bool = True) -> str:
     """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     d = found.diagnosis
     sections = [
+        html.Section("The drive", _drive(found)),
         html.Section("Findings", _findings(d)),
         html.Section("Terms", _terms(d.extension)),
         html.Section("Components", _components(d)),
@@ -93,6 +95,57 @@ def _figures(found: DiagnosisResult) -> list[html.Section]:
         caption = "Each finding beside all others; the line is its 95 % interval, by bootstrap over blocks of windows."
         sections.append(html.Section("Held-out gain", [html.Figure(_gain_svg(d), "Held-out gain of each finding", caption)]))
     return sections
+
+
+def _drive(found: DiagnosisResult) -> list[html.Block]:
+    """The measured path beside those by the model as it is and as it is corrected; nothing where poses were not measured along a drive."""
+    paths = _paths(found)
+    if paths is None:
+        return []
+    measured, before, after = paths
+    off = [float(np.hypot(*(path[-1] - measured[-1])[:2])) for path in (before, after)]
+    lines = [(measured, html.COLOURS["ink"], 2.5), (before, html.COLOURS["red"], 1.2)]
+    caption = f"Black: as measured, window after window; red: by the robot file, {off[0]:.2g} m off at the end"
+    d, extension = found.diagnosis, found.diagnosis.extension
+    has_terms = extension is not None and bool(extension.terms) and extension.is_better
+    if d.findings or has_terms:
+        how = "with the terms" if has_terms else "once the findings are corrected"
+        caption += f"; blue: {how}, {off[1]:.2g} m off"
+        lines.append((after, html.COLOURS["blue"], 1.2))
+
+    def draw(figure: Canvas) -> None:
+        axes = figure.add_subplot()
+        for path, colour, width in lines:
+            axes.plot(path[:, 0], path[:, 1], color=colour, linewidth=width)
+        axes.plot(*measured[0, :2], "o", color=html.COLOURS["ink"])
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xlabel="x [m]", ylabel="y [m]")
+
+    caption += "."
+    return [html.Figure(svg("paths", html.WIDTH_IN, 3.6, draw), "Measured path, and the model's before and after", caption)]
+
+
+def _paths(found: DiagnosisResult) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """(n, 3) poses from window to window: measured, by the robot file, and once corrected; None where these were not measured. Windows that
+    a gap cut off begin where the one before ended."""
+    if found.predictor is None or found.residuals is None:
+        return None
+    drive, batch, r = found.predictor.drive, found.predictor.batch, found.residuals
+    if drive.kind != "log" or not (drive.has_positions and drive.has_headings):
+        return None
+    last = np.flatnonzero(np.diff(batch.owner, append=-1))  # of several poses in a window
+    rows = np.stack([np.zeros_like(r.rows[last, :3]), r.rows[last, :3], r.left[last, :3]])
+    motions = batch.measured[last]
+    known = np.isfinite(rows).all(axis=(0, 2)) & np.isfinite(motions).all(axis=1)
+    if not known.any():
+        return None
+    found_paths = []
+    for off in rows[:, known]:
+        pose = [np.zeros(3)]
+        for step in se2.compose(motions[known], se2.inverse(off)):
+            pose.append(se2.compose(pose[-1], step))
+        found_paths.append(np.array(pose))
+    return found_paths[0], found_paths[1], found_paths[2]
 
 
 def _findings(d: Diagnosis) -> list[html.Block]:

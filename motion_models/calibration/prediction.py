@@ -14,11 +14,12 @@ from motion_models import se2
 from motion_models.calibration.chords import chord_jacobians, chord_poses
 from motion_models.calibration.maneuvers import Batch, IntArray
 from motion_models.compiled import kernel
-from motion_models.extended_model import SampleSeries, in_series
+from motion_models.extended_model import in_series
 from motion_models.motion import Twist
 from motion_models.preintegration import integrate, noise_vector
 from motion_models.robot import WheelNoise
 from motion_models.se2 import FloatArray
+from motion_models.term_memory import SampleSeries
 
 REFERENCE_PARAM_NAMES = ("wheel_time_offset", "wheel_lag", "lidar_offset_x", "lidar_offset_y", "lidar_yaw")
 """Nuisance parameters between wheels and motion reference, in the order of their vector (5,), all 0 by default:

@@ -61,7 +61,7 @@ def test_candidate_terms_have_at_most_four_powers_of_motions() -> None:
     assert {"v*abs(v)*wz", "v*wz*abs(wz)"} <= {str(c.expression) for c in candidates}
     values = {"cg_x": np.zeros(len(twist)), "cg_y": np.zeros(len(twist)), "t": np.ones(len(twist))}
     motions = {"v": twist[:, 0], "wz": twist[:, 2], "dv": twist[:, 0], "dwz": twist[:, 2]}
-    for candidate in candidates:
+    for candidate in (c for c in candidates if not any(f.form == "play" for f in c.expression.factors)):  # it is 0 for small motions
         small, large = (candidate.expression.evaluate(values | {n: s * m for n, m in motions.items()})[0] for s in (1.0, 10.0))
         assert np.all(np.abs(large) <= 1e4 * (1.0 + 1e-9) * np.abs(small)), str(candidate.expression)
 

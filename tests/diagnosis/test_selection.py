@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import binom, multivariate_normal
 
 from localization.diagnosis.causes import CAUSES
 from localization.diagnosis.drive_predictor import DrivePredictor
@@ -140,3 +140,17 @@ def test_simplest_set_of_equally_good_clocks_takes_that_of_a_reference() -> None
     predictor = cast(DrivePredictor, SimpleNamespace(has_baseline=False, drive=SimpleNamespace(is_lidar_reference=False)))
     for off in (-1e-9, 0.0, 1e-9):
         assert simplest_set([(-50.0, reference), (-50.0 + off, wheels)], 0.0, predictor) == reference
+
+
+def test_joint_p_of_healthy_robots_has_its_level() -> None:
+    """Of 400 robots off their files by what is tolerated, 5 % are below 5 %, within the 99.9 % interval."""
+    rng = np.random.default_rng(5)
+    p = np.array([made_up(WITHIN * rng.normal(size=len(USED)), rng).problem.joint_p((), np.zeros(0)) for _ in range(400)])
+    assert binom.ppf(0.0005, 400, 0.05) <= np.count_nonzero(p <= 0.05) <= binom.ppf(0.9995, 400, 0.05)
+
+
+def test_joint_p_of_sizes_that_are_each_tolerated_is_small() -> None:
+    """2.5 sigma of every cause at once, of which each by itself is a robot in eighty."""
+    problem = made_up(2.5 * WITHIN, np.random.default_rng(5)).problem
+    assert problem.joint_p((), np.zeros(0)) < 1e-3
+    assert problem.joint_p((0, 1, 2, 3), 2.5 * WITHIN) == 1.0  # nothing is left to be tolerated

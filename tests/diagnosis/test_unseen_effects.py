@@ -21,7 +21,6 @@ def test_extend_law_that_follows_time_is_not_written_as_a_law_of_motion(tmp_path
 
 
 @pytest.mark.extended
-@pytest.mark.xfail(reason="no file is written for it; which gate refuses it is open", strict=True)
 def test_extend_law_whose_size_is_alike_in_all_parts_is_written(tmp_path: Path) -> None:
     """wz = c min(v, 0) max(wz, 0) on a Warthog: each quarter shows 1.4 to 1.6 times what the terms change."""
     row = run(case_of(8, 22), 8, tmp_path)

@@ -390,3 +390,12 @@ def test_headline_denies_nothing_that_a_table_states(
     for item in () if d.extension is None else (*d.extension.terms, *d.extension.effects):
         assert (str(item.term.expression) if isinstance(item, FoundTerm) else item.shape.along) in text
     assert d.to_dict()["sentence"] == text
+
+
+def test_headline_of_much_within_tolerance_does_not_say_that_nothing_is_wrong() -> None:
+    healthy = dataclasses.replace(diagnosis((), (), {"yaw": row("within tolerance")}), verdict="consistent", joint_p=0.2)
+    assert healthy.sentence.startswith("Nothing beyond tolerances is wrong")
+    spread = dataclasses.replace(healthy, joint_p=1e-5)
+    assert "Nothing" not in spread.sentence
+    assert "--healthy" in spread.sentence
+    assert spread.to_dict()["within_tolerance_p"] == 1e-5

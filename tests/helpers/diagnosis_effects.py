@@ -33,6 +33,8 @@ class Motion(NamedTuple):
     xy: FloatArray
     angles: FloatArray
     """(N, 2) of the wheels [rad]."""
+    cg: FloatArray
+    """(N, 2) [m]."""
 
 
 Effect = Callable[[Motion], tuple[Any, Any, Any]]
@@ -61,6 +63,7 @@ def hide(drive: Drive, effect: Effect) -> Drive:
 def _motion(drive: Drive, twist: FloatArray, times_s: FloatArray) -> Motion:
     """Along the windows end to end, each from its start."""
     dt = np.concatenate([m.dt for m in drive.maneuvers])
+    cg = np.concatenate([np.broadcast_to(m.cg, (len(m.dt), 2)) for m in drive.maneuvers])
     wheels = np.concatenate([m.wheels for m in drive.maneuvers])
     owner = np.repeat(np.arange(len(drive.maneuvers)), [len(m.dt) for m in drive.maneuvers])
     rate = 1.0 / np.where(np.r_[True, owner[1:] != owner[:-1]], np.inf, dt)
@@ -73,7 +76,7 @@ def _motion(drive: Drive, twist: FloatArray, times_s: FloatArray) -> Motion:
         angles[i + m.lead : i + n] = angle + np.cumsum((wheels[i : i + n] * m.dt[:, None])[m.lead :], axis=0)
         pose, angle, i = se2.compose(pose, m.measured[-1]), angles[i + last - 1], i + n
     changes = (np.diff(x, prepend=x[:1]) * rate for x in (v, wz))
-    return Motion(v, wz, *changes, times_s, times_s / max(float(times_s.max()), 1e-9), poses, angles)
+    return Motion(v, wz, *changes, times_s, times_s / max(float(times_s.max()), 1e-9), poses, angles, cg)
 
 
 class ChangedLog:

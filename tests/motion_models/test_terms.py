@@ -7,16 +7,20 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from localization.events import WheelSample
+from localization.wheel_motion import WheelMotion
+from motion_models import se2
 from motion_models.calibration.fit import FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import RobotError
-from motion_models.extended_model import ExtendedModel, SampleSeries, in_series
+from motion_models.extended_model import ExtendedModel, in_series
 from motion_models.online_calibration import add_correction_parameters, make_corrections
 from motion_models.preintegration import preintegrate
 from motion_models.prior import prior_notes
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
 from motion_models.robot_file import load_robot, parse_robot, robot_toml
+from motion_models.term_memory import SampleSeries, respond
 from motion_models.terms import Term, parse_expression
 from tests.helpers.synthetic_steps import Noise, squared_errors
 
@@ -45,6 +49,9 @@ def husky(entry: str, model: str = "diff_drive") -> Robot:
         ("vx", "v*rise(t,1.2e+02)", "v*rise(t,120)", "1", True),
         ("wz", "max( wz, 0 )", "max(wz,0)", "1", False),
         ("vx", "abs(wz)*min(v,0)", "min(v,0)*abs(wz)", "s", True),
+        ("wz", "lag(wz, 0.40)", "lag(wz,0.4)", "1", True),
+        ("vx", "swing(v,0.8,0.2)", "swing(v,0.8,0.2)", "1", True),
+        ("vy", "play(wz,0.1)*abs(v)", "abs(v)*play(wz,0.1)", "s", True),
     ],
 )
 def test_expression_is_written_in_one_way_with_its_unit(component: str, text: str, written: str, unit: str, is_symmetric: bool) -> None:
@@ -82,6 +89,9 @@ def test_term_value_is_that_of_python() -> None:
         ('vy = {"wz^9" = 1}', "power 9 of wz"),
         ('vx = {"v*rise(v,20)" = 1}', "a rise is of t, with a time constant of 0.1 to 100000 s"),
         ('vx = {"v*rise(t,0)" = 1}', "a rise is of t"),
+        ('vx = {"lag(cg_x,0.5)" = 1}', "a lag is of a motion"),
+        ('vx = {"swing(v,0.5)" = 1}', "a frequency of 0.05 to 5 Hz and a damping ratio of 0.02 to 0.95, as swing.v,0.8,0.2."),
+        ('vx = {"lag(v,nan)" = 1}', "cannot read lag"),
         ('vy = {"wz" = [1, -1]}', "sigma not below 0"),
         ('vy = {"wz" = [nan, 1]}', "must be value"),
         ('vy = {"wz" = [1, 1, "m/s"]}', "the unit of 'wz' is 'm', found 'm/s'"),
@@ -119,6 +129,68 @@ def test_acceleration_term_moves_by_the_change_of_speed() -> None:
     alone = preintegrate(plain, dt, rates, CG, plain.nominal, WheelNoise()).delta
     assert moved[0] - alone[0] == pytest.approx(0.2 * 3.0 * HUSKY.geometry.wheel_radius_m)
     assert in_series(plain, series) is plain
+
+
+_STEP_S = 0.02
+
+
+def stepped(seconds: float = 12.0) -> tuple[np.ndarray, SampleSeries]:
+    """0 for a second, then 1."""
+    t = np.arange(0.0, seconds, _STEP_S)
+    return np.where(t >= 1.0, 1.0, 0.0), SampleSeries(np.full(len(t), _STEP_S), t)
+
+
+def test_lag_follows_a_step_exponentially() -> None:
+    x, series = stepped()
+    middle = series.t + 0.5 * _STEP_S - 1.0
+    expected = np.where(middle > 0.0, 1.0 - np.exp(-np.maximum(middle, 0.0) / 0.5), 0.0)
+    np.testing.assert_allclose(respond("lag", (0.5,), x, series), expected, atol=1e-12)
+
+
+def test_swing_overshoots_a_step_by_its_damping_and_fades() -> None:
+    x, series = stepped()
+    found = respond("swing", (0.6, 0.2), x, series)
+    assert found.max() == pytest.approx(np.exp(-np.pi * 0.2 / np.sqrt(1.0 - 0.2**2)), abs=1e-3)
+    assert abs(found[-1]) < 1e-3
+
+
+def test_play_stays_behind_by_its_width_and_keeps_its_side() -> None:
+    x = np.array([0.0, 0.2, 0.5, 0.4, 0.2, -0.2])
+    found = respond("play", (0.3,), x, SampleSeries(np.full(6, 0.1), 0.1 * np.arange(6)))
+    np.testing.assert_allclose(found, [0.0, 0.0, 0.2, 0.2, 0.2, 0.1])
+
+
+@pytest.mark.parametrize(("form", "constants"), [("lag", (0.5,)), ("swing", (0.6, 0.2))])
+def test_memory_of_windows_that_overlap_is_that_of_the_drive(form: str, constants: tuple[float, ...]) -> None:
+    x, series = stepped()
+    cut = np.r_[0:200, 180:400, 390:600]  # each window with samples before it
+    found = respond(form, constants, x[cut], SampleSeries(series.dt[cut], series.t[cut]))
+    np.testing.assert_allclose(found, respond(form, constants, x, series)[cut], atol=1e-12)
+
+
+def test_memory_of_a_window_without_a_time_begins_at_rest_there() -> None:
+    x, t = np.array([1.0, 1.0, 2.0, 2.0]), np.array([0.0, 0.1, 0.0, 0.1])
+    np.testing.assert_allclose(respond("lag", (0.5,), x, SampleSeries(np.full(4, 0.1), t)), x)
+
+
+def test_memory_is_the_same_in_steps_of_the_filter_and_in_one_prediction() -> None:
+    """Odometry, EKF and graph integrate from scan to scan, a diagnosis a whole window."""
+    robot = husky('wz = {"lag(wz,0.4)" = 0.2}\nvx = {"swing(v,0.8,0.3)" = -0.3}')
+    model = make_model("diff_drive", robot)
+    wheels, whole = WheelMotion(model, robot, 0.5, np.ones(3), has_slopes=False), np.zeros(3)
+    rates = np.array([[4.0 * np.sin(0.5 * i * 0.05), 3.0 if i > 30 else 0.0] for i in range(140)])
+    for i, rate in enumerate(np.vstack([rates[:1], rates])):
+        wheels.buffer.insert(WheelSample(round(i * 5e7), rate, np.full(2, np.nan)))
+    held = wheels.buffer.window(0, round(7e9), 0.5)
+    for start in range(7):
+        window = wheels.buffer.window(round(start * 1e9), round((start + 1) * 1e9), 0.5)
+        whole = se2.compose(whole, wheels.integrate(round(start * 1e9), window, None)[0].delta)
+    series = SampleSeries(held.dt, np.cumsum(held.dt) - held.dt)
+    at_once = preintegrate(in_series(model, series), held.dt, held.rates, held.cg, model.nominal, WheelNoise()).delta
+    without = make_model("diff_drive", HUSKY)
+    plain = preintegrate(without, held.dt, held.rates, held.cg, without.nominal, WheelNoise()).delta
+    np.testing.assert_allclose(whole, at_once, atol=1e-9)
+    assert np.abs(whole - plain).max() > 0.05
 
 
 def test_fit_recovers_a_term_with_its_sigma() -> None:

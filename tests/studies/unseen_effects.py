@@ -4,11 +4,12 @@ python -m tests.studies.unseen_effects --draw N [--cases A:B] [--folder FOLDER] 
 
 The number N of a draw determines robots, routes, sizes and expressions of its 40 cases; each draw is used once to measure, and may be
 developed on afterwards. Robots are off their files by what files are accurate to. Laws are products of shapes of speed, yaw rate, their
-changes, heading and time, of which half are not in the library of terms (saturation, dead zones, roots, one side only), and are drawn
-again where a single cause would explain 80 % of them. Scores: names printed first that are wrong, with and without `--extend`, and
-written; nulls that are not consistent; laws with a term of the right component and variable, or unexplained with such a trend; the share
-of a law that the written file removes on a fresh drive, of what the true law would remove, where that drive shows the law; and intervals
-of sizes that hold them. Causes count where the drive shows them to three sigma.
+changes, heading and time, of which half are not in the library of terms (saturation, dead zones, roots, one side only), from draw 40 on
+of the centre of gravity and with a memory as well (responses, hysteresis, reversals), and are drawn again where a single cause would
+explain 80 % of them. Scores: names printed first that are wrong, with and without `--extend`, and written; nulls that are not consistent;
+laws with a term of the right component and variable, or unexplained with such a trend; the share of a law that the written file removes on
+a fresh drive, of what the true law would remove, where that drive shows the law; and intervals of sizes that hold them. Causes count where
+the drive shows them to three sigma.
 """
 
 from __future__ import annotations
@@ -67,8 +68,10 @@ _STRONG_SIGMAS = 3.0
 _LEAST_SQUARES = 60.0
 """Least squares of a law over the reference's noise on its drive."""
 _MOST_BY_A_CAUSE = 0.8
-_IN_NO_FILE = ("heading", "sin(t/9)")
-"""In laws that no robot file holds: another drive begins at another heading, and after another time."""
+_IN_NO_FILE = ("heading", "sin(t/9)", "reversal")
+"""In laws that no robot file holds: another drive begins at another heading, and after another time; no term has a memory of reversals."""
+_FIRST_WITH_MEMORY = 40
+"""Draw from which on laws may have a memory, or follow the centre of gravity; those before are as they were run."""
 _TWO_SIDED_95 = 1.96
 _COMPONENTS = {"vx": "x", "vy": "y", "wz": "yaw"}
 _VARIABLES_OF_TRENDS = {
@@ -78,6 +81,8 @@ _VARIABLES_OF_TRENDS = {
     "dwz": ("gain in turning",),
     "heading": ("heading",),
     "t": ("time",),
+    "cg_x": ("cg_x", "CG"),
+    "cg_y": ("cg_y", "CG"),
 }
 _WORD = re.compile(r"[a-z_]+")
 
@@ -110,6 +115,65 @@ _OF_OTHERS: Mapping[str, Shape] = {
     "v*exp(-t/15)": lambda m: m.v * np.exp(-m.t / 15.0),
     "wz*t": lambda m: m.wz * m.share,
 }
+_WITH_MEMORY: Mapping[str, Shape] = {
+    "lag(wz,0.5)": lambda m: _respond(m, m.wz, math.inf, 0.5),
+    "lag(v,0.7)": lambda m: _respond(m, m.v, math.inf, 0.7),
+    "swing(v,0.6,0.2)": lambda m: _respond(m, m.v, 0.6, 0.2) - m.v,
+    "swing(wz,0.5,0.15)": lambda m: _respond(m, m.wz, 0.5, 0.15) - m.wz,
+    "play(wz,0.15)": lambda m: _play(m.wz, 0.15),
+    "play(v,0.2)": lambda m: _play(m.v, 0.2),
+    "v*reversal": lambda m: m.v * _since_reversal(m, 2.0),
+    "wz*reversal": lambda m: m.wz * _since_reversal(m, 1.5),
+}
+"""Responses of first and second order (time constant; frequency and damping), hysteresis, and what fades after each reversal."""
+_OF_POSTURE: Mapping[str, Shape] = {
+    "v*cg_y": lambda m: m.v * m.cg[:, 1],
+    "v*cg_x": lambda m: m.v * m.cg[:, 0],
+    "wz*cg_x": lambda m: m.wz * m.cg[:, 0],
+    "wz*cg_y": lambda m: m.wz * m.cg[:, 1],
+    "abs(wz)*cg_y": lambda m: np.abs(m.wz) * m.cg[:, 1],
+    "wz*abs(wz)*cg_x": lambda m: m.wz * np.abs(m.wz) * m.cg[:, 0],
+}
+
+
+def _steps(m: Motion) -> FloatArray:
+    """(N,) time from the sample before [s]; 0 where windows overlap."""
+    return np.asarray(np.maximum(np.diff(m.t, prepend=m.t[:1]), 0.0))
+
+
+def _respond(m: Motion, x: FloatArray, frequency_hz: float, constant: float) -> FloatArray:
+    """(N,) response to ``x`` (N,): of first order with the time ``constant`` [s], or at a finite frequency of second order, with it as the
+    damping ratio."""
+    found, y, rate = np.zeros_like(x), float(x[0]), 0.0
+    for i, dt in enumerate(_steps(m)):
+        if math.isinf(frequency_hz):
+            y += (x[i] - y) * (1.0 - math.exp(-dt / constant))
+        else:
+            omega, n = 2.0 * math.pi * frequency_hz, max(math.ceil(dt / 0.01), 1)
+            for _ in range(n):
+                rate += (omega**2 * (x[i] - y) - 2.0 * constant * omega * rate) * dt / n
+                y += rate * dt / n
+        found[i] = y
+    return found
+
+
+def _play(x: FloatArray, r: float) -> FloatArray:
+    """(N,) hysteresis: what follows ``x`` (N,) once it is farther off than ``r``."""
+    found, y = np.zeros_like(x), 0.0
+    for i, value in enumerate(x):
+        y = min(max(y, value - r), value + r)
+        found[i] = y
+    return found
+
+
+def _since_reversal(m: Motion, fades_s: float) -> FloatArray:
+    """(N,) 1 at each reversal of the speed, fading after it."""
+    found, y, side = np.zeros_like(m.v), 0.0, 0.0
+    for i, dt in enumerate(_steps(m)):
+        now = float(np.sign(m.v[i])) if abs(m.v[i]) > 0.02 else side
+        y = 1.0 if now * side < 0.0 else y * math.exp(-dt / fades_s)
+        found[i], side = y, now
+    return found
 
 
 def _heading(m: Motion) -> FloatArray:
@@ -183,7 +247,7 @@ def law_of(case: Case, draw: int, plain: Drive) -> Law:
     predictor = make_predictor(plain, make_model(default_model(plain.robot), plain.robot))
     first = linearize(predictor, candidate_causes(predictor, 0), {}, TOLERANCE)
     while True:
-        law = _drawn(rng)
+        law = _drawn(rng, draw >= _FIRST_WITH_MEMORY)
         scaled = law._replace(size=law.size * _unit_size(law, plain))
         rows = make_predictor(hide(plain, scaled), predictor.model).discrepancies(Hypothesis()) - predictor.discrepancies(Hypothesis())
         y = first.noise.whiten(rows).ravel()
@@ -194,11 +258,11 @@ def law_of(case: Case, draw: int, plain: Drive) -> Law:
             return scaled
 
 
-def _drawn(rng: np.random.Generator) -> Law:
+def _drawn(rng: np.random.Generator, has_memory: bool) -> Law:
     """A law of one shape, or of a product of two; its size is a share of the component's root mean square."""
     component = str(rng.choice(list(_COMPONENTS)))
-    kind = int(rng.integers(0, 4))
-    tables = ((_OF_SPEED,), (_OF_YAW_RATE,), (_OF_SPEED, _OF_YAW_RATE), (_OF_OTHERS,))[kind]
+    kinds = ((_OF_SPEED,), (_OF_YAW_RATE,), (_OF_SPEED, _OF_YAW_RATE), (_OF_OTHERS,), (_WITH_MEMORY,), (_OF_POSTURE,))
+    tables = kinds[int(rng.integers(0, len(kinds) if has_memory else 4))]
     texts = [str(rng.choice(list(table))) for table in tables]
     shapes = [table[text] for table, text in zip(tables, texts, strict=True)]
     size = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 0.12))
