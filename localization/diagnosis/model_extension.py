@@ -80,12 +80,13 @@ class Extension:
     def describe_terms(self) -> str:
         """The terms and their gain, as a sentence without a stop."""
         parts = [describe_term(t.term) for t in self.terms]
-        known = "no physical cause known"
+        known = [] if all(describe_parameter(t.term) for t in self.terms) else ["no physical cause known"]
         if self.replaced:
-            known += f"; it explains the drive better than {' and '.join(self.replaced)}"
+            known.append(f"it explains the drive better than {' and '.join(self.replaced)}")
         if any("t" in t.term.expression.variables for t in self.terms):
-            known += "; t counts from the start of each drive, so that it holds for drives that start as this one did"
-        text = f"{', and '.join(parts)} beyond {self.model} ({known}); "
+            known.append("t counts from the start of each drive, so that it holds for drives that start as this one did")
+        beside = f" ({'; '.join(known)})" if known else ""
+        text = f"{', and '.join(parts)} beyond {self.model}{beside}; "
         if self.refusal:
             return f"{text}{self.refusal}, so that it is not written"
         if self.check is None:

@@ -104,7 +104,7 @@ def placebo_statistics(
 
     rest, length, is_modulated = left_of(y), block_length(candidates.columns), candidates.is_modulated
     whole, prices = usable(candidates.columns), candidates.prices[:, None]
-    count = np.count_nonzero(np.any(y, axis=1))
+    count = int(np.count_nonzero(np.any(y, axis=1)))
     terms, of_terms = whole[:, ~is_modulated], prices[~is_modulated]
     kept = (1.0 - np.sum(q**2, axis=1)).sum() / len(q)  # of the variance of white noise
     loose = (rest / np.sqrt(max(kept, 1e-3))).reshape(windows, channels, -1)
@@ -127,7 +127,7 @@ def joint_statistic(y: FloatArray, beside: FloatArray, columns: FloatArray, pric
     rest, left = (values - q @ (q.T @ values) for values in (y, columns))
     moment = columns.T @ rest
     gain = float(moment @ np.linalg.lstsq(columns.T @ left, moment, rcond=_COLLINEAR**2)[0])
-    return float(_statistic(gain, float(y @ rest), np.count_nonzero(y))) - price
+    return float(_statistic(gain, float(y @ rest), int(np.count_nonzero(y)))) - price
 
 
 def _statistic(gain: FloatArray | float, squares: FloatArray | float, count: int) -> FloatArray:

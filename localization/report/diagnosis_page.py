@@ -31,7 +31,7 @@ _MAX_PANELS = 4
 _VERDICTS = {
     "consistent": "No discrepancy exceeds noise and tolerances; the table shows each component.",
     "explained": "Each discrepancy that exceeds its noise has a cause with a name.",
-    "extended": "With terms that no physical cause is known for, each discrepancy is explained; RMS is that of the model without them.",
+    "extended": "With the terms each discrepancy is explained; RMS is that of the model without them.",
     "ambiguous": "The discrepancies are explained, but by more than one cause; this drive cannot separate them.",
     "unexplained": "The discrepancies have a part that no cause explains.",
     "undecidable": "This drive cannot show whether the model is right.",
@@ -103,9 +103,9 @@ def _drive(found: DiagnosisResult) -> list[html.Block]:
     if paths is None:
         return []
     measured, before, after = paths
-    off = [float(np.hypot(*(path[-1] - measured[-1])[:2])) for path in (before, after)]
+    off = [float(np.sqrt(np.mean(np.sum((path - measured)[:, :2] ** 2, axis=1)))) for path in (before, after)]
     lines = [(measured, html.COLOURS["ink"], 2.5), (before, html.COLOURS["red"], 1.2)]
-    caption = f"Black: as measured, window after window; red: by the robot file, {off[0]:.2g} m off at the end"
+    caption = f"Black: as measured, window after window; red: by the robot file, {off[0]:.2g} m off (root mean square)"
     d, extension = found.diagnosis, found.diagnosis.extension
     has_terms = extension is not None and bool(extension.terms) and extension.is_better
     if d.findings or has_terms:
