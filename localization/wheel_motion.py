@@ -47,7 +47,11 @@ class WheelMotion:
         dt, rates, cg = window.dt, window.rates, window.cg
         if not len(dt):
             return Motion(np.zeros(3), np.zeros((3, 3)), np.zeros((3, len(self.params)))), np.zeros(3), np.zeros(3)
-        ago, before, before_cg = self._before(start_ns)
+        before, before_cg = self.buffer.at(start_ns - 1, self._max_hold_s)
+        ago = np.zeros(len(before))
+        if self._horizon_ns:  # samples within the memory of the model's terms
+            past = self.buffer.window(start_ns - self._horizon_ns, start_ns, self._max_hold_s)
+            ago, before, before_cg = (past.dt, past.rates, past.cg) if len(past.dt) else (ago, before, before_cg)
         n = len(ago)
         rates, cg = np.vstack([before, rates]), np.vstack([before_cg, cg])
         model = self.model
@@ -63,13 +67,3 @@ class WheelMotion:
         motion = replace(motion, cov=motion.cov + self._within.add(window, twist.value[n:]))
         first, last = twist.value[max(n - 1, 0)], twist.value[-1]
         return motion, last - se2.adjoint(se2.inverse(motion.delta)) @ first, last
-
-    def _before(self, start_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Lengths (n,) [s], rates (n, 2) and CG (n, 2) of the samples before ``start_ns`` that the step depends on: the last one, which has
-        no length here, or all within the memory of the model's terms."""
-        if self._horizon_ns:
-            past = self.buffer.window(start_ns - self._horizon_ns, start_ns, self._max_hold_s)
-            if len(past.dt):
-                return past.dt, past.rates, past.cg
-        rates, cg = self.buffer.at(start_ns - 1, self._max_hold_s)
-        return np.zeros(len(rates)), rates, cg

@@ -101,7 +101,7 @@ class Factor(NamedTuple):
     """Empty, abs, sign, max, min, rise, lag, swing or play."""
     power: int
     constants: tuple[float, ...] = ()
-    """Of a rise, or of what has a memory."""
+    """Constants of a rise, or of what has a memory."""
 
     @property
     def has_memory(self) -> bool:

@@ -418,7 +418,7 @@ def _beyond_placebos(
 ) -> tuple[tuple[int, ...], dict[int, str]]:
     """The ``found`` columns (and the first of a term) without terms and effects that are no better than the best of a placebo search beside
     the others; and why these are none. Columns of which the drive shows the sum alone are one group, for which k placebos count."""
-    (chosen, f), refused = found, {}
+    (chosen, f), refused = found, {}  # type: tuple[tuple[int, ...], int], dict[int, str]
     y, base = noise.whiten(design.linear).ravel(), noise.whiten(design.base).reshape(design.linear.size, -1)
     columns = {i: noise.whiten(design.columns[..., i]).ravel() for i in chosen}
     while any(i >= f for i in chosen):
