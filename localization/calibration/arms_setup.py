@@ -93,10 +93,12 @@ def add_arms(robot: Robot, text: str, base_link: str, survey: Survey, log: Path,
         draft.reasons.append(_describe(arm, in_log))
     absent = [joint for arm in movable for joint in arm.joints if joint not in in_log]
     if absent:
-        have = [name for names_of in survey.joint_names.values() for name in names_of if _is_arm_joint(name)]
+        known = {*in_log.values()}
+        have = [name for names_of in survey.joint_names.values() for name in names_of if _is_arm_joint(name) and name not in known]
+        others = f" Joints of the log that the URDF does not have: {first_names(have)}." if have else ""
         draft.missing.append(
-            f"arms: the log has no positions of {first_names(absent)}, which are taken to stand at 0. Joints in it that are no wheels: "
-            f"{first_names(have) or 'none'}. Publish them in /joint_states by the URDF's names."
+            f"arms: the log has no positions of {first_names(absent)}, which are taken to stand at 0.{others} "
+            "Publish them in /joint_states by the URDF's names."
         )
     middle = (0.0, 0.0) if geometry is None or not geometry.positions else geometry.middle
     draft.urdf = write_urdf(urdf, base_link, middle, in_log, wheels)
@@ -220,7 +222,8 @@ def _show_range(draft: ArmsDraft, table: Arms, survey: Survey, log: Path) -> Non
         geometry = dataclasses.replace(g, mass_kg=model.mass, cg_x_m=round(float(cg[0]), 5), cg_y_m=round(float(cg[1]), 5))
         robot = dataclasses.replace(robot, geometry=geometry)
     draft.robot = dataclasses.replace(robot, arms=table)
-    draft.reasons.append(describe_range(draft.robot, cgs[inside] if inside.any() else cgs, where))
+    if inside.any():
+        draft.reasons.append(describe_range(draft.robot, cgs[inside], where))
 
 
 def describe_range(robot: Robot, cgs: FloatArray, where: str) -> str:

@@ -23,6 +23,7 @@ from localization.commands.common import add_row, plain_table, print_line, print
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.center_of_gravity.urdf import body_link, parse_urdf, read_urdf
+from motion_models.center_of_gravity.urdf_wheels import FORWARD, with_forward_base
 from motion_models.center_of_gravity.xacro_files import expand_xacro, is_xacro
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
@@ -110,6 +111,11 @@ class Init:
             answered = _ask(console, survey, draft, given)
             draft = draft if answered == given else draft_robot(survey, answered, self.log)
             given = answered
+        if given.base_link == FORWARD:
+            draft.missing.append(
+                "body frame: the URDF's wheels roll along the y axis of its base link. Lengths, centre of gravity and arms are written "
+                "for x forward (REP 103); mounts of /tf_static keep the URDF's axes, which `skidloc check` compares."
+            )
         for reason in draft.reasons:
             print_line(console, f"  {reason}")
         for gap in draft.missing:
@@ -173,9 +179,15 @@ class Init:
     def _arms(self, robot: Robot, survey: Survey) -> ArmsDraft:
         if self.urdf is None:
             return ArmsDraft(robot)
-        return add_arms(robot, self._text, self._base, survey, self.log, self._arms_file().name, self.mass_kg)
+        text, base = self._description
+        return add_arms(robot, text, base, survey, self.log, self._arms_file().name, self.mass_kg)
 
     @cached_property
+    def _description(self) -> tuple[str, str]:
+        """The URDF's text and its link of the body frame, x forward."""
+        text, source = self._text(), str(self.urdf)
+        return with_forward_base(text, source, self.base_link or body_link(parse_urdf(text, source)))
+
     def _text(self) -> str:
         """The URDF's text, expanded where it is a xacro file."""
         assert self.urdf is not None
@@ -187,11 +199,6 @@ class Init:
                 raise RobotError(f"--package {name}={folder}: there is no such folder.")
         return expand_xacro(self.urdf, packages, _pairs(self.xacro_arg, "--xacro-arg"))
 
-    @cached_property
-    def _base(self) -> str:
-        """Link of the body frame."""
-        return self.base_link or body_link(parse_urdf(self._text, str(self.urdf)))
-
     def _given(self) -> Given:
         left, right = (tuple(n.strip() for n in text.split(",") if n.strip()) for text in (self.left, self.right))
         if bool(left) != bool(right):
@@ -202,6 +209,7 @@ class Init:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise RobotError(f"--{name.replace('_', '-')} is {value:g}; it must be {low:g} to {high:g}.")
+        text, base = (None, "base_link") if self.urdf is None else self._description
         return Given(
             self.name,
             self.drive,
@@ -213,11 +221,11 @@ class Init:
             self.mass_kg,
             self.wheel_separation_multiplier,
             self.urdf,
-            "base_link" if self.urdf is None else self._base,
+            base,
             None if self.like is None else load_robot(self.like),
             self.topic,
             self.controller,
-            None if self.urdf is None else self._text,
+            text,
         )
 
 

@@ -32,6 +32,8 @@ from motion_models.center_of_gravity.urdf import Joint, Urdf, first_names, link_
 from motion_models.errors import RobotError
 from motion_models.se2 import FloatArray
 
+FORWARD = "skidloc_forward"
+"""Link that `with_forward_base` adds: the body frame with x forward."""
 _WHEEL = re.compile(r"wheel|tire|tyre|whl|sprocket", re.IGNORECASE)
 _CASTER = re.compile(r"caster|castor|swivel|ball_?wheel", re.IGNORECASE)
 _STEER = re.compile(r"(?<!skid)(?<!skid[_\-])steer", re.IGNORECASE)
@@ -159,6 +161,29 @@ def sides(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     wheels = [name for name in names if is_wheel(name)]
     left = tuple(name for name in wheels if _LEFT.search(name) and not re.search("right", name, re.IGNORECASE))
     return left, tuple(name for name in wheels if name not in left and _RIGHT.search(name))
+
+
+def with_forward_base(text: str, source: str, base_link: str) -> tuple[str, str]:
+    """Text and body link of a URDF whose body frame has x forward (REP 103): as given, or with one more link `FORWARD` turned by 90 degrees.
+
+    Wheels roll across their axes: along y where all axes lie along x, and the joints' names have left and right apart along x as well.
+    Raises `RobotError` for a text that is no URDF, and a missing ``base_link``.
+    """
+    urdf, root = parse_urdf(text, source), urdf_root(text, source)
+    driven = _Finder(urdf, link_poses(urdf, base_link), round_shapes(text, source)).find(velocity_joints(root)).driven
+    left, right = sides([wheel.name for wheel in driven])
+    if not (left and right and all(abs(wheel.axis[0]) > _ALONG for wheel in driven)):
+        return text, base_link
+    places = {wheel.name: wheel.position[:2] for wheel in driven}
+    to_left = np.mean([places[name] for name in left], axis=0) - np.mean([places[name] for name in right], axis=0)
+    if abs(to_left[0]) <= abs(to_left[1]):
+        return text, base_link
+    turned = ET.SubElement(root, "joint", name=f"{FORWARD}_joint", type="fixed")
+    ET.SubElement(turned, "parent", link=base_link)
+    ET.SubElement(turned, "child", link=FORWARD)
+    ET.SubElement(turned, "origin", rpy=f"0 0 {-math.copysign(math.pi / 2.0, to_left[0])!r}")
+    ET.SubElement(root, "link", name=FORWARD)
+    return ET.tostring(root, encoding="unicode"), FORWARD
 
 
 def wheel_geometry(text: str, source: str, base_link: str = "base_link") -> WheelGeometry:
