@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import importlib
 import io
 import os
@@ -17,10 +16,10 @@ from importlib.metadata import version
 from typing import Any
 
 from localization.blas_threads import use_one_blas_thread
+from localization.commands.arguments import bash_completion, check_arguments
 from localization.commands.common import PlainConsole
 from localization.commands.short_help import short_help
-from localization.errors import LogError
-from motion_models.errors import SkidlocError
+from motion_models.errors import SkidlocError, no_such
 
 _BAD_INPUT = 2
 _DEFECT = 70
@@ -57,8 +56,6 @@ def module_of(command: str) -> str:
     return command.replace("-", "_")
 
 
-_OF_LOGS = ("try", "info", "replay", "calibrate", "diagnose", "weigh", "init", "check")
-"""Commands whose first argument is a log."""
 USAGE = "usage: skidloc COMMAND [OPTIONS]"
 
 
@@ -75,6 +72,7 @@ def overview() -> str:
             *lines,
             "",
             "`skidloc COMMAND --help` describes the options of a command, `--help-all` all of its settings as well.",
+            "`source <(skidloc --completion)` completes commands, options and robots in bash.",
         ]
     )
 
@@ -90,6 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(overview())
         elif given == ["--version"]:
             print(f"skidloc {version('skidloc')}")
+        elif given == ["--completion"]:
+            print(bash_completion(COMMANDS))
         elif not given or given[0] not in COMMANDS:
             errors.print(f"skidloc: {_unknown(given)}", markup=False)
             return _BAD_INPUT
@@ -153,9 +153,7 @@ def _unknown(given: Sequence[str]) -> str:
     """What is wrong with a first argument that names no command."""
     if not given:
         return f"a command is missing: {', '.join(COMMANDS)}. `skidloc --help` describes them."
-    nearest = difflib.get_close_matches(given[0], COMMANDS, n=1)
-    hint = f"did you mean '{nearest[0]}'?" if nearest else f"there are {', '.join(COMMANDS)}."
-    return f"no command '{given[0]}'; {hint}"
+    return no_such("command", given[0], [*COMMANDS])
 
 
 def _run(name: str, options: Sequence[str]) -> None:
@@ -163,16 +161,8 @@ def _run(name: str, options: Sequence[str]) -> None:
     if text is not None:
         print(text)
         return
-    _require_log(name, options)
+    check_arguments(name, COMMANDS[name][0], options)
     parse(name, options).run(PlainConsole(highlight=False))
-
-
-def _require_log(name: str, options: Sequence[str]) -> None:
-    """Raise `LogError` for a log that is not there before anything heavy is imported."""
-    if name not in _OF_LOGS or not options or options[0].startswith("-") or options[0].lower().endswith(".csv"):
-        return
-    if not os.path.exists(options[0]):
-        raise LogError(f"no log '{options[0]}': there is no such file or folder.")
 
 
 def parse(name: str, options: Sequence[str]) -> Any:

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from motion_models.prior import SkidPrior, geometric_scaling, prior_notes, skid_prior
     from motion_models.registry import MODELS, make_model
     from motion_models.robot import Robot
-    from motion_models.robot_file import load_robot, parse_robot, robot_names, robot_toml
+    from motion_models.robot_file import load_robot, parse_robot, robot_toml
+    from motion_models.robot_names import robot_names
     from motion_models.skid_steer import SkidSteer, thesis_coefficients
     from motion_models.slope import Slope, SlopeTwist
 
@@ -140,7 +141,8 @@ _MODULES = {
     "motion_models.prior": "SkidPrior geometric_scaling prior_notes skid_prior",
     "motion_models.registry": "MODELS make_model",
     "motion_models.robot": "Robot",
-    "motion_models.robot_file": "load_robot parse_robot robot_names robot_toml",
+    "motion_models.robot_file": "load_robot parse_robot robot_toml",
+    "motion_models.robot_names": "robot_names",
     "motion_models.skid_steer": "SkidSteer thesis_coefficients",
     "motion_models.slope": "Slope SlopeTwist",
 }

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from typing import Any, cast
 
 from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
-from motion_models.errors import ModelError
+from motion_models.errors import ModelError, no_such
 from motion_models.extended_model import ExtendedModel
 from motion_models.friction import FrictionModel
 from motion_models.full_linear import FullLinear
@@ -48,9 +47,7 @@ def make_model(name: str, robot: Robot) -> MotionModel:
     turns at 0.896 rad/s about a point 0.154 m ahead
     """
     if name not in MODELS:
-        near = difflib.get_close_matches(name, MODELS, n=1)
-        meant = f"did you mean '{near[0]}'? There" if near else "there"
-        raise ModelError(f"no motion model '{name}'; {meant} are {', '.join(MODELS)}.")
+        raise ModelError(no_such("motion model", name, [*MODELS]))
     g = robot.geometry
     lengths = Lengths(g.wheel_radius_m, g.track_width_m, g.wheelbase_m)
     model = cast(MotionModel, dataclasses.replace(cast(Any, MODELS[name].from_robot(robot)), lengths=lengths))

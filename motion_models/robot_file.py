@@ -24,6 +24,7 @@ from motion_models.errors import RobotError
 from motion_models.input_files import read_text
 from motion_models.registry import MODELS, params_of, traits_of
 from motion_models.robot import DRIVES, Clock, Driver, Geometry, GyroNoise, Imu, Joints, Lidar, Mount, Robot, Tf, Topics, WheelNoise
+from motion_models.robot_names import check_robot_name
 from motion_models.terms import VARIABLES, parse_terms, terms_table
 
 Section = TypeVar("Section")
@@ -73,11 +74,6 @@ _TERMS_TEXT = (
 )
 
 
-def robot_names() -> list[str]:
-    """Names of the robots that are shipped."""
-    return sorted(f.name.removesuffix(".toml") for f in (resources.files(__package__) / "robots").iterdir() if f.name.endswith(".toml"))
-
-
 def load_robot(robot: str | Path) -> Robot:
     """The robot of a shipped name (`robot_names`) or of a path to a TOML file. Raises `RobotError`.
 
@@ -94,15 +90,7 @@ def load_robot(robot: str | Path) -> Robot:
         except UnicodeDecodeError as error:
             raise RobotError(f"robot file '{path}' is not text (byte {error.start} is not UTF-8).") from error
         return parse_robot(text, source=str(path), folder=path.parent.absolute())
-    if path.suffix in (".urdf", ".xacro", ".yaml", ".yml", ".json"):
-        raise RobotError(
-            f"'{path}' is no robot file (.toml): `skidloc init LOG --urdf ROBOT.urdf --controller CONTROL.yaml --out robot.toml` writes one"
-            " of a URDF and a controller's YAML."
-        )
-    if str(robot) not in robot_names():
-        near = difflib.get_close_matches(str(robot), robot_names(), n=1)
-        meant = f"did you mean '{near[0]}'? Shipped" if near else "shipped"
-        raise RobotError(f"no robot '{robot}'; {meant} are {', '.join(robot_names())}. Name one of them or a path to a .toml file.")
+    check_robot_name(str(robot))
     text = (resources.files(__package__) / "robots" / f"{robot}.toml").read_text(encoding="utf-8")
     return parse_robot(text, source=f"{robot}.toml")
 

@@ -5,10 +5,12 @@ import importlib
 import importlib.metadata
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from localization.cli import COMMANDS, main, module_of
+from localization.commands.arguments import bash_completion
 from localization.commands.short_help import short_help
 
 HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "tyro")
@@ -85,3 +87,33 @@ def test_robot_and_model_with_a_slip_of_the_pen_are_refused_with_the_nearest(cap
     assert main(["robots", "vaultbot"]) == 0
     assert main(["cg", "--robot", "vaultbt", "--posture", "ready"]) == 2
     assert "did you mean 'vaultbot'?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (("init", "drive", "robot.toml"), "init needs --out ROBOT.toml: Robot file to write"),
+        (("replay", "drive", "--robt", "jackal"), "did you mean '--robot'?"),
+        (("replay", "drive", "--robot", "jackel", "--out", "x"), "no robot 'jackel'; did you mean 'jackal'?"),
+        (("rplay", "drive"), "no command 'rplay'; did you mean 'replay'?"),
+    ],
+)
+def test_wrong_arguments_are_named_without_heavy_imports(given: tuple[str, ...], expected: str, tmp_path: Path) -> None:
+    (tmp_path / "drive").mkdir()
+    code = "import sys; from localization.cli import main; c = main(sys.argv[1:]); print(c, 'numpy' in sys.modules, 'tyro' in sys.modules)"
+    shown = subprocess.run([sys.executable, "-c", code, *given], capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert expected in shown.stderr
+    assert shown.stdout.split() == ["2", "False", "False"]
+
+
+def test_completion_has_commands_options_and_robots(tmp_path: Path) -> None:
+    (tmp_path / "completion.sh").write_text(bash_completion(COMMANDS))
+    script = "source completion.sh; COMP_WORDS=({}); COMP_CWORD={}; _skidloc; echo ${{COMPREPLY[@]}}"
+    for words, expected in (
+        ("skidloc repl", "replay"),
+        ("skidloc init x --contr", "--controller"),
+        ("skidloc info x --robot jack", "jackal"),
+    ):
+        command = script.format(words, len(words.split()) - 1)
+        shown = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=tmp_path, check=True)
+        assert shown.stdout.strip() == expected

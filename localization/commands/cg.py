@@ -18,7 +18,7 @@ from motion_models.center_of_gravity.files import arms_model, arms_postures, wei
 from motion_models.center_of_gravity.parts import Arms, CgEstimate, Payload, StaticPart, require_support
 from motion_models.center_of_gravity.urdf_wheels import wheel_geometry
 from motion_models.center_of_gravity.weighing import WHEELS, WeighedCg, read_weighings
-from motion_models.errors import CgError, RobotError
+from motion_models.errors import CgError, RobotError, no_such
 from motion_models.friction import FrictionModel
 from motion_models.friction.contact import loads
 from motion_models.input_files import read_text
@@ -215,7 +215,7 @@ def _off_middle(urdf: Path, base_link: str) -> float:
 
 def _named(postures: dict[str, Posture], name: str) -> Posture:
     if name not in postures:
-        raise CgError(f"no posture '{name}'; postures are {', '.join(postures) or 'none'}.")
+        raise CgError(no_such("posture", name, [*postures]))
     return postures[name]
 
 

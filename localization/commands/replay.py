@@ -112,6 +112,10 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json, self.save_map, self.extend_map)
+        for name in names(self.model, "--model"):
+            make_model(name, robot)
+        for name in names(self.estimator, "--estimator"):
+            check_estimator(name, has_lidar=True, has_map=True)
         log = open_log_with_set_up(self.log, robot, self.topic.scored_against(self.reference)).log
         robot, mounts = log.robot, log.mounts
         has_lidar = log.sources.lidar is not None

@@ -12,10 +12,11 @@ from rich.console import Console
 
 from localization.commands.common import add_row, plain_table, print_line, print_table, write_json
 from localization.output import check_outputs
-from motion_models.errors import RobotError
+from motion_models.errors import RobotError, no_such
 from motion_models.prior import scaling_sigma
 from motion_models.robot import DIFF_DRIVE, Robot
-from motion_models.robot_file import load_robot, robot_names
+from motion_models.robot_file import load_robot
+from motion_models.robot_names import robot_names
 from motion_models.skid_steer import SkidSteer
 
 
@@ -33,7 +34,7 @@ class Robots:
         check_outputs(self.json)
         if self.name:
             if self.name not in robot_names():
-                raise RobotError(f"no robot '{self.name}'; shipped are {', '.join(robot_names())}.")
+                raise RobotError(no_such("robot", self.name, robot_names()))
             print_line(console, (resources.files("motion_models") / "robots" / f"{self.name}.toml").read_text(encoding="utf-8"))
             return
         found = [summary(load_robot(name)) for name in robot_names()]

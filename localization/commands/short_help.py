@@ -23,6 +23,9 @@ class Option:
     is_positional: bool
     is_group: bool
     """Whether it is a dataclass of settings, which only the long help lists."""
+    metavar: str
+    aliases: tuple[str, ...]
+    """Other names of the option."""
 
     @property
     def flag(self) -> str:
@@ -30,12 +33,18 @@ class Option:
         return self.name.upper() if self.is_positional else "--" + self.name.replace("_", "-")
 
 
+def options_of(command: str, class_name: str) -> list[Option] | None:
+    """Options of a command; None where it has subcommands."""
+    options = _class(f"localization.commands.{command.replace('-', '_')}", class_name)[1]
+    return None if any(option.name == "action" for option in options) else options
+
+
 def short_help(command: str, class_name: str) -> str | None:
     """Text for ``skidloc command --help``; None where the command has subcommands."""
     found, options = _class(f"localization.commands.{command.replace('-', '_')}", class_name)
     if any(option.name == "action" for option in options):
         return None
-    required = [o.flag if o.is_positional else f"{o.flag} {o.name.upper()}" for o in options if o.is_required]
+    required = [o.flag if o.is_positional else f"{o.flag} {o.metavar}" for o in options if o.is_required]
     lines = [f"usage: skidloc {command} {' '.join(required)} [OPTIONS]", "", ast.get_docstring(found) or "", ""]
     for option in options:
         if option.is_group:
@@ -77,6 +86,19 @@ def _options(node: ast.ClassDef) -> list[Option]:
                     value is None,
                     "Positional" in ast.unparse(field.annotation),
                     value is not None and "default_factory" in ast.unparse(value),
+                    *_of_annotation(field.annotation, field.target.id),
                 )
             )
     return found
+
+
+def _of_annotation(annotation: ast.expr, name: str) -> tuple[str, tuple[str, ...]]:
+    """Placeholder of the value and aliases of an option, as `tyro.conf.arg` has them."""
+    given = {
+        k.arg: ast.literal_eval(k.value)
+        for node in ast.walk(annotation)
+        if isinstance(node, ast.Call)
+        for k in node.keywords
+        if k.arg != "help"
+    }
+    return str(given.get("metavar", name.upper())), tuple(given.get("aliases", ()))

@@ -24,6 +24,7 @@ from localization.lidar import LidarConfig, ScanMatchingSensor
 from localization.maps import KeyframeMap, SpaceMap
 from localization.maps.space_places import SpacePlaces
 from motion_models.base import MotionModel
+from motion_models.errors import no_such
 from motion_models.online_calibration import Form, make_corrections
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import Pose2
@@ -84,7 +85,7 @@ def check_estimator(name: str, has_lidar: bool, has_map: bool = False, no_wheels
     if name == LOCALIZER and not has_map:
         raise EstimatorError(f"the estimator '{LOCALIZER}' needs a saved map. Name one by --map, or use graph.")
     if name not in (*ESTIMATORS, LOCALIZER):
-        raise EstimatorError(f"no estimator '{name}'; there are {', '.join(ESTIMATORS)}.")
+        raise EstimatorError(no_such("estimator", name, ESTIMATORS))
     if name in ("lidar", LOCALIZER) and not has_lidar:
         raise EstimatorError(
             f"the estimator '{name}' needs scans, and there are none in this log. Use odometry, ekf or graph, or pass --topic.scan."

@@ -12,7 +12,7 @@ from motion_models.center_of_gravity.cg_model import CgModel, Posture, cg_model,
 from motion_models.center_of_gravity.parts import TYPICAL, Arms, CgEstimate, Payload, StaticPart, Tolerances, require_support
 from motion_models.center_of_gravity.urdf import Urdf, load_urdf, parse_urdf
 from motion_models.center_of_gravity.weighing import Scales, WeighedCg, cg_from_scales, read_weighings, wheel_contacts
-from motion_models.errors import CgError, RobotError
+from motion_models.errors import CgError, RobotError, no_such
 from motion_models.input_files import read_text
 
 
@@ -110,5 +110,5 @@ def _text(name: str, folder: Path | None) -> str:
 
 def _named(postures: Mapping[str, Posture], name: str) -> Posture:
     if name not in postures:
-        raise CgError(f"no posture '{name}'; postures are {', '.join(postures) or 'none'}.")
+        raise CgError(no_such("posture", name, [*postures]))
     return postures[name]

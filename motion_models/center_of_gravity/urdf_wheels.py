@@ -164,7 +164,7 @@ def sides(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def with_forward_base(text: str, source: str, base_link: str) -> tuple[str, str]:
-    """Text and body link of a URDF whose body frame has x forward (REP 103): as given, or with one more link `FORWARD` turned by 90 degrees.
+    """Text and body link of a URDF whose body frame has x forward (REP 103): as given, or with a link `FORWARD` that is turned by 90 deg.
 
     Wheels roll across their axes: along y where all axes lie along x, and the joints' names have left and right apart along x as well.
     Raises `RobotError` for a text that is no URDF, and a missing ``base_link``.

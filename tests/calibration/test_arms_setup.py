@@ -20,7 +20,8 @@ from motion_models.center_of_gravity.urdf import body_link, parse_urdf, read_urd
 from motion_models.center_of_gravity.urdf_wheels import wheel_geometry
 from motion_models.errors import RobotError
 from motion_models.robot import Driver, Geometry, Robot
-from motion_models.robot_file import load_robot, parse_robot, robot_names, robot_toml
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
+from motion_models.robot_names import robot_names
 
 VAULTBOT = Path(__file__).parents[2] / "motion_models" / "robots" / "vaultbot.urdf"
 ROBOT = Robot("new", Geometry(0.165, 0.57, 0.51, 50.0), Driver(0.165, 0.57))

@@ -20,7 +20,8 @@ from motion_models.online_calibration import CorrectedWheels
 from motion_models.preintegration import preintegrate
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Robot, WheelNoise
-from motion_models.robot_file import load_robot, robot_names
+from motion_models.robot_file import load_robot
+from motion_models.robot_names import robot_names
 from motion_models.se2 import FloatArray
 from tests.helpers.extended import cases
 

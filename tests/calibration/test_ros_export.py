@@ -15,7 +15,8 @@ from motion_models.calibration.ros_export import diff_drive_controller_yaml, mul
 from motion_models.errors import CalibrationError
 from motion_models.registry import MODELS, make_model
 from motion_models.robot import Joints, Mount, Robot
-from motion_models.robot_file import load_robot, parse_robot, robot_names, robot_toml
+from motion_models.robot_file import load_robot, parse_robot, robot_toml
+from motion_models.robot_names import robot_names
 
 VAULTBOT = load_robot("vaultbot")
 NUMBERS = st.floats(-1e9, 1e9)

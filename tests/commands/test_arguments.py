@@ -92,7 +92,7 @@ def test_urdf_that_expands_without_end_is_refused(tmp_path: Path, capsys: pytest
 def test_files_of_another_kind_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], log: Path) -> None:
     (tmp_path / "robot.urdf").write_text('<robot name="r"/>')
     assert run("info", log, "--robot", tmp_path / "robot.urdf") == 2
-    assert "is no robot file (.toml): `skidloc init LOG --urdf ROBOT.urdf" in capsys.readouterr().err
+    assert "is not a robot file (.toml): `skidloc init LOG --urdf ROBOT.urdf" in capsys.readouterr().err
     (tmp_path / "pointer.db3").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
     assert run("info", tmp_path / "pointer.db3", "--robot", "vaultbot") == 2
     assert "is a pointer of Git LFS, not the log itself" in capsys.readouterr().err

@@ -15,7 +15,8 @@ from motion_models.online_calibration import make_corrections
 from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
 from motion_models.registry import make_model
 from motion_models.robot import Driver, Geometry, Robot
-from motion_models.robot_file import load_robot, parse_robot, robot_names
+from motion_models.robot_file import load_robot, parse_robot
+from motion_models.robot_names import robot_names
 from motion_models.skid_steer import thesis_coefficients
 
 BARE = """

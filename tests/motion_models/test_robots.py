@@ -11,7 +11,8 @@ import pytest
 from localization.cli import main
 from motion_models.errors import RobotError
 from motion_models.robot import DIFF_DRIVE, Clock, Lidar, Mount, Tf
-from motion_models.robot_file import load_robot, parse_robot, reference, robot_names, robot_toml
+from motion_models.robot_file import load_robot, parse_robot, reference, robot_toml
+from motion_models.robot_names import robot_names
 
 # Wheel radius, track, wheelbase [m], mass [kg], product of the driver's track and multiplier [m], from the sources in each file.
 SOURCES = {
