@@ -83,7 +83,7 @@ def choose_geometry(
     for name in ("wheel_radius_m", "track_width_m"):
         if name not in draft.values:
             draft.choose(name, [(None if like is None else getattr(like, name), of_like)])
-    if urdf is not None and urdf.has_one_axle and "wheelbase_m" not in draft.values:
+    if urdf is not None and urdf.has_one_axle and not urdf.kinds and "wheelbase_m" not in draft.values:
         draft.choose("wheelbase_m", [(draft.values.get("track_width_m"), "the track; nothing but the driven wheels touches the ground")])
     for name, flag in (("wheel_radius_m", "--wheel-radius-m"), ("track_width_m", "--track-width-m"), ("wheelbase_m", "--wheelbase-m")):
         if name not in draft.values:

@@ -33,7 +33,7 @@ from localization.logs.topic_names import is_measured_outside, is_other_estimate
 from localization.logs.topic_roles import TYPES, TopicOverrides
 from motion_models.center_of_gravity.drive_controllers import ControllerValues
 from motion_models.center_of_gravity.urdf import first_names, link_poses, parse_urdf
-from motion_models.center_of_gravity.urdf_wheels import WheelGeometry, is_wheel, sides, wheel_geometry
+from motion_models.center_of_gravity.urdf_wheels import FORWARD, WheelGeometry, is_wheel, sides, wheel_geometry
 from motion_models.errors import RobotError
 from motion_models.input_files import read_text
 from motion_models.robot import DIFF_DRIVE, Driver, Geometry, Joints, Mount, Robot, Topics
@@ -70,6 +70,11 @@ def draft_robot(survey: Survey, given: Given, path: Path) -> Draft:
     choose_geometry(draft, given, urdf, controllers, fit)
     if given.drive is None and given.like is None:
         _check_drive(draft, urdf, fit)
+    if given.base_link == FORWARD:
+        draft.missing.append(
+            "body frame: the URDF's wheels roll along the y axis of its base link. Lengths, centre of gravity and arms are written for "
+            "x forward (REP 103); mounts of /tf_static keep the URDF's axes, which `skidloc check` compares."
+        )
     if urdf is not None:
         _compare_joints(draft, survey, urdf)
         findings = check_urdf(urdf, draft.values, measured)

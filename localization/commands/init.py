@@ -23,11 +23,12 @@ from localization.commands.common import add_row, plain_table, print_line, print
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.center_of_gravity.urdf import body_link, parse_urdf, read_urdf
-from motion_models.center_of_gravity.urdf_wheels import FORWARD, with_forward_base
+from motion_models.center_of_gravity.urdf_wheels import with_forward_base
 from motion_models.center_of_gravity.xacro_files import expand_xacro, is_xacro
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
-from motion_models.robot import DIFF_DRIVE, DRIVES, Robot
+from motion_models.registry import recommended_model
+from motion_models.robot import DRIVES, Robot
 from motion_models.robot_file import load_robot, parse_robot, robot_toml
 
 _NEEDED = {
@@ -111,11 +112,6 @@ class Init:
             answered = _ask(console, survey, draft, given)
             draft = draft if answered == given else draft_robot(survey, answered, self.log)
             given = answered
-        if given.base_link == FORWARD:
-            draft.missing.append(
-                "body frame: the URDF's wheels roll along the y axis of its base link. Lengths, centre of gravity and arms are written "
-                "for x forward (REP 103); mounts of /tf_static keep the URDF's axes, which `skidloc check` compares."
-            )
         for reason in draft.reasons:
             print_line(console, f"  {reason}")
         for gap in draft.missing:
@@ -128,7 +124,7 @@ class Init:
         robot = self._write(console, survey, draft, given)
         for note in prior_notes(robot):
             print_line(console, note)
-        model = "diff_drive" if robot.drive == DIFF_DRIVE else "skid_steer"
+        model = recommended_model(robot)
         if self.calibrate or (is_interactive and _wants_calibration(console, draft)):
             Calibrate((self.log,), str(self.out), model, out=calibrated).run(console)
             return
@@ -261,7 +257,7 @@ def _ask_number(console: Console, name: str, text: str, is_needed: bool = True) 
             value = float("nan")
         if low <= value <= high:
             return value
-        print_line(console, f"'{answer}' is no number from {low:g} to {high:g}.")
+        print_line(console, f"'{answer}' is not a number from {low:g} to {high:g}.")
     raise RobotError(f"no usable answer for {name}; give --{name.replace('_', '-')}.")
 
 

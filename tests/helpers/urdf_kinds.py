@@ -12,6 +12,8 @@ from localization.calibration.log_survey import Survey
 from localization.calibration.robot_draft import Draft, Given
 from localization.calibration.robot_setup import draft_robot, finish_robot
 from localization.logs.topic_roles import TYPES
+from motion_models.center_of_gravity.urdf_wheels import with_forward_base
+from motion_models.errors import RobotError
 
 FOUR = {
     "front_left_wheel": (0.2, 0.25),
@@ -397,9 +399,10 @@ KINDS = {
     ),
     "body turned by 90 degrees": Kind(
         urdf(wheels({n: (y, x) for n, (x, y) in FOUR.items()}, axis="1 0 0")),
-        track=0.4,
-        wheelbase=0.5,
-        named=("do not turn about the y axis",),
+        named=("roll along the y axis",),
+    ),
+    "two wheels alone": Kind(
+        urdf(wheels(TWO)), ("left_wheel",), wheelbase=0.5, named=("nothing but the driven wheels",), drive="diff_drive"
     ),
     "body at a corner": Kind(
         urdf(wheels({n: (x + 0.2, y + 0.25) for n, (x, y) in FOUR.items()}), base=link("base_link", 20.0, "0.2 0.25 0")),
@@ -447,7 +450,12 @@ def draft_of(text: str, folder: Path) -> Draft:
     (folder / "r.urdf").write_text(text)
     joints = tuple(re.findall(r'<joint name="([^"]*)" type="continuous"', text))
     topics = {"/joint_states": (TYPES["joint_states"], 100)}
-    return draft_robot(Survey("log", topics, {"/joint_states": joints}, {}, {}), Given(urdf=folder / "r.urdf"), folder)
+    try:
+        text, base = with_forward_base(text, "r", "base_link")
+    except RobotError:  # raised again where it is read
+        base = "base_link"
+    given = Given(urdf=folder / "r.urdf", base_link=base, urdf_text=text)
+    return draft_robot(Survey("log", topics, {"/joint_states": joints}, {}, {}), given, folder)
 
 
 def gaps(found: Draft) -> list[str]:
