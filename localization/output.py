@@ -38,7 +38,7 @@ def check_outputs(*paths: Path | None) -> None:
         try:
             tempfile.TemporaryFile(dir=parent).close()
         except OSError as error:
-            raise OutputError(f"output '{path}' cannot be written: '{parent}' is no folder in which you may make files.") from error
+            raise OutputError(f"output '{path}' cannot be written: '{parent}' is not a folder in which you may create files.") from error
     for i, path in enumerate(given):
         for other in given[:i]:
             one, two = path.absolute(), other.absolute()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, cast
 
 from motion_models.base import MotionModel
@@ -13,7 +14,7 @@ from motion_models.friction import FrictionModel
 from motion_models.full_linear import FullLinear
 from motion_models.icr import Icr
 from motion_models.param import Lengths, Param, Traits
-from motion_models.robot import Robot
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.skid_steer import SkidSteer
 
 MODELS: dict[str, type[MotionModel]] = {
@@ -33,6 +34,24 @@ def params_of(model: str) -> tuple[Param, ...]:
 def traits_of(model: str) -> Traits:
     """Traits of the motion model ``model``."""
     return cast(Traits, MODELS[model].traits)
+
+
+def recommended_model(robot: Robot) -> str:
+    """The motion model that describes ``robot`` best (docs/which-model.md): where arms move the centre of gravity, friction."""
+    if robot.drive == DIFF_DRIVE:
+        return DiffDrive.name
+    return SkidSteer.name if robot.arms is None else FrictionModel.name
+
+
+def advice(robot: Robot, models: Sequence[str]) -> list[str]:
+    """A sentence on a model that describes ``robot`` better than ``models``; else none."""
+    best = recommended_model(robot)
+    if best != FrictionModel.name or best in models:
+        return []
+    return [
+        f"{robot.name} has arms, for which --model friction is better: over 68 measured rotations, each at a centre of gravity that the "
+        "fit does not have, its heading is off by 1.6 degrees after 5 s of turning, that of skid_steer by 3.6, that of diff_drive by 19.9."
+    ]
 
 
 def make_model(name: str, robot: Robot) -> MotionModel:

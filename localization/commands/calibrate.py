@@ -36,13 +36,14 @@ from localization.commands.calibration_tables import (
 from localization.commands.common import in_radians, write_json
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
+from localization.report.calibrate_page import write_calibrate_page
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_foreign_frames
 from motion_models.calibration.regressions import RotationTable, read_rotations, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
 from motion_models.center_of_gravity.files import arms_model, arms_postures
 from motion_models.errors import CalibrationError
-from motion_models.registry import make_model
+from motion_models.registry import advice, make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
 from motion_models.se2 import FloatArray
@@ -87,6 +88,8 @@ class Calibrate:
     """Name of the node in the exported parameters. Default: diff_drive_controller, or ekf_filter_node."""
     export_out: Annotated[Path | None, tyro.conf.arg(metavar="FILE.yaml")] = None
     """Write them to this file instead."""
+    page: Annotated[Path | None, tyro.conf.arg(metavar="FILE.html")] = None
+    """Write a page with k and centre of rotation against the centre of gravity, measured and by the model, errors and parameters."""
     windows: Annotated[Path | None, tyro.conf.arg(metavar="FILE.csv")] = None
     """Write the maneuvers that were fitted to this table, which `calibrate` reads."""
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -102,6 +105,8 @@ class Calibrate:
             raise CalibrationError(f"logs, tables of windows and tables of rotations cannot be calibrated on together: {', '.join(kinds)}.")
         (kind,) = kinds
         if kind == "rotations" and self.model == "skid_steer" and not self.fit:
+            if self.page is not None:
+                raise CalibrationError("--page shows a fit to windows; regressions on a table of rotations are printed. Leave --page out.")
             new, sigmas, numbers = self._regressions(console, robot)
         else:
             new, sigmas, numbers = self._fit(console, robot, model, kind)
@@ -118,9 +123,9 @@ class Calibrate:
             raise CalibrationError("--export-node names a node, but --export names no package.")
         if self.export_node and not _NODE_NAME.fullmatch(self.export_node):
             raise CalibrationError(
-                f"--export-node '{self.export_node}' is no name of a ROS node: letters, digits, _ and /, or /** for all."
+                f"--export-node '{self.export_node}' is not a name of a ROS node: letters, digits, _ and /, or /** for all."
             )
-        check_outputs(self.out, self.export_out, self.windows, self.json)
+        check_outputs(self.out, self.export_out, self.page, self.windows, self.json)
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
 
@@ -140,10 +145,14 @@ class Calibrate:
         if self.windows is not None:
             write_text_file(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
         numbers = {"robot": robot.name, "model": model.name, **calibration_numbers(found, about, cuts, by_source)}
-        if not found.is_recommended:
-            return robot, {}, numbers
-        calibrated_robot = with_clock(found.fit.robot(robot), found)
-        return dataclasses.replace(calibrated_robot, wheel_noise=found.noise.scaled(robot.wheel_noise)), found.sigmas, numbers
+        new, sigmas = robot, {}  # type: Robot, dict[str, float]
+        if found.is_recommended:
+            new = dataclasses.replace(with_clock(found.fit.robot(robot), found), wheel_noise=found.noise.scaled(robot.wheel_noise))
+            sigmas = found.sigmas
+        if self.page is not None:
+            write_calibrate_page(self.page, robot, new, [m for each in cuts for m in each.maneuvers], numbers)
+            console.print(f"page: {self.page}", markup=False, soft_wrap=True)
+        return new, sigmas, numbers
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         if kind == "log":
@@ -188,6 +197,8 @@ class Calibrate:
                 console.print(text, markup=False, soft_wrap=True)
         if self.json is not None:
             write_json(self.json, {"source": [path.name for path in self.source], **numbers})
+        for sentence in advice(robot, [self.model]):
+            console.print(sentence, markup=False, soft_wrap=True)
 
 
 def _kind(path: Path) -> str:

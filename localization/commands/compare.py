@@ -22,7 +22,7 @@ from localization.comparison.jobs import OK, Job, LogOrigin, Row, job_key, run_j
 from localization.comparison.manifest import Entry, read_manifest
 from localization.comparison.remote import is_url
 from localization.comparison.result_table import ResultFolder, ResultTable
-from localization.comparison.statistics import ComparisonFindings, against_best, closing, find, headline
+from localization.comparison.statistics import ComparisonFindings, against_best, closing, find, leading
 from localization.errors import EvaluationError, LogError, OutputError
 from localization.estimators import check_estimator
 from localization.logs import TopicOverrides
@@ -156,7 +156,7 @@ class Compare:
         for m in found.means:
             grid.add_row(m.name, str(m.n), f"{m.mean:.4g}", f"{m.low:.4g} to {m.high:.4g}" if m.n > 1 else "")
         console.print(grid)
-        for sentence in (headline(found), *(against_best(mean, found) for mean in found.means[2:]), *closing(found)):
+        for sentence in (*leading(found), *(against_best(mean, found) for mean in found.means[2:]), *closing(found)):
             console.print(sentence, markup=False, soft_wrap=True)
         if failed:
             console.print(f"The reasons of what failed are in {table.path}.", markup=False, soft_wrap=True)
@@ -184,7 +184,7 @@ def places(out: Path) -> tuple[Path, Path]:
 def _content(found: ComparisonFindings) -> dict[str, Any]:
     return {
         "metric": found.metric,
-        "verdict": " ".join([headline(found), *closing(found)]),
+        "verdict": " ".join([*leading(found), *closing(found)]),
         "means": [dataclasses.asdict(m) for m in found.means],
         "differences": [dataclasses.asdict(d) for d in found.tested],
         "damaged": found.damaged,

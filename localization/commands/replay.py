@@ -48,7 +48,7 @@ from localization.trajectory import write_tum
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, check_forms
 from motion_models.prior import prior_notes, scaling_prior
-from motion_models.registry import make_model
+from motion_models.registry import advice, make_model
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
@@ -316,6 +316,8 @@ class Replay:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
+        for sentence in advice(load_robot(self.robot), names(self.model, "--model")):
+            console.print(sentence, markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 
 

@@ -27,9 +27,11 @@ from localization.commands.replay import Replay
 from localization.logs import TopicOverrides, open_log
 from localization.output import check_outputs
 from localization.report.try_page import Part, TryResult, summarize, write_try_page
+from motion_models.diff_drive import DiffDrive
 from motion_models.errors import SkidlocError
 from motion_models.input_files import read_text
-from motion_models.robot import DIFF_DRIVE, Robot
+from motion_models.registry import recommended_model
+from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 
 _PARTS = 7
@@ -99,10 +101,13 @@ class Try:
         runner.run("check", Check(self.log, robot_file, out=folder / "check"), self._line("check"))
         checked = folder / "check" / "robot.toml"
         robot_file = str(checked) if checked.exists() else robot_file
-        models = ("diff_drive",) if robot.drive == DIFF_DRIVE else ("diff_drive", "skid_steer")
+        models = tuple(dict.fromkeys((DiffDrive.name, recommended_model(robot))))
+        before = load_robot(robot_file)
+        cut = self._cut(before)
         for model in models:
             name = "calibrated.toml" if model == models[-1] else f"{model}.toml"
-            calibrate = Calibrate((self.log,), robot_file, model, out=folder / name, json=folder / f"calibrate_{model}.json")
+            numbers = folder / f"calibrate_{model}.json"
+            calibrate = _CalibrateOn((self.log,), robot_file, model, cut=cut, out=folder / name, json=numbers)
             runner.run(f"calibrate {model}", calibrate, self._line("calibrate", f"--model {model}"))
         calibrated = folder / "calibrated.toml"
         best = str(calibrated) if calibrated.exists() else robot_file
@@ -113,8 +118,7 @@ class Try:
         )
         runner.run("replay", replay, self._line("replay", f"--model {','.join(models)} --estimator {estimators}"))
         runner.run("diagnose", Diagnose(self.log, best, out=folder / "diagnosis", static=True), self._line("diagnose"))
-        before, after = load_robot(robot_file), load_robot(best)
-        return TryResult(self.log.name, before, after, models[-1], tuple(runner.parts), self._cut(after), _contents(folder, models))
+        return TryResult(self.log.name, before, load_robot(best), models[-1], tuple(runner.parts), cut, _contents(folder, models))
 
     def _cut(self, robot: Robot) -> Cut | None:
         """Windows of the log with what measured them; None where nothing did."""
@@ -133,6 +137,16 @@ class Try:
 
     def _descriptions(self) -> list[tuple[str, Path]]:
         return [(name, path) for name, path in (("urdf", self.urdf), ("controller", self.controller)) if path is not None]
+
+
+@dataclass(frozen=True)
+class _CalibrateOn(Calibrate):
+    """`Calibrate` on windows that were cut before, where there are any: cutting matches all scans."""
+
+    cut: Cut | None = None
+
+    def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
+        return super()._cut(path, robot, kind) if self.cut is None else self.cut
 
 
 @contextlib.contextmanager

@@ -75,7 +75,7 @@ class Twin:
             raise CalibrationError(f"--window-s is {self.window_s:g}; windows of 0.5 to 20 s make sense.")
         check_outputs(self.out, self.json)
         robot = load_robot(self.robot)
-        simulator, notes = self._simulator(robot)
+        simulator, notes = self.open_simulator(robot)
         with console.status("reading"):
             maneuvers = [m for path in self.source for m in self._maneuvers(path, robot)]
         with console.status("simulating"):
@@ -96,7 +96,7 @@ class Twin:
                 is_best = " (the better one)" if repair is result.best and len(result.repaired) > 1 else ""
                 print_line(console, f"simulator with {repair.name}{is_best}: {self.out / folder_of(repair) / repair.file.name}")
 
-    def _simulator(self, robot: Robot) -> tuple[Simulator, tuple[str, ...]]:
+    def open_simulator(self, robot: Robot) -> tuple[Simulator, tuple[str, ...]]:
         """The simulator, and what was left out of its file."""
         file = None if self.simulator is None else _load(self.simulator)
         is_dart = self.engine == "dart" or (self.engine == "auto" and file is not None and file.root.tag == "sdf")

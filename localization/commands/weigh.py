@@ -92,7 +92,7 @@ def describe(found: DrivenWeighing, at: tuple[float, float] | None) -> str:
 
     >>> offset, cov = np.array([0.036, 0.0004]), np.diag([0.001, 0.003]) ** 2
     >>> describe(DrivenWeighing("a.bag", "husky_a200", "scans", 28, 49.0, np.zeros(2), offset, cov, 46.0, 1.0, {}), None)
-    'centre of gravity at x = +36 +- 1 mm, y = +0 +- 3 mm: 36 mm farther ahead than in the robot file, as by a load of 1.7 kg m ahead.'
+    'centre of gravity at x = +36 +- 1 mm, y = +0 +- 3 mm: 36 mm farther ahead than in the robot file: a load moment of 1.7 kg m ahead.'
     """
     (x, y), (sx, sy) = 1e3 * found.position, 1e3 * found.sigmas
     where = f"centre of gravity at x = {round(x):+d} +- {sx:.0f} mm, y = {round(y):+d} +- {sy:.0f} mm"
@@ -107,7 +107,7 @@ def describe(found: DrivenWeighing, at: tuple[float, float] | None) -> str:
     shift = " and ".join(f"{abs(1e3 * found.offset[i]):.0f} mm farther {sides[i]}" for i in shown)
     load = " and ".join(f"{abs(found.moment[i]):.2g} kg m {sides[i]}" for i in shown)
     mass = "" if at is None else " At the given place it weighs {:.1f} +- {:.1f} kg.".format(*found.payload(*at))
-    return f"{where}: {shift} than in the robot file, as by a load of {load}.{mass}"
+    return f"{where}: {shift} than in the robot file: a load moment of {load}.{mass}"
 
 
 def print_weighing(console: Console, found: DrivenWeighing, at: tuple[float, float] | None) -> None:

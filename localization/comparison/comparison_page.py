@@ -18,7 +18,7 @@ from localization.comparison.statistics import (
     by_combination,
     closing,
     combination,
-    headline,
+    leading,
     p_words,
     percent,
 )
@@ -70,7 +70,7 @@ def check_report(path: Path) -> None:
     """Raises `OutputError` where a report would overwrite something else."""
     try:
         if path.exists() and f"<title>{_TITLE}".encode() not in read_bytes(path)[:1000]:
-            raise OutputError(f"'{path}' exists already and is no report of a comparison. Choose another --out, or remove it.")
+            raise OutputError(f"'{path}' exists already and is not a report of a comparison. Choose another --out, or remove it.")
     except OSError as error:
         raise OutputError(f"'{path}' cannot be read: {error.strerror}.") from error
 
@@ -91,7 +91,7 @@ def comparison_page(head: CompareHead, found: ComparisonFindings, is_interactive
         html.glossary(_TERMS),
         html.Section("Sources and versions", [html.Definitions(_provenance(head, found))]),
     ]
-    sentences = [_unbroken(sentence) for sentence in (headline(found), *closing(found), *head.notes)]
+    sentences = [_unbroken(sentence) for sentence in (*leading(found), *closing(found), *head.notes)]
     page = html.Page(title, facts, sentences, sections)
     return html.render(page if is_interactive else page.without_scripts())
 

@@ -40,7 +40,7 @@ def read_manifest(path: Path, robot: str | None, reference: str | None) -> list[
     except OSError as error:
         raise LogError(f"manifest '{path}' cannot be read: {error.strerror or error}.") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise LogError(f"manifest '{path}' is no CSV file ({error}).") from error
+        raise LogError(f"manifest '{path}' is not a CSV file ({error}).") from error
     if "log" not in header:
         raise LogError(
             f"manifest '{path}' has no column 'log'; its first line names its columns: {','.join(COLUMNS)} (log alone is enough)."

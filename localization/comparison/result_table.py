@@ -30,7 +30,7 @@ class ResultTable:
     """Rows by log and trial, read from an existing file; `put` and `save`."""
 
     def __init__(self, path: Path) -> None:
-        """Raises `OutputError` for a file that is no table of a comparison, or a format that cannot be written here."""
+        """Raises `OutputError` for a file that is not a table of a comparison, or a format that cannot be written here."""
         if path.suffix not in _SUFFIXES:
             raise OutputError(f"table '{path}': its name must end in {' or '.join(_SUFFIXES)}.")
         self.path = path
@@ -46,9 +46,9 @@ class ResultTable:
         except OSError as error:
             raise OutputError(f"table '{self.path}' cannot be read: {error.strerror or error}.") from error
         except (ValueError, csv.Error) as error:
-            raise OutputError(f"'{self.path}' is no table of a comparison ({error}). Name another file.") from error
+            raise OutputError(f"'{self.path}' is not a table of a comparison ({error}). Name another file.") from error
         if any(set(_HEAD) - set(row) for row in rows) or not rows:
-            raise OutputError(f"'{self.path}' is no table of a comparison: columns are missing. Name another file.")
+            raise OutputError(f"'{self.path}' is not a table of a comparison: columns are missing. Name another file.")
         return rows
 
     def missing(self, job: Job) -> tuple[TrialSpec, ...]:

@@ -296,6 +296,13 @@ def find(rows: Sequence[Row], metric: str) -> ComparisonFindings:
     return ComparisonFindings(metric, rows, found, differences(rows, metric), words)
 
 
+def leading(found: ComparisonFindings) -> list[str]:
+    """What users ask first: which motion model is better with one estimator, by the largest difference that is shown; then the best run."""
+    alike = [d for d in found.tested if found.is_shown(d) and d.better.split()[1:] == d.worse.split()[1:]]
+    largest = max(alike, key=lambda d: -math.inf if math.isnan(d.relative) else d.relative, default=None)
+    return list(dict.fromkeys([*([] if largest is None else [_of(largest, found)]), headline(found)]))
+
+
 def headline(found: ComparisonFindings) -> str:
     """The best against the next one."""
     best, others = found.best, found.means[1:]

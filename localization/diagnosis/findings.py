@@ -524,7 +524,7 @@ def _joint(d: Diagnosis) -> str:
 def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     """What to correct, strongest finding first, and what that gains on windows that did not correct it."""
     first = findings[0]
-    text = f"Correct {first.definition.label}, off by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
+    text = f"Correct {first.definition.label} by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
     whole = d.gain or first.gain
     if d.handover is not None and d.handover.replays:
         text += f"; {d.handover.describe_replays()}"
@@ -539,7 +539,7 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
 
 def _further(f: Finding) -> str:
     aliases = f", or {describe_sizes(f.aliases)}" if f.aliases else ""
-    return f"{f.definition.label}, off by {f.size:+.3g}{unit_of(f.cause)} ({f.description}{aliases})"
+    return f"{f.definition.label} by {f.size:+.3g}{unit_of(f.cause)} ({f.description}{aliases})"
 
 
 def describe_sizes(aliases: Sequence[tuple[str, float]]) -> str:

@@ -93,7 +93,7 @@ def read_reference_file(path: str | Path, log_stamps: LogStamps | None = None) -
     if len(rows[0]) == 3:
         table = _numbers(rows, path)
         return _of_poses(_Poses(_stamps(table[:, 0], rows, 0, "s"), np.column_stack([table[:, 1:], np.zeros(len(table))])), path, None)
-    raise EvaluationError(f"'{path}' is no reference: its first line has {len(rows[0])} columns and no header of their names. {_KNOWN}")
+    raise EvaluationError(f"'{path}' is not a reference: its first line has {len(rows[0])} columns and no header of their names. {_KNOWN}")
 
 
 def load_reference(log: Log, name: str, file: Path | None = None) -> ReferenceTrack | Relations:
@@ -285,7 +285,7 @@ def _read_kitti(rows: Sequence[Sequence[str]], path: Path) -> _Poses:
     matrices = _numbers(rows, path).reshape(-1, 3, 4)
     turns, positions = matrices[:, :, :3], matrices[:, :, 3]
     if np.abs(np.einsum("nij,nkj->nik", turns, turns) - np.eye(3)).max() > 0.05:
-        raise EvaluationError(f"'{path}' has twelve columns that are no poses of KITTI (rotation, translation). {_KNOWN}")
+        raise EvaluationError(f"'{path}' has twelve columns that are not poses of KITTI (rotation, translation). {_KNOWN}")
     beside = [path.with_name(name) for name in (f"{path.stem}_times.txt", f"{path.stem}.times", "times.txt")]
     times = next((file for file in beside if file.is_file()), None)
     stamps = None
@@ -350,7 +350,7 @@ def _read_gpx(path: Path) -> _Poses:
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
-        raise EvaluationError(f"'{path}' is no whole GPX file: {error}.") from error
+        raise EvaluationError(f"'{path}' is not a complete GPX file: {error}.") from error
     rows: list[tuple[int, float, float, float]] = []
     for point in root.iter():
         if point.tag.rpartition("}")[2] != "trkpt":
@@ -371,7 +371,7 @@ def _iso_ns(text: str, where: str) -> int:
     try:
         when = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
     except ValueError as error:
-        raise EvaluationError(f"{where}: '{text}' is no time as 2024-05-01T12:00:00Z.") from error
+        raise EvaluationError(f"{where}: '{text}' is not a time such as 2024-05-01T12:00:00Z.") from error
     since = (when if when.tzinfo is not None else when.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 

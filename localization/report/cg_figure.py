@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.report import page as html
 from localization.report.figures import Figure, svg
 from localization.report.page import COLOURS, WIDTH_IN
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Maneuver
-from motion_models.robot import Robot
+from motion_models.registry import make_model
+from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
 
 _MIN_TURN_RAD = 0.3
@@ -93,16 +95,27 @@ def cg_svg(turns: Turns, models: Sequence[tuple[str, MotionModel]], robot: Robot
     return svg(name, WIDTH_IN, 3.2, draw)
 
 
+def cg_blocks(turns: Turns, model: str, before: Robot, after: Robot) -> list[html.Block]:
+    """The figure by the robot ``before`` and, where that is another one, ``after`` a calibration of the ``model``; none without turns."""
+    if not len(turns.k) or after.drive == DIFF_DRIVE:
+        return []
+    models = [("by the robot file", make_model(model, before))]
+    if after != before:
+        models.append(("calibrated", make_model(model, after)))
+    caption = "Each dot is a window of turning in place. k is the yaw rate over that of wheels without slip."
+    return [html.Figure(cg_svg(turns, models, after), "k and centre of rotation against the centre of gravity", caption)]
+
+
 def describe_turns(turns: Turns, model: MotionModel, robot: Robot) -> str:
     """Range of measured k and centre of rotation, and how near the model comes, in a sentence; empty without turns."""
     if not len(turns.k):
         return ""
     k, x_cr = predicted_turns(model, robot, turns.cg)
-    moved = f"the centre of gravity moved by {100.0 * np.ptp(turns.cg[:, 0]):.1f} cm along the robot" if turns.moves else ""
     low, high = (float(f(turns.k)) for f in (np.min, np.max))
-    text = f"In {len(turns.k)} turns in place k was {low:.2f} to {high:.2f}{' while ' + moved if moved else ''}; the model predicts it to "
-    text += f"{np.sqrt(np.mean((k - turns.k) ** 2)):.3f}"
+    moved = f", while the centre of gravity moved by {100.0 * np.ptp(turns.cg[:, 0]):.1f} cm along the robot" if turns.moves else ""
+    text = f"In {len(turns.k)} turns in place k was between {low:.2f} and {high:.2f}{moved}. {model.name} is off by "
+    text += f"{np.sqrt(np.mean((k - turns.k) ** 2)):.3f} in k"
     known = np.isfinite(turns.x_cr)
     if known.any():
-        text += f" and the centre of rotation to {1e3 * np.sqrt(np.mean((x_cr - turns.x_cr)[known] ** 2)):.0f} mm"
-    return text + " RMS."
+        text += f" and by {1e3 * np.sqrt(np.mean((x_cr - turns.x_cr)[known] ** 2)):.0f} mm in the centre of rotation"
+    return text + " (RMS)."

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -108,7 +108,7 @@ def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None
         "lost": _lost(run, t),
         "slips": _slips(run, t),
         "faults": [[float(at), text] for at, text in _FAULT.findall("\n".join(run.result.run.warnings))],
-        "parameters": {name: _history(rows, start_ns) for name, rows in run.result.run.parameter_history.items()},
+        "parameters": {name: _history(rows, start_ns) for name, rows in _by_movement(run.result.run.parameter_history)},
     }
 
 
@@ -191,6 +191,12 @@ def _ellipses(poses: FloatArray, covariances: FloatArray) -> list[list[float | N
     """Half axes [m] and direction [rad] of the two-sigma ellipses of ``poses`` (N, 3) with covariances (N, 3, 3): three columns."""
     found = [ellipse(pose, cov) for pose, cov in zip(poses, covariances, strict=True)]
     return [numbers([e.semi_axes[0] for e in found], 3), numbers([e.semi_axes[1] for e in found], 3), numbers([e.angle for e in found], 2)]
+
+
+def _by_movement(histories: Mapping[str, FloatArray]) -> list[tuple[str, FloatArray]]:
+    """Histories (N, 3) of stamp, mean and sigma by name; first what moved by the most of its first sigmas, which the page opens on."""
+    moved = {name: float(np.ptp(rows[:, 1])) / max(float(rows[0, 2]), 1e-12) for name, rows in histories.items()}
+    return sorted(histories.items(), key=lambda item: -moved[item[0]])
 
 
 def _history(rows: FloatArray, start_ns: int) -> dict[str, list[float | None]]:

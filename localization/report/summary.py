@@ -263,7 +263,7 @@ def _coverage(best: PlottedRun) -> list[str]:
     return [f"The reference covers only {100.0 * accuracy.overlap:.0f} % of the drive's time."]
 
 
-_LESS_THAN_NOISE = "wheels and scans differ less than their noise allows"
+_LESS_THAN_NOISE = "wheels and scans agree better than their covariances predict"
 
 
 def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
@@ -296,7 +296,7 @@ def _consistency(line: PlottedRun, whose: str = "Its covariances") -> list[str]:
     if found["over"] and by_pose in ("fits", "under"):
         also = f"{whose} are not too small by the reference ({join_words([*found['fits'], *found['under']])})"
         cause = "Wheels slip, or the mount, the stamps or the scale of a sensor is wrong: run `skidloc diagnose` on the log."
-        return [f"{also}, but wheels and scans differ more than their noise allows: {found['over'][0]}.", cause]
+        return [f"{also}, but wheels and scans differ by more than their covariances predict: {found['over'][0]}.", cause]
     if found["over"]:
         also = f" ({join_words([*found['under'], *found['fits']])})" if found["under"] or found["fits"] else ""
         return [f"{whose} are overconfident: {join_words(found['over'])}{also}. Enlarge them before fusing them elsewhere."]

@@ -9,9 +9,8 @@ from typing import Any
 
 from localization.calibration.calibrate import Cut
 from localization.report import page as html
-from localization.report.cg_figure import Turns, cg_svg, describe_turns, measured_turns
+from localization.report.cg_figure import Turns, cg_blocks, describe_turns, measured_turns
 from motion_models.calibration.maneuvers import Maneuver
-from motion_models.prior import scaling_prior
 from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE, Robot
 
@@ -65,26 +64,27 @@ class TryResult:
         return measured_turns(self.maneuvers, self.after)
 
 
-def improvement(contents: Mapping[str, Any]) -> str:
-    """Errors of predicted windows on held-out parts of the drive: diff_drive against skid_steer with the CG; empty where unknown."""
-    base, ours = contents.get("calibrate_diff_drive"), contents.get("calibrate_skid_steer")
-    if base is None or ours is None or not (base["heldout"] and ours["heldout"]):
+def improvement(contents: Mapping[str, Any], model: str) -> str:
+    """Errors of predicted windows on held-out parts of the drive: diff_drive against ``model`` with the CG; empty where unknown."""
+    base, ours = contents.get("calibrate_diff_drive"), contents.get(f"calibrate_{model}")
+    if model == "diff_drive" or base is None or ours is None or not (base["heldout"] and ours["heldout"]):
         return ""
     parts = []
-    for name, unit, factor in (("position_m", "mm", 1e3), ("heading_deg", "deg", 1.0)):
+    for name, unit, factor in (("heading_deg", "deg", 1.0), ("position_m", "mm", 1e3)):
         if name in base["errors"] and name in ours["errors"]:
-            driver, fitted = base["errors"][name]["before"][0], base["errors"][name]["after"][0]
+            tried = ((base, "before"), (base, "after"), (ours, "after"))
+            driver, fitted, by_cg = (f"{factor * numbers['errors'][name][when][0]:.3g} {unit}" for numbers, when in tried)
             parts.append(
-                f"{name.split('_')[0]} {factor * driver:.3g} {unit} by diff_drive as the driver has it, {factor * fitted:.3g} {unit} "
-                f"by diff_drive calibrated, {factor * ours['errors'][name]['after'][0]:.3g} {unit} by skid_steer with the centre of gravity"
+                f"the {name.split('_')[0]} is off by {by_cg} with {model} and the centre of gravity, by {fitted} with diff_drive "
+                f"calibrated, and by {driver} with diff_drive as the driver has it"
             )
-    return f"Odometry of windows held out from the calibration is off by (RMS): {'; '.join(parts)}." if parts else ""
+    return f"Over windows that the calibration did not use (RMS), {'; '.join(parts)}." if parts else ""
 
 
 def summarize(found: TryResult) -> list[str]:
     """The sentences at the top, the most important first."""
     model = make_model(found.model, found.after)
-    sentences = [improvement(found.contents)]
+    sentences = [improvement(found.contents, found.model)]
     if found.after.drive != DIFF_DRIVE:
         sentences.append(describe_turns(found.turns, model, found.after))
     numbers = found.contents.get(f"calibrate_{found.model}")
@@ -102,7 +102,7 @@ def summarize(found: TryResult) -> list[str]:
 
 def _calibrated(numbers: Mapping[str, Any], found: TryResult) -> str:
     if not numbers["recommended"]:
-        return "The calibration predicts held-out windows no better than the robot file, which keeps its numbers."
+        return "The calibration predicts windows that it did not use no better than the robot file does, which keeps its numbers."
     turning = numbers["turning"]
     track = found.after.geometry.track_width_m
     k = track / turning["effective_track_m"][0]
@@ -115,7 +115,7 @@ def _calibrated(numbers: Mapping[str, Any], found: TryResult) -> str:
 def _next_steps(found: TryResult) -> list[str]:
     numbers = found.contents.get(f"calibrate_{found.model}")
     steps = [f"{held['parameter']}: {held['why']}" for held in (numbers or {}).get("held", [])]
-    if numbers is None or not found.maneuvers or scaling_prior(found.after) is not None:
+    if not found.is_calibrated or not found.maneuvers:
         steps.append(_DRIVE)
     if found.after.drive != DIFF_DRIVE and not found.turns.moves:
         steps.append(
@@ -133,15 +133,7 @@ def write_try_page(path: str | Path, found: TryResult) -> None:
 
 def try_page(found: TryResult) -> str:
     """HTML of the whole page."""
-    blocks: list[html.Block] = []
-    turns = found.turns
-    if len(turns.k) and found.after.drive != DIFF_DRIVE:
-        models = [("by the robot file", make_model(found.model, found.before))]
-        if found.is_calibrated:
-            models.append(("calibrated", make_model(found.model, found.after)))
-        picture = cg_svg(turns, models, found.after)
-        caption = "Each dot is a window of 2 s of turning in place. k is the yaw rate over that of wheels without slip."
-        blocks.append(html.Figure(picture, "k and centre of rotation against the centre of gravity", caption))
+    blocks = cg_blocks(found.turns, found.model, found.before, found.after if found.is_calibrated else found.before)
     sections = [
         html.Section("What the centre of gravity does", blocks),
         html.Section("What to do next", html.bullets(_next_steps(found))),

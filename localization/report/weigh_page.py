@@ -22,6 +22,8 @@ _SHOWN = 0.95
 _POINTS = 73
 """Points of an ellipse: one each 5 degrees."""
 _WIDTH_IN = 6.0
+_WHEEL_WIDTH = 0.5
+"""Drawn width of a wheel over its radius."""
 _TERMS = {
     "Ellipse": f"Holds the centre of gravity in {100 * _SHOWN:.0f} of 100 such drives, by the covariance of the estimate; where the "
     "friction model does not describe the drive, the errors of such models are in it.",
@@ -74,11 +76,11 @@ def write_weigh_page(path: Path, sentence: str, found: DrivenWeighing, geometry:
 def weigh_page(sentence: str, found: DrivenWeighing, geometry: Geometry, at: tuple[float, float] | None) -> str:
     """HTML of the whole page; ``at``: where the load is, if that is known [m]."""
     ellipse = confidence_ellipse(found.position, found.covariance)
-    wheels = np.array([[sx * geometry.wheelbase_m, sy * geometry.track_width_m] for sx in (0.5, -0.5) for sy in (0.5, -0.5)])
-    caption = "From above, ahead to the right. The cross is where the robot file has the centre of gravity."
-    figure = html.Figure(_svg(found, ellipse, wheels, at), "Centre of gravity between the wheels", caption)
+    caption = "The robot from above, ahead to the right. The dot is the centre of gravity that was found, the cross that of the robot file."
+    body = outline(geometry)
+    figure = html.Figure(_svg(found, ellipse, body, at), "Centre of gravity between the wheels", caption)
     sections = [
-        html.Section("Explore", [_cg_chart(found, ellipse, wheels, at)]),
+        html.Section("Explore", [_cg_chart(found, ellipse, body, at)]),
         html.Section("Centre of gravity", [figure], is_static=True),
         html.Section("Result", [_table(found, at)]),
         html.Section("Estimated with it", _corrections(found.corrections)),
@@ -89,6 +91,17 @@ def weigh_page(sentence: str, found: DrivenWeighing, geometry: Geometry, at: tup
     return html.render(html.Page(f"Weighing by {found.log}", f"{found.robot} · {about}", [sentence[:1].upper() + sentence[1:]], sections))
 
 
+def outline(geometry: Geometry) -> FloatArray:
+    """(n, 2) lines of the robot from above [m], separated by rows of NaN: body with its nose ahead, and four wheels."""
+    r, half = geometry.wheel_radius_m, _WHEEL_WIDTH * geometry.wheel_radius_m / 2.0
+    box = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    ahead, beside = geometry.wheelbase_m / 2.0, geometry.track_width_m / 2.0
+    nose = np.array([[ahead + r, beside - half], [ahead + 1.4 * r, 0.0], [ahead + r, half - beside]])
+    parts = [np.vstack([box * [ahead + r, beside - half], np.full(2, np.nan), nose])]
+    parts += [box * [r, half] + [sx * ahead, sy * beside] for sx in (1.0, -1.0) for sy in (1.0, -1.0)]
+    return np.vstack([row for part in parts for row in (part, np.full(2, np.nan))])
+
+
 def confidence_ellipse(centre: FloatArray, covariance: FloatArray, probability: float = _SHOWN) -> FloatArray:
     """(n, 2) points of the ellipse that holds a Gaussian of ``centre`` (2,) and ``covariance`` (2, 2) with ``probability``."""
     values, vectors = np.linalg.eigh(covariance)
@@ -97,32 +110,33 @@ def confidence_ellipse(centre: FloatArray, covariance: FloatArray, probability: 
     return np.asarray(centre + (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def _cg_chart(found: DrivenWeighing, ellipse: FloatArray, wheels: FloatArray, at: tuple[float, float] | None) -> Chart:
-    columns = {"ellipse x": ellipse[:, 0], "ellipse y": ellipse[:, 1], "wheel x": wheels[:, 0], "wheel y": wheels[:, 1]}
+def _cg_chart(found: DrivenWeighing, ellipse: FloatArray, body: FloatArray, at: tuple[float, float] | None) -> Chart:
+    columns = {"ellipse x": ellipse[:, 0], "ellipse y": ellipse[:, 1], "robot x": body[:, 0], "robot y": body[:, 1]}
     points: Sequence[tuple[str, FloatArray, str, str]] = [
         ("robot file", found.given, "grey", "x"),
         ("found", found.position, "blue", "circle"),
-        *([] if at is None else [("load", np.array(at), "orange", "triangle-up")]),
+        *([] if at is None else [(f"load, {found.payload(*at)[0]:.1f} kg", np.array(at), "orange", "triangle-up")]),
     ]
     series = [ChartSeries(f"{100 * _SHOWN:.0f} % ellipse", "blue", x="ellipse x", y="ellipse y", is_line=True, is_filled=True)]
-    series.append(ChartSeries("wheels", "ink", x="wheel x", y="wheel y", size=13.0, symbol="square", texts=["wheel"] * 4))
+    series.append(ChartSeries("robot", "ink", x="robot x", y="robot y", is_line=True))
     for name, point, colour, symbol in points:
         columns |= {f"{name} x": point[:1], f"{name} y": point[1:]}
         series.append(ChartSeries(name, colour, x=f"{name} x", y=f"{name} y", size=10.0, symbol=symbol, texts=[name]))
     title = "Centre of gravity between the wheels"
-    note = "From above, ahead to the right. Scroll to zoom to the ellipse."
+    note = "The robot from above, ahead to the right. Scroll to zoom to the ellipse."
     return Chart(title, [("found x", "x [m]")], [("found y", "y [m]")], series, columns, is_map=True, height_px=420, note=note)
 
 
-def _svg(found: DrivenWeighing, ellipse: FloatArray, wheels: FloatArray, at: tuple[float, float] | None) -> str:
+def _svg(found: DrivenWeighing, ellipse: FloatArray, body: FloatArray, at: tuple[float, float] | None) -> str:
     def draw(figure: Canvas) -> None:
         axes = figure.add_subplot()
         axes.fill(*ellipse.T, facecolor=html.COLOURS["sky"], edgecolor=html.COLOURS["blue"], linewidth=1.0)
-        axes.plot(*wheels.T, "s", color=html.COLOURS["ink"], markersize=9.0)
+        axes.plot(*body.T, color=html.COLOURS["ink"], linewidth=1.2)
         axes.plot(*found.given, "x", color=html.COLOURS["grey"], markersize=8.0)
         axes.plot(*found.position, "o", color=html.COLOURS["blue"], markersize=5.0)
         if at is not None:
             axes.plot(*at, "^", color=html.COLOURS["orange"], markersize=7.0)
+            axes.annotate(f"load, {found.payload(*at)[0]:.1f} kg", at, (8.0, 4.0), textcoords="offset points")
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
     return svg("cg", _WIDTH_IN, 4.2, draw)

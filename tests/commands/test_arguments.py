@@ -138,7 +138,7 @@ def test_json_that_cannot_be_written_is_refused_before_the_run(tmp_path: Path, c
 
 
 def test_folder_in_which_no_file_can_be_made_is_refused_before_the_run() -> None:
-    with pytest.raises(OutputError, match="'/proc' is no folder in which you may make files"):
+    with pytest.raises(OutputError, match="'/proc' is not a folder in which you may create files"):
         check_outputs(Path("/proc/out"))
 
 

@@ -38,7 +38,7 @@ def test_measured_turns_are_those_of_the_model_that_drove(rates: tuple[float, fl
     k, x_cr = predicted_turns(MODEL, ROBOT, found.cg)
     np.testing.assert_allclose(found.k, k, rtol=1e-9)
     np.testing.assert_allclose(found.x_cr, x_cr, atol=1e-9)
-    assert "0 mm RMS" in describe_turns(found, MODEL, ROBOT)
+    assert "by 0 mm in the centre of rotation (RMS)" in describe_turns(found, MODEL, ROBOT)
     assert cg_svg(found, [("calibrated", MODEL)], ROBOT).startswith("<svg")
 
 
@@ -59,9 +59,9 @@ def test_improvement_names_each_model_with_its_held_out_error() -> None:
     def numbers(before: float, after: float) -> dict[str, object]:
         return {"heldout": True, "errors": {"position_m": {"before": [before, 0, 0], "after": [after, 0, 0]}}}
 
-    text = improvement({"calibrate_diff_drive": numbers(0.163, 0.076), "calibrate_skid_steer": numbers(0.05, 0.009)})
-    assert "163 mm by diff_drive as the driver has it, 76 mm by diff_drive calibrated, 9 mm by skid_steer" in text
-    assert improvement({"calibrate_skid_steer": numbers(0.05, 0.009)}) == ""
+    text = improvement({"calibrate_diff_drive": numbers(0.163, 0.076), "calibrate_friction": numbers(0.05, 0.009)}, "friction")
+    assert "off by 9 mm with friction and the centre of gravity, by 76 mm with diff_drive calibrated, and by 163 mm with diff_drive" in text
+    assert improvement({"calibrate_skid_steer": numbers(0.05, 0.009)}, "skid_steer") == ""
 
 
 def test_try_without_lengths_names_the_options_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -271,7 +271,7 @@ def test_compare_file_that_is_no_table_is_not_overwritten(tmp_path, capsys):
         (tmp_path / "t.csv").write_bytes(content)
         assert compare(tmp_path / "t.csv") == 2
         assert (tmp_path / "t.csv").read_bytes() == content
-        assert "is no table of a comparison" in capsys.readouterr().err
+        assert "is not a table of a comparison" in capsys.readouterr().err
 
 
 @pytest.mark.extended
@@ -331,7 +331,7 @@ def test_compare_folder_gets_table_and_report(table, tmp_path, capsys):
     capsys.readouterr()
     (out / "report.html").write_text("<title>Replay of a log</title>")
     assert compare(out) == 2
-    assert "is no report of a comparison" in capsys.readouterr().err
+    assert "is not a report of a comparison" in capsys.readouterr().err
     assert (out / "report.html").read_text() == "<title>Replay of a log</title>"
 
 

@@ -61,7 +61,7 @@ def runs(contact: str) -> Diagnosis:
 def test_diagnose_84_runs_with_thesis_law_names_force_law() -> None:
     found = runs("thesis")
     assert found.windows == 84
-    assert found.sentence.startswith("Correct lateral_force_law, off by")
+    assert found.sentence.startswith("Correct lateral_force_law by")
     assert found.findings[0].size == pytest.approx(1.0, abs=0.2)
     assert found.findings[0].gain.low > 0.5
 

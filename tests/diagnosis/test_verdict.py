@@ -220,8 +220,8 @@ def test_attribute_rows_lists_no_tolerated_cause_that_is_not_significant(rotatio
 def test_sentence_slopes_along_and_across_are_told_apart() -> None:
     along, across = finding("slope", 0.03), dataclasses.replace(finding("slope", -0.02), definition=CAUSES["slope (across)"])
     text = sentence(diagnosis((along, across), (), {"yaw": row("attributed")}))
-    assert "Correct slope (along), off by +0.03 rad" in text
-    assert "slope (across), off by -0.02 rad" in text
+    assert "Correct slope (along) by +0.03 rad" in text
+    assert "slope (across) by -0.02 rad" in text
     assert [f.to_dict()["cause"] for f in (along, across)] == ["slope", "slope"]
 
 

@@ -13,7 +13,7 @@ from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.online_calibration import make_corrections
 from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
-from motion_models.registry import make_model
+from motion_models.registry import advice, make_model, recommended_model
 from motion_models.robot import Driver, Geometry, Robot
 from motion_models.robot_file import load_robot, parse_robot
 from motion_models.robot_names import robot_names
@@ -130,3 +130,10 @@ def test_calibrate_of_an_uncalibrated_robot_starts_from_its_prior() -> None:
     own = make_model("skid_steer", load_robot("vaultbot"))
     fitted = calibrate(own, rotations[:4], ["k_0"], FitConfig(noise=bare.wheel_noise)).fit
     assert fitted.config.prior_sigma == {"k_0": 0.3}  # the scale that k declares: a calibrated robot has no prior by geometry
+
+
+def test_robot_with_arms_is_advised_to_take_the_friction_model() -> None:
+    vaultbot, husky, burger = (load_robot(name) for name in ("vaultbot", "husky_a200", "turtlebot3_burger"))
+    assert [recommended_model(robot) for robot in (vaultbot, husky, burger)] == ["friction", "skid_steer", "diff_drive"]
+    assert "--model friction" in advice(vaultbot, ["diff_drive", "skid_steer"])[0]
+    assert advice(vaultbot, ["friction"]) == advice(husky, ["skid_steer"]) == []

@@ -209,7 +209,7 @@ def test_summary_large_innovations_with_honest_poses_are_no_overconfidence():
         "Its covariances are not too small by the reference (mean NEES 1.5, where 3 is expected; so short a drive shows only "
         "sigmas that are 1.8" in text
     )
-    assert "differ more than their noise allows: mean NIS" in text
+    assert "differ by more than their covariances predict: mean NIS" in text
     assert "`skidloc diagnose`" in text
     assert "overconfident" in verdict([dataclasses.replace(result, nees_mean=20.0)], track())
 
