@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from localization.events import Scan as Scan
     from localization.events import WheelSample as WheelSample
     from motion_models import *  # noqa: F403
+    from skidloc.analyses import Analysis as Analysis
     from skidloc.online import Online as Online
     from skidloc.robot_log import RobotLog as RobotLog
     from skidloc.robot_log import Runs as Runs
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from skidloc.robot_log import open as open
 
 _OWN = {
+    "Analysis": "skidloc.analyses",
     "Online": "skidloc.online",
     **dict.fromkeys(("RobotLog", "Runs", "ScoredRun", "open"), "skidloc.robot_log"),
     **dict.fromkeys(("CgSample", "ImuSample", "PositionSample", "Scan", "WheelSample"), "localization.events"),

@@ -7,14 +7,23 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from localization.errors import EvaluationError
+from localization.calibration.calibrate import Calibrated, calibrated, cut_log
+from localization.calibration.robot_check import RobotCheck, check_robot
+from localization.calibration.robot_draft import Given
+from localization.commands.twin import simulator_of
+from localization.diagnosis.corrected_robot import correct_robot
+from localization.diagnosis.drive import drive_of_log
+from localization.diagnosis.findings import Diagnosis
+from localization.diagnosis.linearization import default_model
+from localization.diagnosis.suited_model import examine_beside_suited
+from localization.diagnosis.weigh import DrivenWeighing, weigh
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result, score
@@ -24,9 +33,13 @@ from localization.log_replay import replay
 from localization.logs import Log, TopicOverrides
 from localization.pipeline import ReplayConfig
 from localization.trajectory import Trajectory
+from localization.twin.twin import TwinConfig, TwinResult
+from localization.twin.twin import examine as examine_twin
+from motion_models.registry import make_model, recommended_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from skidloc.analyses import Analysis, as_frame, of_calibration, of_check, of_diagnosis, of_twin, of_weighing
 from skidloc.online import make_trial
 
 if TYPE_CHECKING:
@@ -43,9 +56,9 @@ def open(path: str | Path, robot: str | Path | Robot, topics: TopicOverrides | N
     Signs and units of wheels and gyro that the log's other sensors contradict are corrected (`log.warnings()`). Raises
     `LogError` for a log that cannot be read, `RobotError` for a robot that does not exist.
     """
-    described = robot if isinstance(robot, Robot) else load_robot(str(robot))
-    log = open_log_with_set_up(path, described, topics or TopicOverrides()).log
-    return RobotLog(log, log.robot)
+    described, named = robot if isinstance(robot, Robot) else load_robot(str(robot)), topics or TopicOverrides()
+    log = open_log_with_set_up(path, described, named).log
+    return RobotLog(log, log.robot, named)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +67,8 @@ class RobotLog:
 
     log: Log
     robot: Robot
+    topics: TopicOverrides = field(default_factory=TopicOverrides)
+    """Topics that were named when it was opened."""
 
     @property
     def has_lidar(self) -> bool:
@@ -80,6 +95,40 @@ class RobotLog:
         track = self._reference(reference)
         runs = replay(self.log.events(), trials, self.robot, self.log.mounts, self.has_lidar, config)
         return Runs(tuple(ScoredRun(result) for result in score(runs, track)), track)
+
+    def check(self) -> Analysis[RobotCheck]:
+        """Compare signs, units, clocks, mounts and lengths of the robot with a second source each, as `skidloc check` does."""
+        return of_check(check_robot(self.log.path, self.robot, Given(topics=self.topics)))
+
+    def calibrate(self, model: str = "", free: Sequence[str] = ()) -> Analysis[Calibrated]:
+        """Fit a motion model, by default `recommended_model`; ``free`` names its parameters, by default those that the drive reveals.
+
+        ``robot`` of the result is calibrated. Raises `CalibrationError` where nothing measures the motion.
+        """
+        cut = cut_log(self.log.path, self.robot, self.topics, "auto", None)
+        fitted = calibrated(make_model(model or recommended_model(self.robot), self.robot), [cut], self.robot, list(free), False)
+        return of_calibration(fitted, cut, self.robot)
+
+    def diagnose(self, model: str = "") -> Analysis[Diagnosis]:
+        """Find what a motion model gets wrong on this log, as `skidloc diagnose` does. Raises `CalibrationError` as `calibrate`."""
+        described = make_model(model or default_model(self.robot), self.robot)
+        return of_diagnosis(examine_beside_suited(drive_of_log(self.log), described).found.diagnosis)
+
+    def weigh(self, at: tuple[float, float] | None = None) -> Analysis[DrivenWeighing]:
+        """Estimate the centre of gravity, and the mass of a load ``at`` a place of the body frame [m], from how the robot turns.
+
+        ``robot`` of the result has both. Raises `CalibrationError` where the drive does not determine it.
+        """
+        found, predictor = weigh(drive_of_log(self.log))
+        return of_weighing(found, self.robot, correct_robot(predictor, found.sizes).robot, at)
+
+    def twin(self, simulator: str | Path | None = None) -> Analysis[TwinResult]:
+        """Compare a simulator of the robot, a MuJoCo or URDF file, by default one made from the robot file, with the measured motion.
+
+        Needs the extra `mujoco`. Raises `SimulationError` for a file that cannot be simulated.
+        """
+        mjcf = simulator_of(None if simulator is None else Path(simulator), self.robot)[0]
+        return of_twin(examine_twin(list(drive_of_log(self.log).maneuvers), self.robot, mjcf, TwinConfig()))
 
     def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:
         if isinstance(given, ReferenceTrack | Relations):
@@ -132,11 +181,8 @@ class ScoredRun:
 
     def to_pandas(self) -> Any:
         """`pandas.DataFrame` of `to_numpy`, indexed by stamp [ns]. Raises `EvaluationError` where pandas is not installed."""
-        try:
-            import pandas as pd  # optional
-        except ImportError as error:
-            raise EvaluationError("to_pandas needs pandas: pip install 'skidloc[pandas]', or use to_numpy.") from error
-        return pd.DataFrame(self.to_numpy(), columns=list(COLUMNS), index=pd.Index(self.trajectory.stamps_ns, name="stamp_ns"))
+        frame = as_frame(self.to_numpy(), columns=list(COLUMNS), index=self.trajectory.stamps_ns)
+        return frame.rename_axis("stamp_ns")
 
     def plot(self, reference: ReferenceTrack | Relations | None = None) -> Picture:
         """Picture of the trajectory, aligned to the reference if there is one."""
@@ -188,6 +234,10 @@ class Runs(Sequence[ScoredRun]):
         from localization.report.notebook import trajectories  # imports matplotlib
 
         return trajectories([run.result for run in self.runs], self.reference, title)
+
+    def to_pandas(self) -> Any:
+        """`pandas.DataFrame` with a row for each run: ATE [m], NEES, number of poses."""
+        return as_frame([{"run": run.name, "ate_m": run.ate_m, "nees": run.nees, "poses": len(run.trajectory)} for run in self.runs])
 
     def __repr__(self) -> str:
         return "\n".join(["  ".join(row) for row in self._cells()])

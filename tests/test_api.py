@@ -15,6 +15,7 @@ import skidloc
 from localization.errors import EvaluationError
 from motion_models.errors import SkidlocError
 from tests.helpers.checkout import beginning_of
+from tests.helpers.compare import logs
 
 HUSKY = Path(__file__).parent / "data" / "husky-outdoor-gps" / "test1.bag"
 
@@ -130,3 +131,27 @@ def test_reprs_are_short(log: skidloc.RobotLog, runs: skidloc.Runs) -> None:
         assert len(repr(shown)) < 200
     assert "poses in" in repr(run.trajectory)
     assert run._repr_html_().startswith("<table>")
+
+
+def test_analysis_prints_its_sentence_and_table() -> None:
+    found = skidloc.Analysis(None, "1 of 1 quantities agree.", ({"quantity": "track", "size": 0.571234},))
+    assert repr(found).splitlines() == ["1 of 1 quantities agree.", "quantity  size", "track     0.5712"]
+    assert "<td>track</td>" in found._repr_html_()
+    assert list(pytest.importorskip("pandas").DataFrame(found.to_pandas()).columns) == ["quantity", "size"]
+    with pytest.raises(EvaluationError, match="no picture"):
+        found.plot()
+
+
+@pytest.mark.extended
+def test_analyses_of_a_drive_are_tables_with_pictures(tmp_path_factory: pytest.TempPathFactory) -> None:
+    drive = skidloc.open(logs(1)[0], "vaultbot")
+    calibrated = drive.calibrate("skid_steer")
+    assert {"parameter", "before", "value", "sigma"} <= set(calibrated.rows[0])
+    assert calibrated.robot is not None
+    assert calibrated.plot().png.startswith(b"\x89PNG")
+    checked = drive.check()
+    assert "quantities agree" in repr(checked)
+    assert {row["verdict"] for row in checked.rows} <= {"ok", "contradiction", "cannot be seen", "note"}
+    diagnosed = drive.diagnose()
+    assert repr(diagnosed).startswith(diagnosed.result.verdict)
+    assert diagnosed.plot().png.startswith(b"\x89PNG")
