@@ -1,7 +1,8 @@
 """What the site makes from the code: equations as MathML, lines of code beside them, and the texts of all warnings.
 
 In a page `{code: PATH :: TEXT}` becomes the number and the text of the line of the file PATH that contains TEXT, which must be one line;
-`<!-- messages: PATH -->` becomes the list of the warnings of that module.
+`<!-- messages: PATH -->` becomes the list of the warnings of that module, `<!-- readme: PATH -->` that file, `<!-- robots -->` the rows of
+the shipped robots.
 """
 
 from __future__ import annotations
@@ -9,15 +10,24 @@ from __future__ import annotations
 import ast
 import functools
 import re
+import tomllib
 from collections.abc import Iterator
 from html import escape, unescape
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from mkdocs.config.defaults import MkDocsConfig
+    from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("motion_models", "localization")
 CODE = re.compile(r"\{code: (?P<path>\S+) :: (?P<text>[^\n]+?)\}(?=\s|$)")
 MESSAGES = re.compile(r"<!-- messages: (?P<path>\S+) -->")
+README = re.compile(r"<!-- readme: (?P<path>\S+) -->")
+ROBOTS = "<!-- robots -->"
+FIGURES = ROOT / "notebooks" / "figures"
+_LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:|#)[^)]*\)")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 _BRACES = re.compile(r"\{[^}]*\}")
 _LEAST_LENGTH = 25
@@ -98,7 +108,33 @@ def on_page_markdown(markdown: str, **_: object) -> str:
     def show_messages(found: re.Match[str]) -> str:
         return "\n".join(f"- {escape(text.strip())}" for text in messages(found["path"]))
 
+    def show_readme(found: re.Match[str]) -> str:
+        """The file without its links to others, which lie outside of the site."""
+        return _LINK.sub(r"\1", (ROOT / found["path"]).read_text(encoding="utf-8"))
+
+    markdown = markdown.replace("](../notebooks/figures/", "](images/")
+    markdown = README.sub(show_readme, markdown).replace(ROBOTS, "\n".join(robot_rows()) if ROBOTS in markdown else "")
     return MESSAGES.sub(show_messages, CODE.sub(show_line, markdown))
+
+
+def robot_rows() -> list[str]:
+    """A row of a table for each shipped robot."""
+    rows = []
+    for path in sorted((ROOT / "motion_models" / "robots").glob("*.toml")):
+        robot = tomllib.loads(path.read_text(encoding="utf-8"))
+        g = robot["geometry"]
+        lengths = f"{g['track_width_m']:.3g}, {g['wheelbase_m']:.3g}"
+        rows.append(f"| {robot['name']} | {robot.get('drive', 'skid_steer')} | {lengths} | {g['mass_kg']:.3g} |")
+    return rows
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """The figures of the notebooks among the images of the pages."""
+    from mkdocs.structure.files import File  # of the extra docs
+
+    for path in sorted(FIGURES.glob("*.png")):
+        files.append(File.generated(config, f"images/{path.name}", abs_src_path=str(path)))
+    return files
 
 
 def on_page_content(html: str, **_: object) -> str:
