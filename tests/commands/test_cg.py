@@ -127,7 +127,7 @@ def test_cg_of_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     for arguments, complaint in (
         ((), "nothing to find a centre of gravity by"),
         ((tmp_path / "lost.csv",), "cannot be read"),
-        (("--posture", "nap"), "no posture 'nap'; postures are ready, stow_back"),
+        (("--posture", "nap"), "no posture 'nap'; there are ready, stow_back"),
         (("--posture", "ready", "--joint", "elbow=1"), "no joint elbow that moves mass; such joints are left_shoulder_pan_joint"),
         (("--posture", "ready", "--joint", "left_elbow_joint=up"), "must be NAME=VALUE"),
         (("--joint", "left_elbow_joint=1"), "left_shoulder_pan_joint"),  # the others are missing

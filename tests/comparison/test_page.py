@@ -152,7 +152,7 @@ def test_page_overwrites_only_a_report_of_a_comparison(tmp_path):
     assert "Nothing else" not in path.read_text()
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     path.write_text("<title>Replay of precious.mcap</title>")
-    with pytest.raises(OutputError, match="no report of a comparison"):
+    with pytest.raises(OutputError, match="not a report of a comparison"):
         write_comparison_report(path, HEAD, found)
     assert "precious" in path.read_text()
     with pytest.raises(OutputError, match="cannot be written"):

@@ -200,7 +200,7 @@ def test_reference_nmea_takes_the_date_of_rmc_else_the_logs(tmp_path):
         ("a note on the drive\nof yesterday\n", "holds no data"),
         ("1 2 3 4 5\n", "5 columns and no header"),
         ("time,speed\n1,2\n", "2 columns and no header"),
-        ("1 0 0 0 0 1 0 0 0 0 5 0\n", "no poses of KITTI"),
+        ("1 0 0 0 0 1 0 0 0 0 5 0\n", "not poses of KITTI"),
     ],
 )
 def test_reference_of_no_format_is_refused_with_what_works(tmp_path, text, found):
