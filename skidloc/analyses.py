@@ -19,12 +19,12 @@ from localization.diagnosis.weigh import DrivenWeighing
 from localization.errors import EvaluationError
 from localization.report.cg_figure import describe_turns, measured_turns, predicted_turns
 from localization.report.weigh_page import confidence_ellipse, outline, weigh_rows
-from localization.twin.twin import TwinResult
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 
 if TYPE_CHECKING:
     from localization.report.notebook import Picture
+    from localization.twin.twin import TwinResult
 
 T = TypeVar("T")
 _CURVE_POINTS = 60

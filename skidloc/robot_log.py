@@ -17,7 +17,6 @@ import numpy as np
 from localization.calibration.calibrate import Calibrated, calibrated, cut_log
 from localization.calibration.robot_check import RobotCheck, check_robot
 from localization.calibration.robot_draft import Given
-from localization.commands.twin import simulator_of
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.findings import Diagnosis
@@ -33,8 +32,6 @@ from localization.log_replay import replay
 from localization.logs import Log, TopicOverrides
 from localization.pipeline import ReplayConfig
 from localization.trajectory import Trajectory
-from localization.twin.twin import TwinConfig, TwinResult
-from localization.twin.twin import examine as examine_twin
 from motion_models.registry import make_model, recommended_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
@@ -44,6 +41,7 @@ from skidloc.online import make_trial
 
 if TYPE_CHECKING:
     from localization.report.notebook import Picture
+    from localization.twin.twin import TwinResult
 
 DEFAULT_PAIRS = ("diff_drive/odometry", "skid_steer/odometry", "skid_steer/ekf")
 COLUMNS = ("seconds", "x", "y", "theta", "var_x", "var_y", "var_theta", "vx", "vy", "wz")
@@ -125,10 +123,13 @@ class RobotLog:
     def twin(self, simulator: str | Path | None = None) -> Analysis[TwinResult]:
         """Compare a simulator of the robot, a MuJoCo or URDF file, by default one made from the robot file, with the measured motion.
 
-        Needs the extra `mujoco`. Raises `SimulationError` for a file that cannot be simulated.
+        Needs the extra `twin`. Raises `SimulationError` for a file that cannot be simulated.
         """
+        from localization.commands.twin import simulator_of  # these import MuJoCo
+        from localization.twin.twin import TwinConfig, examine
+
         mjcf = simulator_of(None if simulator is None else Path(simulator), self.robot)[0]
-        return of_twin(examine_twin(list(drive_of_log(self.log).maneuvers), self.robot, mjcf, TwinConfig()))
+        return of_twin(examine(list(drive_of_log(self.log).maneuvers), self.robot, mjcf, TwinConfig()))
 
     def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:
         if isinstance(given, ReferenceTrack | Relations):
