@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -121,15 +121,17 @@ class RobotLog:
         return of_weighing(found, self.robot, correct_robot(predictor, found.sizes).robot, at)
 
     def twin(self, simulator: str | Path | None = None) -> Analysis[TwinResult]:
-        """Compare a simulator of the robot, a MuJoCo or URDF file, by default one made from the robot file, with the measured motion.
+        """Compare a simulator of the robot (MJCF, SDF or URDF; by default one made from the robot file) with the measured motion.
 
         Needs the extra `twin`. Raises `SimulationError` for a file that cannot be simulated.
         """
-        from localization.commands.twin import simulator_of  # these import MuJoCo
-        from localization.twin.twin import TwinConfig, examine
+        from localization.commands.twin import Twin  # these import the simulator's engine
+        from localization.twin.twin import examine
 
-        mjcf = simulator_of(None if simulator is None else Path(simulator), self.robot)[0]
-        return of_twin(examine(list(drive_of_log(self.log).maneuvers), self.robot, mjcf, TwinConfig()))
+        command = Twin((self.log.path,), self.robot.name, None if simulator is None else Path(simulator))
+        opened, notes = command.open_simulator(self.robot)
+        found = examine(list(drive_of_log(self.log).maneuvers), self.robot, opened, command.config)
+        return of_twin(replace(found, notes=(*notes, *found.notes)))
 
     def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:
         if isinstance(given, ReferenceTrack | Relations):
