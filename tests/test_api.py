@@ -142,7 +142,7 @@ def test_analysis_prints_its_sentence_and_table() -> None:
         found.plot()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_analyses_of_a_drive_are_tables_with_pictures(tmp_path_factory: pytest.TempPathFactory) -> None:
     drive = skidloc.open(logs(1)[0], "vaultbot")
     calibrated = drive.calibrate("skid_steer")
