@@ -439,11 +439,11 @@ def _beyond_placebos(
 
 
 def _inseparable(problem: Regressor, chosen: Sequence[int]) -> list[tuple[int, ...]]:
-    """The ``chosen`` columns in groups of those that correlate by more than `_ALIKE` beside all that is tolerated."""
+    """The ``chosen`` columns in groups of those that leave nothing of each other beside all that is tolerated."""
     groups: list[tuple[int, ...]] = []
     for i in chosen:
         G = problem.gram
-        near = [g for g in groups if any(abs(G[i, j]) > _ALIKE * math.sqrt(max(G[i, i] * G[j, j], 1e-18)) for j in g)]
+        near = [g for g in groups if any(G[i, j] ** 2 > (1.0 - _COLLINEAR) * G[i, i] * G[j, j] for j in g)]
         groups = [g for g in groups if g not in near] + [(*(j for g in near for j in g), i)]
     return groups
 
