@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 from localization.events import Scan
 from localization.lidar.ground_hits import GroundHits
+from localization.lidar_choice import LidarChoice
 from motion_models.robot import Mount
 
 _UNKNOWN = "no transform or robot file gives the mount of the LiDAR's frame '{}'"
 _LATE = "/tf_static gave the mount of the LiDAR's frame '{}' late"
 _MEND = " Publish it on /tf_static, or add [mounts.{}] to the robot file."
 _CENTRED = "{} taken as if from the body's origin, and positions are off by about as much as it is away from there."
-_UNUSED = "{} not used, because the mounts of other frames are given."
+_UNUSED = "{} not used, because scans of another frame are."
 
 
 class LidarFrames:
@@ -30,15 +31,16 @@ class LidarFrames:
         self._unused: dict[str, int] = {}
 
     def admit(self, scan: Scan) -> bool:
-        """Whether ``scan`` is to be used. Of an unknown frame it is only where no scan of a known one has come: a robot without any
-        transforms may carry its LiDAR in the middle, but not one LiDAR in two places."""
+        """Whether ``scan`` is to be used. Of an unknown frame it is only where no scan of another one has come: a robot without any
+        transforms may carry its LiDAR in the middle, but not two LiDARs."""
         self._newest = frame = scan.frame_id
         if frame in self._mounts:
             self._has_known = True
             return True
-        counts = self._unused if self._has_known else self._centred
+        is_used = not self._has_known and (not self._centred or frame in self._centred)
+        counts = self._centred if is_used else self._unused
         counts[frame] = counts.get(frame, 0) + 1
-        return not self._has_known
+        return is_used
 
     @property
     def problem(self) -> str | None:
@@ -46,7 +48,7 @@ class LidarFrames:
         frame = self._newest
         if frame is None or frame in self._mounts:
             return None
-        what = "are not used" if self._has_known else "are taken as if from the body's origin"
+        what = "are not used" if self._has_known or frame not in self._centred else "are taken as if from the body's origin"
         return f"{_UNKNOWN.format(frame)}: its scans {what}.{_MEND.format(frame)}"
 
     def warnings(self) -> list[str]:
@@ -99,6 +101,8 @@ class ScanQueue:
         self.faulty = FaultyScans()
         self.ground = GroundHits(mounts)
         """Points on hills that may be hits of the ground."""
+        self.choice = LidarChoice()
+        """Of several LiDARs."""
         self.waiting: deque[tuple[int, Scan]] = deque()
         """Scans of known frames, each with the middle of its sweep [ns], in the order of these."""
 
@@ -106,6 +110,8 @@ class ScanQueue:
         """Let ``scan`` wait. One that was overtaken goes where it belongs, if that is after ``used_until_ns``, the end of the last step:
         going back would count the motion since then twice."""
         if not self.frames.admit(scan):
+            return
+        if (scan.frame_id != self.choice.used or self.choice.lidars) and not self.choice.admit(scan):
             return
         self.faulty.empty += not len(scan.points)
         middle_ns = scan.middle_ns

@@ -112,7 +112,7 @@ class Synchronizer:
     def warnings(self) -> list[str]:
         """Problems of the sensors so far."""
         scans = self.scans
-        of_scans = [*scans.faulty.warnings(), *scans.ground.warnings()]
+        of_scans = [*scans.faulty.warnings(), *scans.ground.warnings(), *scans.choice.warnings()]
         return [*self.inertial.warnings(), *of_scans, *self._velocity.warnings(), *scans.frames.warnings()]
 
     def next_interval(self, is_last: bool) -> StepInterval | None:

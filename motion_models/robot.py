@@ -107,7 +107,7 @@ class Topics:
     odometry: str = "/odom"
     """nav_msgs/Odometry of the robot's own driver, used where there are no joint states of wheels."""
     scan: str = "/scan"
-    """sensor_msgs/LaserScan."""
+    """sensor_msgs/LaserScan; several planar scanners with commas (/front/scan,/rear/scan)."""
     points: str = "/points"
     """sensor_msgs/PointCloud2, used where there is no planar scan."""
     imu: str = "/imu/data"

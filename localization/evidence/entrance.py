@@ -18,7 +18,7 @@ from localization.events import Scan
 from localization.evidence.alternatives import Row
 from localization.evidence.fields import own_faults
 from localization.evidence.search import make_stacks
-from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, from_scans, is_comparable
+from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, is_comparable, scan_sources
 from localization.evidence.verdict import CORRECTED, SetUp, decide
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.decode import MAX_RATE_RAD_S, JointReading, OdometryReading, imu_decoder
@@ -136,9 +136,7 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     begin_ns = first_ns if moving_ns is None else max(first_ns, moving_ns - round(_STANDING_S * 1e9))
     rows = {topic: [r for r in readings if r.stamp_ns >= begin_ns] for topic, readings in gathered.items()}
     found = sources_of_readings(log, rows, begin_ns)
-    lidar = log.sources.lidar
-    if lidar is not None and (source := from_scans(lidar.topic, _scans_of(log, begin_ns), log.mounts, begin_ns)) is not None:
-        found.append(source)
+    found += scan_sources(log.sources.lidars, _scans_of(log, begin_ns), log.mounts, begin_ns)
     if reference is not None and reference.yaws is not None:
         of_reference = from_poses(reference.source, reference.stamps_ns, reference.poses, begin_ns)
         found += [] if of_reference is None else [of_reference]

@@ -80,8 +80,15 @@ def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> l
             rows = (clock_row(source, delay),) if delay else ()
             found += [replace(a, rows=(*a.rows, *rows), delay_s=delay) for a in MAKERS[source.kind](source, rates, second, robot)]
         found.append(_unrelated(source, found[0]))
+        if sum(other.kind == source.kind for other in sources) > 1:
+            found = [replace(a, rows=tuple(_row_of(source.name, row) for row in a.rows)) for a in found]
         stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins]))
     return stacks
+
+
+def _row_of(name: str, row: Row) -> Row:
+    """``row`` of one of several sources of a kind, whose clock has no entry of its own in the robot file."""
+    return replace(row, of=name, correct=None if row.source == "clock" else row.correct)
 
 
 def _sizes_of_motion(source: Source, rates: FloatArray) -> dict[str, float]:

@@ -19,6 +19,7 @@ from localization.events import ImuSample, Scan
 from localization.lidar import LidarConfig
 from localization.logs.decode import JointReading, OdometryReading
 from localization.logs.event_decoder import arc
+from localization.logs.topic_roles import TopicSource
 from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -75,6 +76,8 @@ class Source:
     """Least time of recording less stamp [s]; None where that is unknown."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
+    is_second: bool = False
+    """A LiDAR beside another, whose place shows the centre of rotation already: its own place ahead is not asked for."""
 
     @property
     def up(self) -> FloatArray:
@@ -159,8 +162,21 @@ def from_gyro(name: str, samples: Sequence[ImuSample], mounts: Mapping[str, Moun
     return Source(name, "gyro", t, angles, known, force=force, frame=frame, mount=mounts.get(frame, Mount()))
 
 
+def scan_sources(lidars: Sequence[TopicSource], scans: Iterable[Scan], mounts: Mapping[str, Mount], first_ns: int) -> list[Source]:
+    """Motion by the scans of each of ``lidars``, of several by its frame."""
+    if len(lidars) < 2:
+        found = [from_scans(lidar.topic, scans, mounts, first_ns) for lidar in lidars]
+    else:
+        by_frame: dict[str, list[Scan]] = {}
+        for scan in scans:
+            by_frame.setdefault(scan.frame_id, []).append(scan)
+        found = [from_scans(f"the scanner '{frame}'", by_frame[frame], mounts, first_ns) for frame in sorted(by_frame)]
+    there = [source for source in found if source is not None]
+    return [replace(source, is_second=i > 0) for i, source in enumerate(there)]
+
+
 def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], first_ns: int) -> Source | None:
-    """Motion from scan to scan of the first LiDAR, at its own place, in the body's axes by its mount."""
+    """Motion from scan to scan of the first frame, at its own place, in the body's axes by its mount."""
     odometry, last_s, scale, config = ScanOdometry(), -math.inf, 0.0, LidarConfig()
     t, steps, known, frame = list[float](), list[tuple[float, float, float]](), list[tuple[bool, bool, bool]](), None
     for scan in scans:

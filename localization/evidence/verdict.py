@@ -219,6 +219,8 @@ _DECIDERS = {"gyro": "a gyro", "lidar": "a LiDAR"}
 
 
 def _topic(sources: Sequence[Source], row: Row) -> str:
+    if row.of:
+        return row.of
     kind = row.id.partition(".")[2] if row.source == "clock" else row.source
     kinds = {"wheels": ("wheels", "driver"), "driver": ("driver",)}.get(kind, (kind,))
     return next((source.name for source in sources if source.kind in kinds), kind)

@@ -69,6 +69,8 @@ class ScanMatchingSensor:
         """The match, and why the scan is lost; "" where it is not, also of the first scan."""
         scan = step.scan
         assert scan is not None
+        if scan.frame_id != self._frame:  # another LiDAR: its mount may be off against the one that drew the submap
+            self.begin_submap()
         self._frame = scan.frame_id
         if self._stale.is_stale(scan, step.is_standing):
             return None, "stale"

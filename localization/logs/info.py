@@ -153,6 +153,7 @@ def inspect_log(log: Log) -> LogInfo:
     }
     role_of = {source.topic: part for part, source in parts.items() if source is not None}
     role_of.update((source.topic, "wheels") for source in log.sources.more_wheels)
+    role_of.update((source.topic, "lidar") for source in log.sources.more_lidars)
     for source in log.sources.arms:
         role_of.setdefault(source.topic, "arms")
     if log.sources.arms:

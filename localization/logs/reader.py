@@ -83,7 +83,9 @@ class Log:
         self._decoder: EventDecoder | None = None  # of the last `events`
         self._overrides = topics
         self._chooser = TopicChooser(path.name, self.channels, robot, topics)
-        roles = choose_roles(path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge, self._mean_point)
+        roles = choose_roles(
+            path.name, self._chooser, robot, topics, self._joint_names, self._odometry_edge, self._mean_point, self._scan_frame
+        )
         self.robot = roles.robot
         """The robot, its wheel joints by the log's names."""
         self.sources = roles.sources
@@ -175,11 +177,11 @@ class Log:
         return merge(self._items(decoders, stats), self._clocks_with(decoders), stats)
 
     def scans(self) -> Iterator[Scan]:
-        """Scans or clouds of the LiDAR alone, with the ranges of its driver; none without a LiDAR."""
-        lidar = self.sources.lidar
-        if lidar is not None:
+        """Scans or clouds of the LiDARs alone, with the ranges of their drivers; none without a LiDAR."""
+        topics = [lidar.topic for lidar in self.sources.lidars]
+        if topics:
             decoder = EventDecoder(self.sources, self._joints, self._arms, self.robot, MessageStats(), self.period_s)
-            yield from self.readings({lidar.topic: decoder.decoders[lidar.topic]})
+            yield from self.readings({topic: decoder.decoders[topic] for topic in topics})
 
     def references(self, topic: str) -> Iterator[Reference]:
         """Reference poses of a pose, odometry, transform or GPS topic, by header stamp. GPS: east and north of the first fix.
@@ -218,7 +220,7 @@ class Log:
 
     def _unmounted(self, transforms: FixedTransforms) -> set[str]:
         """Frames of sensors in use whose mounts neither the log's ``transforms`` so far nor the robot file have."""
-        used = {s.topic for s in (self.sources.lidar, self.sources.imu) if s is not None}
+        used = {s.topic for s in (*self.sources.lidars, self.sources.imu) if s is not None}
         frames = {frame for topic, frame in self.frames.items() if topic in used and frame}
         return frames - transforms.mounts().keys() - self.robot.mounts.keys()
 
@@ -274,6 +276,9 @@ class Log:
 
     def _joint_names(self, topic: str) -> Iterator[list[str]]:
         return (message.name for _, message in self._first_messages(topic, _JOINT_STATES_READ))
+
+    def _scan_frame(self, topic: str) -> str:
+        return next((frame_name(message.header.frame_id) for _, message in self._first_messages(topic, 1)), "")
 
     def _mean_point(self, topic: str) -> FloatArray | None:
         points = [(message.point.x, message.point.y) for _, message in self._first_messages(topic, _POINTS_READ)]

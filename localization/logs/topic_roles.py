@@ -37,6 +37,9 @@ _WHEEL_WORDS = re.compile(r"wheel|motor|encoder|tick|joint|odom")
 """Names of topics that may be the wheels', of whatever type."""
 _MAX_LISTED = 4
 
+BODY_FRAMES = ("base_link", "base_footprint")
+"""Frames of the body, in which no LiDAR is (REP-105, REP-120)."""
+
 
 @dataclass(frozen=True)
 class TopicOverrides:
@@ -47,7 +50,7 @@ class TopicOverrides:
     odometry: str | None = None
     """nav_msgs/Odometry of the robot's own driver, used where no joint states are."""
     scan: str | None = None
-    """sensor_msgs/LaserScan."""
+    """sensor_msgs/LaserScan; several planar scanners with commas (/front/scan,/rear/scan)."""
     points: str | None = None
     """sensor_msgs/PointCloud2, used where no planar scan is."""
     imu: str | None = None
@@ -99,11 +102,18 @@ class Sources:
     """Joint states of the arms, from which the centre of gravity is computed where no topic has it; one may be the wheels' too."""
     more_wheels: tuple[TopicSource, ...] = ()
     """Joint states of the other wheels, where ``wheels`` has some of them only."""
+    more_lidars: tuple[TopicSource, ...] = ()
+    """Other planar scanners, each in a frame of its own."""
 
     @property
     def all_wheels(self) -> tuple[TopicSource, ...]:
         """Topics of the wheels."""
         return (*(() if self.wheels is None else (self.wheels,)), *self.more_wheels)
+
+    @property
+    def lidars(self) -> tuple[TopicSource, ...]:
+        """Topics of all LiDARs."""
+        return (*(() if self.lidar is None else (self.lidar,)), *self.more_lidars)
 
     @property
     def has_clouds(self) -> bool:
@@ -112,7 +122,7 @@ class Sources:
 
     def used(self) -> list[TopicSource]:
         """Each topic once."""
-        others = [*self.all_wheels, *(s for s in (self.center_of_gravity, self.imu, self.lidar) if s is not None)]
+        others = [*self.all_wheels, *(s for s in (self.center_of_gravity, self.imu, *self.lidars) if s is not None)]
         return others + [arm for arm in self.arms if all(arm.topic != other.topic for other in others)]
 
 
@@ -145,15 +155,18 @@ class TopicChooser:
 
     def find_named(self, kind: str) -> TopicSource | None:
         """The topic that an option or the robot file names. Raises `TopicError` if an option names one that does not fit."""
-        wanted = getattr(self._overrides, kind)
-        if wanted:
-            others = OTHER_TYPES.get(kind, ())
-            self.require(wanted, (TYPES[kind], *others), f"--topic.{kind.replace('_', '-')}")
-            return TopicSource(wanted, kind, "option", self.type_of(wanted) if self.type_of(wanted) in others else "")
-        topic = getattr(self._robot.topics, kind)
-        if wanted is None and self._types.get(topic) == TYPES[kind]:
-            return TopicSource(topic, kind, "robot")
-        return None
+        return next(iter(self.find_all_named(kind)), None)
+
+    def find_all_named(self, kind: str) -> list[TopicSource]:
+        """The topics that an option or the robot file names, several of planar scanners. Raises `TopicError` as `find_named`."""
+        wanted, others = getattr(self._overrides, kind), OTHER_TYPES.get(kind, ())
+        if wanted is None:
+            named = names_of(getattr(self._robot.topics, kind), kind)
+            return [TopicSource(topic, kind, "robot") for topic in named if self._types.get(topic) == TYPES[kind]]
+        for topic in names_of(wanted, kind):
+            self.require(topic, (TYPES[kind], *others), f"--topic.{kind.replace('_', '-')}")
+        types = {topic: self.type_of(topic) for topic in names_of(wanted, kind)}
+        return [TopicSource(topic, kind, "option", its_type if its_type in others else "") for topic, its_type in types.items()]
 
     def find_only(self, kind: str) -> TopicSource | None:
         """The only topic of the matching type, if no option sets the role."""
@@ -236,6 +249,11 @@ class TopicChooser:
         raise TopicError(f"{found}; {fitting}")
 
 
+def names_of(text: str, kind: str) -> tuple[str, ...]:
+    """Topics of an entry: several, with commas, of planar scanners alone; none of an empty one."""
+    return tuple(name for part in (text.split(",") if kind == "scan" else [text]) if (name := part.strip()))
+
+
 def short_type(name: str) -> str:
     """Type name without the "/msg/" in the middle."""
     return name.replace("/msg/", "/")
@@ -243,6 +261,9 @@ def short_type(name: str) -> str:
 
 JointNames = Callable[[str], Iterable[Iterable[str]]]
 """Names of the joints in each of the first messages of a topic."""
+
+ScanFrame = Callable[[str], str]
+"""Frame of a topic's first message."""
 
 OdometryEdge = Callable[[str], tuple[str, str] | None]
 """Parent and child of the odometry's transform on a topic of /tf."""
@@ -275,9 +296,10 @@ def choose_roles(
     joint_names: JointNames,
     odometry_edge: OdometryEdge = lambda topic: None,
     mean_point: MeanPoint = lambda topic: None,
+    scan_frame: ScanFrame = lambda topic: "",
 ) -> TopicRoles:
     """Choose a topic for each role. Raises `TopicError` if an option names a topic that does not fit, and what `arms_model` does."""
-    return _RoleChooser(log, chooser, robot, overrides, joint_names, odometry_edge, mean_point).choose()
+    return _RoleChooser(log, chooser, robot, overrides, joint_names, odometry_edge, mean_point, scan_frame).choose()
 
 
 class _RoleChooser:
@@ -290,8 +312,9 @@ class _RoleChooser:
         joint_names: JointNames,
         odometry_edge: OdometryEdge,
         mean_point: MeanPoint,
+        scan_frame: ScanFrame,
     ) -> None:
-        self._odometry_edge, self._mean_point = odometry_edge, mean_point
+        self._odometry_edge, self._mean_point, self._scan_frame = odometry_edge, mean_point, scan_frame
         self._log, self._chooser, self._robot = log, chooser, robot
         self._overrides, self._joint_names = overrides, joint_names
         self._joints: Sides = ((), ())
@@ -301,9 +324,10 @@ class _RoleChooser:
         self._warnings: list[str] = []
 
     def choose(self) -> TopicRoles:
-        wheels, lidar, imu, center_of_gravity = self._wheels(), self._lidar(), self._choose("imu"), self._center_of_gravity()
+        wheels, lidars, imu, center_of_gravity = self._wheels(), self._lidars(), self._choose("imu"), self._center_of_gravity()
         arms, model = self._arms() if center_of_gravity is None else ((), None)
-        sources = Sources(wheels, lidar, imu, center_of_gravity, arms, self._more_wheels)
+        lidar = lidars[0] if lidars else None
+        sources = Sources(wheels, lidar, imu, center_of_gravity, arms, self._more_wheels, tuple(lidars[1:]))
         return TopicRoles(sources, self._joints, self._error, model, self._robot, [*self._chooser.warnings, *self._warnings])
 
     def _arms(self) -> tuple[tuple[TopicSource, ...], CgModel | None]:
@@ -354,10 +378,36 @@ class _RoleChooser:
             )
         return source
 
-    def _lidar(self) -> TopicSource | None:
+    def _lidars(self) -> list[TopicSource]:
+        """A planar scanner, or several, else clouds."""
+        chooser = self._chooser
         if self._overrides.points and not self._overrides.scan:
-            return self._chooser.find_named("points")
-        return self._chooser.find_named("scan") or self._chooser.find_named("points") or self._choose("scan") or self._choose("points")
+            return chooser.find_all_named("points")
+        named = self._without_repeated(chooser.find_all_named("scan")) or chooser.find_all_named("points") or self._scanners()
+        return named or [source for source in (self._choose("scan") or self._choose("points"),) if source is not None]
+
+    def _without_repeated(self, named: list[TopicSource]) -> list[TopicSource]:
+        """``named`` without topics whose scans are in the frame of another's: those of one LiDAR count once."""
+        used: dict[str, TopicSource] = {}
+        for source in named:
+            frame = (self._scan_frame(source.topic) if len(named) > 1 else "") or source.topic
+            if frame in used:
+                self._warnings.append(f"{source.topic} is not used: its frame '{frame}' is that of {used[frame].topic}, one LiDAR's.")
+            used.setdefault(frame, source)
+        return list(used.values())
+
+    def _scanners(self) -> list[TopicSource]:
+        """Several planar scanners that nothing names, each in a frame of its own. Scans in the body's frame are made of others."""
+        topics = [] if self._overrides.scan is not None else self._chooser.candidates("scan")
+        if find_in_namespace(self._robot.topics.scan, topics) is not None:
+            return []
+        frames = {topic: self._scan_frame(topic) for topic in topics}
+        own = [topic for topic in topics if frames[topic] not in BODY_FRAMES]
+        if len(own) < 2 or len({frames[topic] for topic in own}) < len(own) or "" in frames.values():
+            return []
+        listed = " and ".join(own)
+        self._warnings.append(f"{listed} are used as planar scanners, each by its own mount. --topic.scan {own[0]} uses that one alone.")
+        return [TopicSource(topic, "scan", "only") for topic in own]
 
     def _wheels(self) -> TopicSource | None:
         """Joint states with wheels in them, else the driver's odometry."""

@@ -145,6 +145,7 @@ class Health:
         topics; ``troubles``: what cannot be written, and why."""
         of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline)]
         of_sensors += [_of_place(found)] if (found := pipeline.estimator.localization()) is not None else []
+        of_sensors += _of_lidars(pipeline)
         return [*of_sensors, _of_files(troubles or {}), _of_messages(dropped, silent or {})]
 
     def _of_estimate(self) -> Status:
@@ -211,6 +212,19 @@ class Health:
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
             return Status("wheels", WARN, _SLIP, values)
         return Status("wheels", values=values)
+
+
+def _of_lidars(pipeline: Pipeline) -> list[Status]:
+    """A status for each of several LiDARs."""
+    choice, found = pipeline.synchronizer.scans.choice, list[Status]()
+    silent = choice.silent()
+    for frame, lidar in choice.lidars.items():
+        values = {"rate_hz": f"{1.0 / lidar.period_s:.1f}", "scans": str(lidar.scans)}
+        if frame in silent:
+            found.append(Status(f"lidar {frame}", ERROR, f"no scans for {silent[frame]:.1f} s: check its driver.", values))
+        else:
+            found.append(Status(f"lidar {frame}", OK, "in use" if frame == choice.used else "ready, not in use", values))
+    return found
 
 
 def _of_place(found: Mapping[str, Any]) -> Status:

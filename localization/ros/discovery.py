@@ -15,7 +15,7 @@ from localization.logs.clock_sync import FIRST_MESSAGES, ClockPlan, FirstMessage
 from localization.logs.decode import UnusableError, frame_name, stamp_ns
 from localization.logs.driver_messages import is_by_driver
 from localization.logs.serialization import decoder, live_channel
-from localization.logs.topic_roles import OTHER_TYPES, TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, short_type
+from localization.logs.topic_roles import OTHER_TYPES, TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, names_of, short_type
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
 from localization.ros.settings import Names
@@ -70,13 +70,12 @@ class TopicDiscovery:
         """Type by topic."""
         for kind, message_type in TYPES.items():
             requested = getattr(topics, kind)
-            topic = getattr(robot.topics, kind) if requested is None else requested
-            if topic:
+            for topic in names_of(getattr(robot.topics, kind) if requested is None else requested, kind):
                 self.candidates.setdefault(topic, message_type)
         for topic, message_type in self.candidates.items():
             transport.subscribe(topic, message_type, is_latched=False)
         transport.subscribe(self._tf_static, TF_TYPE, is_latched=True)
-        self._requested = {topic for kind in TYPES if (topic := getattr(topics, kind))}
+        self._requested = {topic for kind in TYPES for topic in names_of(getattr(topics, kind) or "", kind)}
         self._decoders = {topic: decoder(kind, is_ros1=transport.is_ros1) for topic, kind in self.candidates.items()}
         self._transforms = LiveTransforms(body, is_ros1=transport.is_ros1)
         self.late: set[str] = set()
@@ -178,7 +177,7 @@ class TopicDiscovery:
 
     def _open_roles(self, group: tuple[str, ...], published: Mapping[str, set[str]], *, is_lacking: bool) -> tuple[str, ...]:
         """Roles of ``group`` whose topics are taken by their type."""
-        named = {getattr(self._robot.topics, role) for role in group} - {""}
+        named = {topic for role in group for topic in names_of(getattr(self._robot.topics, role), role)}
         has_option = any(getattr(self._topics, role) is not None for role in group)
         return () if has_option or not (is_lacking or named.isdisjoint(published)) else group
 
@@ -264,7 +263,8 @@ class TopicDiscovery:
             of_type = sorted(topic for topic, kinds in published.items() if TYPES[role] in kinds)
             chosen, others = [topic for topic in of_type if topic in used], [topic for topic in of_type if topic not in used]
             if chosen and others:
-                found.append(f"{chosen[0]} is used and {', '.join(others)} not: one {role} is. Choose it with --topic.{role}.")
+                both = f" Both: --topic.scan {','.join([*chosen, *others])}." if role == "scan" else ""
+                found.append(f"{chosen[0]} is used and {', '.join(others)} not. Choose it with --topic.{role}.{both}")
         return found
 
     def _silence(self, published: Mapping[str, set[str]], silent: Sequence[str]) -> str:
@@ -291,7 +291,7 @@ class TopicDiscovery:
     def _discovered(self) -> DiscoveredTopics:
         channels = [live_channel(topic, self.candidates[topic], count) for topic, count in self._counts.items()]
         chooser = TopicChooser("the live topics", channels, self._robot, self._topics)
-        parts = choose_roles("the live topics", chooser, self._robot, self._topics, self._joint_names)
+        parts = choose_roles("the live topics", chooser, self._robot, self._topics, self._joint_names, scan_frame=self._scan_frame)
         if parts.wheels_error is not None:
             raise parts.wheels_error
         used = {source.topic for source in parts.sources.used()}
@@ -300,6 +300,9 @@ class TopicDiscovery:
         start_ns = min(plan.first_stamps(first), default=self._transport.epoch_ns + self._transport.now_ns())
         mounts = self._robot.with_mounts(self._transforms.mounts())
         return DiscoveredTopics(parts, mounts, self._transforms, plan, start_ns, self._backlog)
+
+    def _scan_frame(self, topic: str) -> str:
+        return self._first[topic][0].frame if self._first[topic] else ""
 
     def _joint_names(self, topic: str) -> list[tuple[str, ...]]:
         return list(self._joint_lists[topic])

@@ -6,7 +6,7 @@ What is wrong is the way in which messages are read, so that these are kept as t
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.evidence import CORRECTED, SetUp
 from localization.evidence.entrance import has_moved, infer, sources_of_readings
-from localization.evidence.signals import Source, from_scans
+from localization.evidence.signals import Source, scan_sources
 from localization.logs.decode import ArmReading, JointReading, OdometryReading
 from localization.logs.topic_roles import Sources
 from localization.ros.transports.transport import Received
@@ -63,14 +63,12 @@ class _Readings:
     def sources(self, sensors: LiveSensors) -> list[Source]:
         """Sources of motion so far."""
         first_ns = self.wheels[0].stamp_ns
-        lidar, imu = sensors.sources.lidar, sensors.sources.imu
+        imu = sensors.sources.imu
         readings: dict[str, Sequence[Any]] = {sensors.sources.all_wheels[0].topic: self.wheels}
         if imu is not None:
             readings[imu.topic] = self.gyro
         found = sources_of_readings(sensors, readings, first_ns)
-        if lidar is not None and self.scans and (source := from_scans(lidar.topic, self.scans, sensors.mounts, first_ns)) is not None:
-            found.append(source)
-        return found
+        return [*found, *scan_sources(sensors.sources.lidars, self.scans, sensors.mounts, first_ns)]
 
 
 class LiveSetUp:
@@ -79,8 +77,7 @@ class LiveSetUp:
     def __init__(self, sensors: LiveSensors, executor: Executor | None = None) -> None:
         """``executor``: where questions are answered beside the estimator; None: at once."""
         self._sensors, self._executor = sensors, executor
-        source = sensors.sources.lidar
-        self._messages = KeptMessages("" if source is None else source.topic)
+        self._messages = KeptMessages({source.topic for source in sensors.sources.lidars})
         self._readings = _Readings()
         self._first: JointReading | OdometryReading | None = None
         self._moving_ns: int | None = None
@@ -203,18 +200,18 @@ class EntranceChecks:
 
 
 class KeptMessages:
-    """Messages in order of coming; those of the LiDAR, which are large, up to `_MAX_BYTES`."""
+    """Messages in order of coming; those of LiDARs, which are large, up to `_MAX_BYTES`."""
 
-    def __init__(self, lidar: str) -> None:
-        """``lidar``: its topic."""
-        self._lidar_topic = lidar
+    def __init__(self, lidars: Collection[str]) -> None:
+        """``lidars``: their topics."""
+        self._lidars = lidars
         self._lidar: deque[Received] = deque()
         self._others: deque[Received] = deque()
         self._bytes = 0
 
     def add(self, received: Received) -> None:
         """Keep ``received``."""
-        if received.topic != self._lidar_topic:
+        if received.topic not in self._lidars:
             self._others.append(received)
             return
         self._lidar.append(received)

@@ -41,7 +41,7 @@ _CLEARPATH_TOPICS = {
     "joint_states": "/platform/joint_states",
     "odometry": "/platform/odom",
     "imu": "/sensors/imu_0/data",
-    "scan": "/sensors/lidar2d_0/scan",
+    "scan": "/sensors/lidar2d_0/scan,/sensors/lidar2d_1/scan",
     "points": "/sensors/lidar3d_0/points",
 }
 """Topics of Clearpath's robots inside their namespace (docs.clearpathrobotics.com, ROS 2 Jazzy, platform and sensors API)."""
@@ -80,12 +80,16 @@ class Names(Settings):
                 raise SettingError(f"the remapping rule is '{rule}'; it must be FROM:=TO with two names of topics, as in scan:=front/scan.")
 
     def resolve(self, topic: str) -> str:
-        """The absolute name of ``topic`` after remapping; the first rule that fits counts."""
+        """The absolute name of ``topic`` after remapping; the first rule that fits counts. Of several topics with commas, each."""
+        if "," in topic:
+            return ",".join(self.resolve(part.strip()) for part in topic.split(",") if part.strip())
         full = self._expand(topic)
         return next((self._expand(after) for before, after in self._rules() if self._expand(before) == full), full)
 
     def in_namespace(self, topic: str) -> str:
         """``topic`` of a robot file, where namespaces are not known: absolute there, inside the namespace here."""
+        if "," in topic:
+            return ",".join(self.in_namespace(part.strip()) for part in topic.split(","))
         return self.resolve(topic if topic in _GLOBAL else topic.lstrip("/")) if topic else topic
 
     def apply_to_robot(self, robot: Robot) -> Robot:

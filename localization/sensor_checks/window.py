@@ -86,7 +86,7 @@ class Window:
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig) -> None:
         self.scans = MountedScans(mounts, config)
         """The last that was registered is the one that ended the last bin."""
-        self._open = _Accumulator()
+        self._open, self._frame = _Accumulator(), ""
         self.bins = Bins.of(np.empty((0, _COLUMNS)))
         self.has_scans = self.has_gyro = False
         """Whether any scan, or turn by a gyro, has come."""
@@ -103,6 +103,8 @@ class Window:
         waits_for_scan = self.has_scans and step.scan is None
         if self._open.duration_s < (_MAX_BIN_S if waits_for_scan else BIN_S):
             return False
+        if step.scan is not None and step.scan.frame_id != self._frame:  # another LiDAR: its scans are registered from here on
+            self._frame, self._open.has_scan_at_start = step.scan.frame_id, False
         lidar, across = (_UNKNOWN, _UNKNOWN) if step.scan is None else self._register(step.scan)
         closed, self._open = self._open, _Accumulator(has_scan_at_start=step.scan is not None)
         row = np.array([[closed.duration_s, *closed.wheels, closed.gyro, *lidar, closed.is_standing, *across]])

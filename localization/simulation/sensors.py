@@ -283,8 +283,9 @@ class TruthSensor:
 
 START_NS = 1_000_000_000
 """Stamp of the simulation's beginning; 0 would mean "not set"."""
-LASER, CLOUD, IMU, GPS = "laser", "velodyne", "imu_link", "gps_link"
-_MOUNTS = {LASER: Mount(x=0.4, z=0.2), CLOUD: Mount(z=0.8), IMU: Mount(z=0.1), GPS: Mount(z=1.0)}
+LASER, REAR, CLOUD, IMU, GPS = "laser", "rear_laser", "velodyne", "imu_link", "gps_link"
+_REAR_TOPIC = "/rear/scan"
+_MOUNTS = {LASER: Mount(x=0.4, z=0.2), REAR: Mount(x=-0.4, z=0.2, yaw=math.pi), CLOUD: Mount(z=0.8), IMU: Mount(z=0.1), GPS: Mount(z=1.0)}
 
 
 @dataclass(frozen=True)
@@ -293,6 +294,8 @@ class SensorConfig(Settings):
 
     lidar: Literal["2d", "3d", "none"] = "2d"
     """Planar scanner on /scan, spinning scanner on /points, or none."""
+    rear: bool = False
+    """Second planar scanner on /rear/scan, which looks backwards."""
     center_of_gravity: bool = False
     """Publish the nominal CG, by arms and robot file, on its topic."""
     truth_hz: Positive = 25.0
@@ -348,6 +351,9 @@ def make_sensors(
     real, late = reality.lidar, reality.lidar_late_s
     if config.lidar == "2d":
         sensors.append(PlanarScanner(config.scanner, topics.scan, LASER, real, world, late, START_NS, lidar))
+        if config.rear:
+            rear = np.random.default_rng(seeds.spawn(1)[0])
+            sensors.append(PlanarScanner(config.scanner, _REAR_TOPIC, REAR, mounts[REAR], world, 0.0, START_NS, rear))
     elif config.lidar == "3d":
         sensors.append(SpinningScanner(config.spinning, topics.points, CLOUD, real, world, late, START_NS, lidar))
     return sensors
@@ -369,7 +375,7 @@ def with_faults(config: SensorConfig, reality: TrueRobot) -> SensorConfig:
 
 def transforms(config: SensorConfig, robot: Robot) -> Message:
     """The nominal mounts, which faults do not change."""
-    unused = {LASER: config.lidar != "2d", CLOUD: config.lidar != "3d"}
+    unused = {LASER: config.lidar != "2d", REAR: config.lidar != "2d" or not config.rear, CLOUD: config.lidar != "3d"}
     edges = [
         ("base_link", name, (m.x, m.y, m.z), quaternion(m)) for name, m in nominal_mounts(robot).items() if not unused.get(name, False)
     ]

@@ -53,10 +53,11 @@ DRIVE = Experiment("short", "for tests", "hall", (0.0, 0.0, 0.0), _phases)
 
 
 @functools.cache
-def drive_log(lidar: str = "2d", seed: int = 0, scans_hz: float = 12.5) -> Path:
-    """An .mcap of about 20 s; ``scans_hz`` is that of the planar scanner."""
-    path = Path(_FOLDER.name) / f"drive_{lidar}_{seed}_{scans_hz}.mcap"
-    config = SimulationConfig(sensors=SensorConfig(lidar=lidar, scanner=ScannerConfig(rate_hz=scans_hz), encoders=EncoderConfig()))
+def drive_log(lidar: str = "2d", seed: int = 0, scans_hz: float = 12.5, *, rear: bool = False) -> Path:
+    """An .mcap of about 20 s; ``scans_hz`` is that of the planar scanner, or of two (``rear``)."""
+    path = Path(_FOLDER.name) / f"drive_{lidar}_{seed}_{scans_hz}_{rear}.mcap"
+    sensors = SensorConfig(lidar=lidar, rear=rear, scanner=ScannerConfig(rate_hz=scans_hz), encoders=EncoderConfig())
+    config = SimulationConfig(sensors=sensors)
     write_simulation(path, Simulation(DRIVE, ROBOT, seed, {}, config))
     return path
 

@@ -40,12 +40,14 @@ def beginning(messages):
 def test_clearpath_namespace_names_topics_transforms_and_the_second_imu():
     run = OnlineSettings("vaultbot", node=NodeConfig(clearpath="a200_0000", wait_s=0.0, predict=False)).live_run()
     used = run.resolve_topics().robot.topics
-    assert [used.joint_states, used.imu, used.scan] == list(CLEARPATH.values())[:3]
+    front, rear = used.scan.split(",")
+    assert [used.joint_states, used.imu, front] == list(CLEARPATH.values())[:3]
+    assert rear == "/a200_0000/sensors/lidar2d_1/scan"
     assert used.points == "/a200_0000/sensors/lidar3d_0/points"
     transport = LogTransport(drive_log(), lambda ms: [m._replace(topic=CLEARPATH.get(m.topic, m.topic)) for m in beginning(ms)])
     transport.types = {CLEARPATH.get(topic, topic): kind for topic, kind in transport.types.items()}
     transport.types["/a200_0000/sensors/imu_1/data"] = "sensor_msgs/msg/Imu"
-    named = TopicOverrides(used.joint_states, scan=used.scan, imu=used.imu)
+    named = TopicOverrides(used.joint_states, scan=front, imu=used.imu)
     _, reports = run_node(transport, config=run.node, topics=named)
     assert len(transport.published["/a200_0000/skidloc/odometry"]) > 30
     assert {"/a200_0000/tf", "/a200_0000/diagnostics"} <= set(transport.published)

@@ -62,6 +62,8 @@ class Row:
     since_s: float | None = None
     """Time from which on the source has it [s after the first reading]; None: all the time."""
     until_s: float | None = None
+    of: str = ""
+    """Name of the source, where several are of one kind."""
 
     @property
     def source(self) -> str:
@@ -71,13 +73,13 @@ class Row:
     @property
     def family(self) -> str:
         """What of its source it is about: rows of one family exclude each other."""
-        return "wheels.scale" if self.id in ("wheels.unit", "wheels.factor", "wheels.angle_unit") else f"{self.id}:{self.detail}"
+        return "wheels.scale" if self.id in ("wheels.unit", "wheels.factor", "wheels.angle_unit") else f"{self.of}{self.id}:{self.detail}"
 
     @property
     def key(self) -> tuple[str, str]:
         """Equal for rows that are corrected alike, up to a measured value."""
         when = "" if self.since_s is None and self.until_s is None else " since" if self.until_s is None else " until"
-        return self.id, self.detail + when
+        return self.of + self.id, self.detail + when
 
 
 @dataclass(frozen=True, eq=False)
