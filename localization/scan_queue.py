@@ -102,7 +102,7 @@ class ScanQueue:
         self.ground = GroundHits(mounts)
         """Points on hills that may be hits of the ground."""
         self.choice = LidarChoice()
-        """Of several LiDARs."""
+        """Choice among several LiDARs."""
         self.waiting: deque[tuple[int, Scan]] = deque()
         """Scans of known frames, each with the middle of its sweep [ns], in the order of these."""
 

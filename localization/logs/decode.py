@@ -53,6 +53,7 @@ class Oddity(Enum):
     REPEATED = "dropped (stamp repeated)"
     SECOND_FRAME = "dropped (stamp repeated by another frame: two sensors share the topic); give each of them its own topic"
     LATE = "dropped (recorded long after newer ones)"
+    OVERTAKEN = "dropped (waited for the processor while newer ones came); free the processor, or lower the rate or the points of the LiDAR"
     OLD = "dropped (stamped seconds before the topic's others: latched, or left in a buffer)"
     OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
     REBASED = "stamped after a jump of the clock, moved back by it"

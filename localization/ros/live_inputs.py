@@ -3,12 +3,12 @@ were found to be wired."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from localization.logs.decode import MessageStats
+from localization.logs.decode import MessageStats, Oddity
 from localization.logs.topic_roles import Sources
 from localization.ros.discovery import ROLE_GROUPS, TF, TF_STATIC, TF_TYPE, DiscoveredTopics, TransformConflicts
 from localization.ros.gnss import FIX_TYPE, GnssReceiver, parse_datum, utm_pose
@@ -16,8 +16,11 @@ from localization.ros.live_stream import LiveStream
 from localization.ros.payloads import Payloads
 from localization.ros.session import LiveRobot
 from localization.ros.settings import LiveRun
-from localization.ros.transports.transport import Transport
+from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount
+
+_MAX_WAIT = 1.5
+"""For how many periods a scan waits for the processor, where a newer one is here."""
 
 
 class LiveInputs:
@@ -72,8 +75,27 @@ class LiveInputs:
             self._transport.subscribe(self.gnss.topic, FIX_TYPE, is_latched=False)
             others.append(self.gnss.topic)
         sources = self.sources
-        urgent = [source.topic for source in (sources.lidar, sources.wheels if is_predicting else None) if source is not None]
+        urgent = [source.topic for source in (*sources.lidars, sources.wheels if is_predicting else None) if source is not None]
         self._transport.restrict([*others, *self.topics, *commands], [*urgent, *commands])
+
+    def without_overtaken(self, messages: Sequence[Received], now_ns: int) -> Sequence[Received]:
+        """``messages`` without the scans that have waited for `_MAX_WAIT` of their period while a newer one came.
+
+        Where the processor is too slow for all, the newest counts; messages of wheels and gyro are all integrated.
+        """
+        if len(messages) < 2:
+            return messages
+        lidars = {source.topic for source in self.sources.lidars}
+        newest, kept = {received.topic: received for received in messages if received.topic in lidars}, list[Received]()
+        for received in messages:
+            if received.topic in lidars and received is not newest[received.topic]:
+                rate = self.stream.topic_rates[received.topic]
+                if (now_ns - received.received_ns) * 1e-9 > _MAX_WAIT * rate.period_s > 0.0:
+                    rate.count(received.received_ns)
+                    self.stats.count(received.topic, Oddity.OVERTAKEN)
+                    continue
+            kept.append(received)
+        return kept
 
     def lacking(self) -> list[tuple[str, ...]]:
         """Groups of roles without a topic."""

@@ -11,7 +11,7 @@ import math
 import queue
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
@@ -209,7 +209,10 @@ class Node:
         while not is_over():
             has_estimate = False
             is_behind = self._waiting is not None and self._waiting.is_ready()
-            for received in self._transport.take(0.0 if is_behind else _POLL_S, self.batch_s()):
+            messages: Sequence[Received] = self._transport.take(0.0 if is_behind else _POLL_S, self.batch_s())
+            if self._waiting is None:
+                messages = self.inputs.without_overtaken(messages, self._transport.now_ns())
+            for received in messages:
                 has_estimate |= self._receive(received)
             has_estimate |= self._catch_up(time.monotonic() + _CATCH_UP_S)
             now = time.monotonic()

@@ -770,7 +770,7 @@ class _FakeRclpy(types.ModuleType):
     def spin_once(self, timeout_sec):
         if self.waiting:
             topic, data = self.waiting.pop(0)
-            self.subscriptions[topic][1](data)
+            self.subscriptions[topic][1](data, {"received_timestamp": time.time_ns() - (len(self.waiting) + 1) * 10**9})
 
 
 def test_rclpy_transport_calls_the_documented_interface(monkeypatch):
@@ -810,7 +810,9 @@ def test_rclpy_transport_calls_the_documented_interface(monkeypatch):
     latched = fake.subscriptions["/tf_static"][2]
     assert (latched.reliability, latched.durability) == ("reliable", "transient local")
     fake.waiting = [("/scan", b"one"), ("/tf_static", b"two")]
-    assert [(r.topic, r.data) for r in transport.take(0.1)] == [("/scan", b"one"), ("/tf_static", b"two")]
+    waited = transport.take(0.1)
+    assert [(r.topic, r.data) for r in waited] == [("/scan", b"one"), ("/tf_static", b"two")]
+    assert (waited[1].received_ns - waited[0].received_ns) * 1e-9 == pytest.approx(1.0, abs=0.5)
     transport.publish("/skidloc/odometry", b"three")
     assert fake.sent == [("/skidloc/odometry", b"three")]
     assert transport.publishers() == {"/scan": {"sensor_msgs/msg/LaserScan"}}  # /points has no publisher

@@ -127,13 +127,16 @@ def test_newest_scan_wins_where_the_processor_is_too_slow():
     transport = LogTransport(drive_log(scans_hz=6.25))
     transport.types = {topic: kind for topic, kind in transport.types.items() if kind != SCAN or topic == "/scan"}
     node, _ = run_node(transport)
-    inputs, now_ns = node.inputs, transport.now_ns()
-    waited = [Received("/scan", now_ns - round(age * 1e9), b"") for age in (1.0, 0.84, 0.68, 0.1)]
-    wheels = [Received("/joint_states", now_ns - round(age * 1e9), b"") for age in (0.9, 0.5)]
-    assert inputs.without_overtaken([*waited, *wheels], now_ns) == [waited[-1], *wheels]
-    assert inputs.stats.of("/scan", Oddity.OVERTAKEN) == 3
-    in_time = [Received("/scan", now_ns - round(age * 1e9), b"") for age in (0.17, 0.01)]
-    assert inputs.without_overtaken(in_time, now_ns) == in_time
+    inputs, begin_ns = node.inputs, transport.now_ns()
+
+    def scans(*after_s: float) -> list[Received]:
+        return [Received("/scan", begin_ns + round(seconds * 1e9), b"") for seconds in after_s]
+
+    waited, wheels = scans(0.16, 0.32, 0.64), [Received("/joint_states", begin_ns + round(0.2 * i * 1e9), b"") for i in (1, 2)]
+    assert inputs.without_overtaken([*waited, *wheels], begin_ns + 740_000_000) == [waited[-1], *wheels]
+    assert inputs.stats.of("/scan", Oddity.OVERTAKEN) == 2
+    in_time = scans(0.8, 0.96)
+    assert inputs.without_overtaken(in_time, begin_ns + 970_000_000) == in_time
 
 
 def test_queues_hold_seconds_of_each_sensor():

@@ -27,7 +27,7 @@ import numpy as np
 
 from localization.errors import TransportError
 from localization.logs.serialization import Shape, encode, fields, make, type_hash
-from localization.ros.transports.transport import LAST_DOMAIN, MonotonicTime, Received
+from localization.ros.transports.transport import LAST_DOMAIN, MonotonicTime, Received, queue_depth
 
 try:
     import cyclonedds.core as dds
@@ -45,7 +45,7 @@ except ImportError as error:
         " cyclonedds has no wheel, that extra is zenoh (--transport zenoh, beside rmw_zenohd); or source ROS 2 and use rclpy."
     ) from error
 
-_LATEST, _DEPTH, _LATCHED_DEPTH = 200, 10, 100
+_DEPTH, _LATCHED_DEPTH = 10, 100
 _FASTEST_DRIFT = 1e-4  # of one clock against another
 _RARE_NS = 50_000_000
 """Beside urgent messages, those of topics with few are looked for this often [ns]."""
@@ -98,7 +98,7 @@ class DdsTransport(MonotonicTime):
 
     def subscribe(self, topic: str, kind: str, *, is_latched: bool, is_command: bool = False) -> None:
         """Receive ``topic``: transient local and reliable where ``is_latched``, reliable where ``is_command``, else best effort."""
-        quality = _latched() if is_latched else _command() if is_command else _sensor_data()
+        quality = _latched() if is_latched else _command() if is_command else _sensor_data(kind)
         reader = DataReader(self._participant, self._topic(_dds_name(topic), kind), _hashed(quality, kind))
         is_new = dds.ReadCondition(reader, dds.ViewState.Any | dds.InstanceState.Any | dds.SampleState.NotRead)
         self._waiting.attach(is_new)
@@ -250,8 +250,8 @@ def _hashed(quality: Qos, kind: str) -> Qos:
     return Qos(Policy.Userdata(f"typehash={type_hash(kind)};".encode()), base=quality)
 
 
-def _sensor_data() -> Qos:
-    latest = Policy.History.KeepLast(_LATEST)
+def _sensor_data(kind: str) -> Qos:
+    latest = Policy.History.KeepLast(queue_depth(kind))
     return Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, latest, Policy.IgnoreLocal.Participant, *_COMMON)
 
 

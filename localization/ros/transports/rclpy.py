@@ -9,9 +9,11 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from localization.errors import TransportError
-from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler
+from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler, queue_depth
 
-_LATEST, _LATCHED_DEPTH, _DEPTH = 50, 100, 10
+_LATCHED_DEPTH, _DEPTH = 100, 10
+_MAX_WAITED_NS = 60_000_000_000
+"""Longest wait in the middleware's queue that is taken as one [ns]: its times are of the wall clock, which may be set."""
 _MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
 _SERVICE_PACKAGES = ("std_srvs",)
 _REQUEST_FIELDS = ("data", "filename", "map_url")
@@ -68,13 +70,15 @@ class RclpyTransport(MonotonicTime):
         """Receive ``topic``: transient local and reliable where ``is_latched``, reliable where ``is_command``, else best effort."""
         q = self._qos
         quality = q.QoSProfile(
-            depth=_LATCHED_DEPTH if is_latched else _LATEST,
+            depth=_LATCHED_DEPTH if is_latched else queue_depth(kind),
             reliability=q.ReliabilityPolicy.RELIABLE if is_latched or is_command else q.ReliabilityPolicy.BEST_EFFORT,
             durability=q.DurabilityPolicy.TRANSIENT_LOCAL if is_latched else q.DurabilityPolicy.VOLATILE,
         )
 
-        def on_message(data: bytes) -> None:
-            self._received.append(Received(topic, time.monotonic_ns(), bytes(data)))
+        def on_message(data: bytes, info: Mapping[str, int]) -> None:
+            waited_ns = time.time_ns() - info.get("received_timestamp", 0)  # in the middleware's queue
+            received_ns = time.monotonic_ns() - (waited_ns if 0 < waited_ns < _MAX_WAITED_NS else 0)
+            self._received.append(Received(topic, received_ns, bytes(data)))
 
         self._subscriptions[topic] = self._node.create_subscription(_interface_class(kind), topic, on_message, quality, raw=True)
 
@@ -115,14 +119,14 @@ class RclpyTransport(MonotonicTime):
         return bool(self._writers[topic].get_subscription_count())
 
     def take(self, timeout_s: float, batch_s: float = 0.0) -> list[Received]:
-        """In the order in which the executor has them; ``batch_s`` is not used."""
+        """In the order in which the middleware received them; ``batch_s`` is not used."""
         self._executor.spin_once(timeout_sec=timeout_s)
         while self._received:
             before = len(self._received)
             self._executor.spin_once(timeout_sec=0.0)
             if len(self._received) == before:
                 break
-        found, self._received = self._received, []
+        found, self._received = sorted(self._received, key=lambda received: received.received_ns), []
         return found
 
     def publishers(self) -> Mapping[str, set[str]]:

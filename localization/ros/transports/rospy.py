@@ -15,10 +15,9 @@ from urllib.parse import urlparse
 
 from localization.errors import TransportError
 from localization.logs.serialization import definition
-from localization.ros.transports.transport import MonotonicTime, Received
+from localization.ros.transports.transport import MonotonicTime, Received, queue_depth
 
 _DEBIAN = Path("/usr/lib/python3/dist-packages")
-_LATEST = 100
 
 
 def _import(name: str) -> Any:
@@ -63,7 +62,9 @@ class RospyTransport(MonotonicTime):
         def on_message(message: Any) -> None:
             self._received.put(Received(topic, time.monotonic_ns(), message._buff))
 
-        self._subscribers[topic] = self._rospy.Subscriber(topic, self._bytes_type(kind), on_message, queue_size=_LATEST, tcp_nodelay=True)
+        self._subscribers[topic] = self._rospy.Subscriber(
+            topic, self._bytes_type(kind), on_message, queue_size=queue_depth(kind), tcp_nodelay=True
+        )
 
     def restrict(self, topics: Collection[str], urgent: Collection[str] = ()) -> None:
         """Receive only these of the topics subscribed to, from now on; none is urgent, for `take` waits for no batch."""

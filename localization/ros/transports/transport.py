@@ -16,6 +16,18 @@ LAST_DOMAIN = 230
 CLOCK, CLOCK_TYPE = "/clock", "rosgraph_msgs/msg/Clock"
 
 
+_QUEUE_S = 2.0
+"""Time for which messages of sensors wait for the node [s]: a pause of the process that loses nothing."""
+_FASTEST_HZ = {"sensor_msgs/msg/LaserScan": 50.0, "sensor_msgs/msg/PointCloud2": 20.0}
+_FASTEST_OTHER_HZ = 400.0
+"""Rates that are not exceeded by LiDARs, by type, and by wheels and IMUs [Hz]."""
+
+
+def queue_depth(kind: str) -> int:
+    """How many messages of a sensor's type ``kind`` wait at most: those of `_QUEUE_S` at the fastest rate."""
+    return round(_QUEUE_S * _FASTEST_HZ.get(kind, _FASTEST_OTHER_HZ))
+
+
 class Received(NamedTuple):
     """A message as it came."""
 
