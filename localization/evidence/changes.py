@@ -15,7 +15,7 @@ import numpy as np
 
 from localization.evidence.alternatives import Alternative, Row
 from localization.evidence.alternatives.alternative import LEVELS
-from localization.evidence.likelihood import Choice, Stack, evidence_by_bin, log_posterior
+from localization.evidence.likelihood import Choice, Stack, evidence_by_bin, log_posterior, varied
 from motion_models.se2 import FloatArray
 
 _ODDS = math.log(0.1)
@@ -44,9 +44,10 @@ def with_changes(stacks: Sequence[Stack], choices: Sequence[Choice]) -> tuple[li
 def _best_change(stacks: Sequence[Stack], choice: Choice, index: int) -> Alternative | None:
     """The most probable alternative of one source that has a row more on one side of a change, the other sources as in ``choice``; None
     where none is more probable than the best without a change."""
-    zeros, stack, bins = [0] * len(stacks), stacks[index], range(_MIN_BINS, len(stacks[index].t) - _MIN_BINS, _EVERY)
-    level = max(LEVELS, key=lambda each: log_posterior([s.only(k) for s, k in zip(stacks, choice, strict=True)], zeros, 0, each)[0])
-    E = evidence_by_bin(stacks, choice, index, level) + stack.log_jacobians
+    stack, bins = stacks[index], range(_MIN_BINS, len(stacks[index].t) - _MIN_BINS, _EVERY)
+    level = max(LEVELS, key=lambda each: log_posterior(stacks, np.array([choice]), each)[0])
+    choices = varied(choice, index, stack)
+    E = evidence_by_bin(stacks, choices, level) + stack.log_jacobians
     own = np.array([a.log_prior + a.own for a in stack.alternatives])
     candidates = list[tuple[float, int, int, Row, bool]]()
     for base, k, row in _pairs(stack) if bins else ():
@@ -59,8 +60,8 @@ def _best_change(stacks: Sequence[Stack], choice: Choice, index: int) -> Alterna
     if not joined:
         return None
     tried = [stack.of(joined) if i == index else other for i, other in enumerate(stacks)]
-    scores = log_posterior(tried, choice, index, level)
-    unchanged = log_posterior(stacks, choice, index, level)
+    scores = log_posterior(tried, varied(choice, index, tried[index]), level)
+    unchanged = log_posterior(stacks, choices, level)
     return joined[int(scores.argmax())] if scores.max() > unchanged.max() else None
 
 

@@ -22,8 +22,8 @@ from motion_models.se2 import FloatArray
 _ITERATIONS = 4
 _SIZE_SIGMA = 0.7
 """Standard deviation of the logarithm of a drive's speed over `WAY_M_S`, and of its turns: 0.1 m/s to 2 m/s are two of them."""
-Noises = tuple[FloatArray, FloatArray]
-"""Floors (k,) and parts of the motion (k,), or two sigmas."""
+Pair = tuple[FloatArray, FloatArray]
+"""Floors (k, n) and parts of the motion (k,) of the noise; or scales and biases (k,), or their sigmas."""
 
 
 def log_size_prior(log_size: FloatArray) -> FloatArray:
@@ -33,32 +33,32 @@ def log_size_prior(log_size: FloatArray) -> FloatArray:
 
 @kernel
 def channel_evidence(
-    z: FloatArray, floor: FloatArray, relative: FloatArray, tau: FloatArray, bias_sigma: FloatArray, sizes: tuple[float, float]
+    z: FloatArray, floor: FloatArray, relative: FloatArray, tau: FloatArray, bias_sigma: FloatArray, size: float, least: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Tempered evidence by bin (A, n); that of the size, the scales and the biases (A,); scales' logarithms and the data's information on
     them (A, k).
 
-    ``z`` (A, k, n): A alternatives of k sources in n bins, NaN where unknown; ``floor``, ``bias_sigma`` (k,); ``relative``, ``tau`` (A, k);
-    ``sizes``: prior standard deviation of the motion, and the least one: maps by which the robot stands explain nothing.
+    ``z`` (A, k, n): A alternatives of k sources in n bins, NaN where unknown; ``floor`` (A, k, n); ``bias_sigma`` (k,); ``relative`` and
+    ``tau`` (A, k); ``size``: prior standard deviation of the motion; ``least`` (A,): what is smaller is no motion.
     """
     A, k, n = z.shape
-    size, least = sizes
     of_bins, price = np.zeros((A, n)), np.zeros(A)
     c, information = np.zeros((A, k)), np.zeros((A, k))
     x, b = np.zeros(n), np.zeros(k)
     for i in range(A):
-        noise = floor, relative[i]
+        noise = floor[i], relative[i]
         _first_scales(z[i], tau[i], c[i])
-        b[:] = 0.0
+        b[:] = x[:] = 0.0
+        _motion(z[i], noise, np.exp(c[i]), b, size, x)  # by the floors of the noise first, then with its part of the motion
         for _ in range(_ITERATIONS):
             _motion(z[i], noise, np.exp(c[i]), b, size, x)
             if k > 1:
                 _scales(z[i], noise, (tau[i], bias_sigma), x, c[i], b, information[i])
         scale = np.exp(c[i])
-        own = max(least, _size_of_motion(z[i], noise, scale, b, size, x))
+        own = max(least[i], _size_of_motion(z[i], noise, scale, b, size, x))
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
         for m in range(n):
-            of_bins[i, m] = TEMPER * _bin_evidence(z[i, :, m], noise, scale, b, own, x[m])
+            of_bins[i, m] = TEMPER * _bin_evidence(z[i], noise, m, scale, b, own, x[m])
     return of_bins, price, c, information
 
 
@@ -88,33 +88,32 @@ def _first_scales(z: FloatArray, tau: FloatArray, c: FloatArray) -> None:
 
 
 @subroutine
-def _variance(noise: Noises, j: int, scale: float, x: float) -> float:
-    """Variance of source ``j`` at the motion ``x``."""
-    return float(noise[0][j] ** 2 + (noise[1][j] * scale * x) ** 2)
+def _variance(noise: Pair, j: int, m: int, scale: float, x: float) -> float:
+    """Variance of source ``j`` in bin ``m`` at the motion ``x``."""
+    return float(noise[0][j, m] ** 2 + (noise[1][j] * scale * x) ** 2)
 
 
 @subroutine
-def _motion(z: FloatArray, noise: Noises, a: FloatArray, b: FloatArray, size: float, x: FloatArray) -> None:
-    """Posterior mean of the motion (n,): by the floors of the noise first, then with its part of the motion."""
+def _motion(z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, size: float, x: FloatArray) -> None:
+    """Posterior mean of the motion (n,), the noise as at the motion ``x`` so far."""
     for m in range(z.shape[1]):
-        x[m] = _mean(z[:, m], noise, a, b, size, 0.0)
-        x[m] = _mean(z[:, m], noise, a, b, size, x[m])
+        x[m] = _mean(z, noise, m, a, b, size, x[m])
 
 
 @subroutine
-def _mean(z: FloatArray, noise: Noises, a: FloatArray, b: FloatArray, size: float, near: float) -> float:
-    """Posterior mean of the motion in one bin, the noise as at a motion ``near``."""
+def _mean(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, size: float, near: float) -> float:
+    """Posterior mean of the motion in bin ``m``, the noise as at a motion ``near``."""
     product, information = 0.0, size**-2.0
     for j in range(len(z)):
-        if math.isfinite(z[j]):
-            weight = a[j] / _variance(noise, j, a[j], near)
-            product += weight * (z[j] - b[j])
+        if math.isfinite(z[j, m]):
+            weight = a[j] / _variance(noise, j, m, a[j], near)
+            product += weight * (z[j, m] - b[j])
             information += weight * a[j]
     return float(product / information)
 
 
 @subroutine
-def _scales(z: FloatArray, noise: Noises, prior: Noises, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray) -> None:
+def _scales(z: FloatArray, noise: Pair, prior: Pair, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray) -> None:
     """Scales, biases and the information on the scales (k,) by the motion ``x``, with sigmas of their ``prior``."""
     tau, bias_sigma = prior
     for j in range(len(c)):
@@ -127,12 +126,12 @@ def _scales(z: FloatArray, noise: Noises, prior: Noises, x: FloatArray, c: Float
 
 
 @subroutine
-def _weighted_sums(z: FloatArray, x: FloatArray, floor: float, relative: float, a: float, b: float) -> tuple[float, ...]:
+def _weighted_sums(z: FloatArray, x: FloatArray, floor: FloatArray, relative: float, a: float, b: float) -> tuple[float, ...]:
     """Sums over the bins of x^2, (z - b) x, x, z and 1, weighted by the noise; a residual beyond three sigma counts less (Cauchy)."""
     wxx, wxz, wx, wz, w_all = 1e-12, 0.0, 0.0, 0.0, 0.0
     for m in range(len(z)):
         if math.isfinite(z[m]):
-            V = floor**2 + (relative * a * x[m]) ** 2
+            V = floor[m] ** 2 + (relative * a * x[m]) ** 2
             w = 1.0 / (V + (z[m] - b - a * x[m]) ** 2 / 9.0)
             wxx += w * x[m] * x[m]
             wxz += w * (z[m] - b) * x[m]
@@ -143,35 +142,46 @@ def _weighted_sums(z: FloatArray, x: FloatArray, floor: float, relative: float, 
 
 
 @subroutine
-def _size_of_motion(z: FloatArray, noise: Noises, a: FloatArray, b: FloatArray, size: float, x: FloatArray) -> float:
+def _size_of_motion(z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, size: float, x: FloatArray) -> float:
     """Standard deviation of the motion of this drive, near ``x``."""
     square = 0.0
     for m in range(len(x)):
-        square += _mean(z[:, m], noise, a, b, size, x[m]) ** 2
+        square += _mean(z, noise, m, a, b, size, x[m]) ** 2
     return math.sqrt(square / len(x) + (0.01 * size) ** 2)
 
 
 @subroutine
-def _bin_evidence(z: FloatArray, noise: Noises, a: FloatArray, b: FloatArray, size: float, x: float) -> float:
-    """Log density of one bin: all sources measure the motion; or all but one do; or none does. Each is exp(-q / 2) / sqrt(d)."""
+def _bin_evidence(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, size: float, x: float) -> float:
+    """Log density of bin ``m``: all sources measure the motion; or all but one do; or none does. Each is exp(-q / 2) / sqrt(d)."""
     k, S2 = len(z), size**2
     zz, az, C, V_all, zz_out, V_out = 0.0, 0.0, 1.0 / S2, 1.0, 0.0, 1.0
     for j in range(k):
-        if math.isfinite(z[j]):
-            r, V = z[j] - b[j], _variance(noise, j, a[j], x)
+        if math.isfinite(z[j, m]):
+            r, V = z[j, m] - b[j], _variance(noise, j, m, a[j], x)
             zz, az, C, V_all = zz + r * r / V, az + a[j] * r / V, C + a[j] ** 2 / V, V_all * V * math.tau
             zz_out, V_out = zz_out + r * r / (a[j] ** 2 * S2 + V), V_out * (a[j] ** 2 * S2 + V) * math.tau
-    least = min(zz - az * az / C, zz_out)
-    total = (1.0 - OUTLIER) * _density(zz - az * az / C - least, V_all * C * S2)
+    together = zz - az * az / C
+    least = min(together, zz_out)
+    for j in range(k if k > 2 else 0):
+        least = min(least, _without(z, noise, m, (a, b), S2, x, j, (zz, az, C, V_all))[0])
+    total = (1.0 - OUTLIER) * _density(together - least, V_all * C * S2)
     total += (0.2 * OUTLIER if k > 2 else OUTLIER) * _density(zz_out - least, V_out)
     for j in range(k if k > 2 else 0):
-        q, d = zz - az * az / C, V_all * C * S2
-        if math.isfinite(z[j]):
-            r, V = z[j] - b[j], _variance(noise, j, a[j], x)
-            rest, U = C - a[j] ** 2 / V, a[j] ** 2 * S2 + V
-            q, d = zz - r * r / V - (az - a[j] * r / V) ** 2 / rest + r * r / U, V_all / V * rest * S2 * U
+        q, d = _without(z, noise, m, (a, b), S2, x, j, (zz, az, C, V_all))
         total += 0.8 * OUTLIER / k * _density(q - least, d)
     return math.log(total) - 0.5 * least
+
+
+@subroutine
+def _without(z: FloatArray, noise: Pair, m: int, maps: Pair, S2: float, x: float, j: int, sums: tuple[float, ...]) -> tuple[float, float]:
+    """q and d of a bin in which source ``j`` measures another motion than the others, from the ``sums`` over all of them and the scales and
+    biases (k,) of their ``maps``."""
+    (a, b), (zz, az, C, V_all) = maps, sums
+    if not math.isfinite(z[j, m]):
+        return zz - az * az / C, V_all * C * S2
+    r, V = z[j, m] - b[j], _variance(noise, j, m, a[j], x)
+    rest, U = max(C - a[j] ** 2 / V, 1.0 / S2), a[j] ** 2 * S2 + V  # 1 / S2 at least, whatever is rounded off
+    return zz - r * r / V - (az - a[j] * r / V) ** 2 / rest + r * r / U, V_all / V * rest * S2 * U
 
 
 @subroutine

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from localization.evidence.alternatives.alternative import (
     STILL_M_S,
@@ -30,9 +31,9 @@ class Noise:
     relative: float
     """Part of the motion: slip, matching."""
     turn_floor: float
-    """[rad/s]"""
+    """[rad/s]; of wheels part of the largest turn that their rates may be (`Stack.sizes`): encoders are still where the robot is."""
     way_floor: float
-    """[m/s]"""
+    """[m/s]; of wheels part of the largest way."""
     turn_scale: float
     """Sigma of the logarithm of its scale: skidding, gyro."""
     way_scale: float
@@ -41,11 +42,20 @@ class Noise:
     """Sigma of a constant yaw rate [rad/s]."""
     skid_relative: float = 0.0
     """Part of the turns where the robot turns by a changing part of what its wheels turn (`_SKID_ODDS`)."""
+    turn_of_way: float = 0.0
+    """Error of the turn by the way [rad/m]: sides that slip or grow; fr079, ACES, Husky: 0.03, 0.04, 0.003."""
+    skid_of_way: float = 0.0
+    """The same where the robot skids."""
+
+    @property
+    def floors(self) -> dict[str, float]:
+        """By channel."""
+        return {"way": self.way_floor, "turn": self.turn_floor}
 
 
 NOISE: Mapping[Kind, Noise] = {
-    "wheels": Noise(0.15, 0.03, 0.02, 0.25, 0.08, skid_relative=1.2),
-    "driver": Noise(0.15, 0.03, 0.02, 0.05, 0.08, skid_relative=1.2),
+    "wheels": Noise(0.15, 0.01, 0.03, 0.25, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12),
+    "driver": Noise(0.15, 0.01, 0.03, 0.05, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12),
     "gyro": Noise(0.04, 0.01, 0.0, 0.03, 0.0, bias=0.03),
     "lidar": Noise(0.06, 0.02, 0.02, 0.01, 0.04),
     "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),
@@ -56,10 +66,15 @@ _SKID_ODDS, _SKID_SIGMA = math.log(0.03), 0.4
 _STANDS_ODDS = math.log(0.03)
 """Share of drives without a way, as turning in place, or without a turn."""
 _AT_REST = 0.05
-"""Part of the root mean square of a source's rates up to which it stands."""
+"""Part of a source's `Stack.sizes` up to which it stands."""
+STILL = {"way": STILL_M_S, "turn": STILL_RAD_S}
+_FAST = 5.0
+"""Size of a fast robot's motion over `_SIZES`: 2.5 m/s, 3 rad/s."""
 _SIZES = {"way": WAY_M_S, "turn": TURN_RAD_S}
 Choice = tuple[int, ...]
 """Index of an alternative, by source."""
+Choices = NDArray[np.intp]
+"""(A, sources) choices."""
 _SCALE_SHARE: Mapping[Kind, tuple[float, float]] = {
     "wheels": (0.5, 0.5),
     "driver": (1.0, 0.0),
@@ -89,7 +104,7 @@ class Stack:
         least."""
         if self.raw:
             return self.raw
-        sizes = {"way": STILL_M_S, "turn": STILL_RAD_S}
+        sizes = dict(STILL)
         in_units = [a for a in self.alternatives if not np.any(a.log_jacobian)]
         of = {name: [size_of(c) for a in in_units if (c := getattr(a, name)) is not None and np.isfinite(c).any()] for name in sizes}
         return {name: max([least, *of[name]]) for name, least in sizes.items() if getattr(self.alternatives[0], name) is not None}
@@ -111,7 +126,7 @@ class Stack:
         known = np.isfinite(channel)
         mean_square = (np.where(known, channel, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         plausible = log_size_prior(0.5 * np.log(mean_square / size**2 + 1e-4))
-        stands = mean_square < (_AT_REST * self.sizes[name] * np.exp(self._log_unit(name).max(axis=1))) ** 2
+        stands = mean_square < (_AT_REST * self.sizes[name] * np.exp(self.log_unit(name).max(axis=1))) ** 2
         plausible = np.where(stands, np.maximum(plausible, _STANDS_ODDS), plausible)
         log_size = math.log(self.sizes[name]) + 0.5 * (1.0 + math.log(math.tau))
         of_unit = self._jacobians_of(name).sum(axis=1)
@@ -133,26 +148,63 @@ class Stack:
         return np.asarray(found)
 
     def _jacobians_of(self, name: str) -> FloatArray:
-        """(A, n) tempered logarithm of the Jacobian of a channel, for encoders where they move: at rest they count nothing in any unit."""
+        """(A, n) tempered logarithm of the Jacobian of a channel: what counts nothing at rest does so in any unit."""
         channel = self.channel(name)
         assert channel is not None
-        names = list(_SIZES) if self.kind == "driver" else [name]  # a driver reckons both of the same wheels
-        has_noise = self.kind not in ("wheels", "driver")  # at rest as well
-        counts = np.isfinite(channel) if has_noise else np.any([self._is_moving(each) for each in names], axis=0)
-        return np.asarray(TEMPER * self._log_unit(name) * counts)
+        return np.asarray(TEMPER * self.log_unit(name) * (np.isfinite(channel) & self._is_scaled))
 
-    def _log_unit(self, name: str) -> FloatArray:
+    def log_unit(self, name: str) -> FloatArray:
         """(A, n) logarithm of the unit of a channel."""
-        channel, shares = self.channel(name), _SCALE_SHARE[self.kind]
-        assert channel is not None
-        of_each = [np.broadcast_to(shares[(name == "turn") != a.is_crossed] * a.log_jacobian, channel.shape[1:]) for a in self.alternatives]
-        return np.stack(of_each)
+        return self._log_units[name]
 
-    def _is_moving(self, name: str) -> BoolArray:
-        """(A, n)"""
-        channel = self.channel(name)
-        assert channel is not None
-        return np.array([np.abs(np.nan_to_num(z)) > _AT_REST * size_of(z) for z in channel])
+    def unit(self, name: str) -> FloatArray:
+        """(A,) largest unit of a channel over the robot file's; 1 where all are smaller."""
+        return np.asarray(np.maximum(np.exp(self.log_unit(name).max(axis=1)), 1.0))
+
+    @cached_property
+    def _log_units(self) -> dict[str, FloatArray]:
+        found, shares = {}, _SCALE_SHARE[self.kind]
+        for name, channel in self._channels.items():
+            of_each = [shares[(name == "turn") != a.is_crossed] * a.log_jacobian for a in self.alternatives]
+            found[name] = np.zeros((len(of_each), 0 if channel is None else channel.shape[1]))
+            for row, of_one in zip(found[name], of_each, strict=True):
+                row[:] = of_one
+        return found
+
+    def floor(self, name: str) -> FloatArray:
+        """(A, n) noise of a channel, or of turns while "skidding", that does not grow with the channel itself; that of turns grows with the
+        way. It is in the unit of the channel, so that no unit has less noise than another."""
+        return self._floors.get(name, self._floors["turn"])
+
+    @cached_property
+    def _floors(self) -> dict[str, FloatArray]:
+        noise, way = NOISE[self.kind], self.channel("way")
+        found = {}
+        for name, floor in noise.floors.items():
+            if self.channel(name) is None:
+                continue
+            scaled = floor * (self.sizes[name] if self._counts else 1.0) * np.exp(self.log_unit(name))
+            found[name] = np.where(self._is_scaled, scaled, STILL[name])
+        if way is not None and "turn" in found:
+            by_way = np.exp(self.log_unit("turn") - self.log_unit("way")) * np.nan_to_num(way)
+            found["skidding"] = np.hypot(found["turn"], noise.skid_of_way * by_way)
+            found["turn"] = np.hypot(found["turn"], noise.turn_of_way * by_way)
+        return found
+
+    @property
+    def _counts(self) -> bool:
+        """Whether the source counts encoders."""
+        return self.kind in ("wheels", "driver")
+
+    @cached_property
+    def _is_scaled(self) -> BoolArray:
+        """(n,) where the source's rates have a unit: encoders have none where all are still, other sensors have noise there."""
+        of_rates = [
+            np.max(np.abs(np.nan_to_num(channel)) / np.exp(self.log_unit(name)), axis=0) / self.sizes[name]
+            for name, channel in self._channels.items()
+            if channel is not None
+        ]
+        return np.asarray(np.max(of_rates, axis=0) > (_AT_REST if self._counts else -1.0))
 
     def channel(self, name: str) -> FloatArray | None:
         """(A, n) way or turn; None where it is not measured."""
@@ -175,16 +227,23 @@ class Stack:
         }
 
 
-def log_posterior(stacks: Sequence[Stack], choice: Sequence[int], vary: int, level: float) -> FloatArray:
-    """Log posterior (A,) of all alternatives of source ``vary``, the others as in ``choice``, at a ``level`` of the noise."""
-    others = sum(float(stack.own[c]) for i, (stack, c) in enumerate(zip(stacks, choice, strict=True)) if i != vary)
-    return np.asarray(stacks[vary].own + others + evidence_by_bin(stacks, choice, vary, level).sum(axis=1))
+def varied(choice: Choice, index: int, stack: Stack) -> Choices:
+    """``choice`` with each alternative of source ``index``, whose ``stack`` it is."""
+    found = np.repeat(np.array([choice]), len(stack.alternatives), axis=0)
+    found[:, index] = np.arange(len(found))
+    return found
 
 
-def evidence_by_bin(stacks: Sequence[Stack], choice: Sequence[int], vary: int, level: float) -> FloatArray:
+def log_posterior(stacks: Sequence[Stack], choices: Choices, level: float) -> FloatArray:
+    """Log posterior (A,) of ``choices`` at a ``level`` of the noise."""
+    own = sum(stack.own[rows] for stack, rows in zip(stacks, choices.T, strict=True))
+    return np.asarray(own + evidence_by_bin(stacks, choices, level).sum(axis=1))
+
+
+def evidence_by_bin(stacks: Sequence[Stack], choices: Choices, level: float) -> FloatArray:
     """(A, n) the part of `log_posterior` that the sources have of each other."""
     names = [name for name in _SIZES if any(stack.channel(name) is not None for stack in stacks)]
-    return np.asarray(sum(_evidence(stacks, choice, vary, name, level) for name in names))
+    return np.asarray(sum(_evidence(stacks, choices, name, level) for name in names))
 
 
 def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
@@ -193,59 +252,62 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     used = [i for i, stack in enumerate(single) if stack.channel(name) is not None]
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
-        inputs = _inputs(single, [0] * len(single), 0, name, 1.0, used)
-        _, _, c, information = channel_evidence(*inputs, (_SIZES[name], 0.0))
+        inputs = _inputs(single, np.zeros((1, len(single)), int), name, 1.0, used)
+        _, _, c, information = channel_evidence(*inputs, _SIZES[name], np.zeros(1))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
     return found
 
 
-def _evidence(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: str, level: float) -> FloatArray:
+def least_sizes(stacks: Sequence[Stack], choices: Choices, name: str) -> FloatArray:
+    """Size (A,) of the motion below which the robot stands, or goes straight on: what is smaller explains no more the smaller it is.
+
+    It is part of the largest that its sensors may have measured, in the robot file's unit or in that of the choice, or of a fast robot's.
+    """
+    measured = [s.sizes[name] * s.unit(name)[rows] for s, rows in zip(stacks, choices.T, strict=True) if name in s.sizes]
+    largest = np.max([*measured, np.zeros(len(choices))], axis=0)
+    return np.asarray(np.maximum(_AT_REST * np.minimum(largest, _FAST * _SIZES[name]), STILL[name]))
+
+
+def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float) -> FloatArray:
     """Evidence (A, n) by bin of one channel, at a level of the noise; what concerns all bins is spread over them."""
     used = [i for i, stack in enumerate(stacks) if stack.channel(name) is not None]
-    inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choice, vary, name, level, used)
-    sizes = _SIZES[name], min(stacks[i].sizes[name] for i in used)
-    of_bins, price, _, _ = channel_evidence(*inputs, sizes)
+    inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choices, name, level, used)
+    least = least_sizes(stacks, choices, name)
+    of_bins, price, _, _ = channel_evidence(*inputs, _SIZES[name], least)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
+    skidding = level * np.stack([stacks[i].floor("skidding")[choices[:, i]] for i in used], axis=1) if name == "turn" else floor
     for share in (level * skids, relative) if name == "turn" and skids.any() else ():  # k changes, or is unusual
         of_share = np.ascontiguousarray(np.where(skids > 0.0, share, relative))
         of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
-        of_sliding, price_of_sliding, _, _ = channel_evidence(z, floor, of_share, of_k, bias_sigma, sizes)
+        of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, _SIZES[name], least)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
         of_bins = np.where(is_better[:, None], of_sliding, of_bins)
         price = np.where(is_better, price_of_sliding + _SKID_ODDS, price)
     is_alone = np.isfinite(z).any(axis=2).sum(axis=1) < 2
     found = of_bins + price[:, None] / z.shape[2]
     if is_alone.any():
-        found[is_alone] = (_of_one_source(stacks, choice, vary, name, used) / z.shape[2])[is_alone, None]
+        found[is_alone] = (_of_one_source(stacks, choices, name, used) / z.shape[2])[is_alone, None]
     return np.asarray(found)
 
 
-def _of_one_source(stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: str, used: Sequence[int]) -> FloatArray:
+def _of_one_source(stacks: Sequence[Stack], choices: Choices, name: str, used: Sequence[int]) -> FloatArray:
     """Evidence (A,) of a channel that one source measures alone: of its unit, and of nothing else.
 
     Flat over motions up to the size of the source's rates: a map by which the robot moves less than its wheels turn explains nothing.
     """
-    found = np.zeros(len(stacks[vary].alternatives))
-    for i in used:
-        mine = stacks[i].alone[name]
-        found = found + (mine if i == vary else mine[choice[i]])
-    return found
+    return np.asarray(sum(stacks[i].alone[name][choices[:, i]] for i in used))
 
 
 def _inputs(
-    stacks: Sequence[Stack], choice: Sequence[int], vary: int, name: str, level: float, used: Sequence[int]
+    stacks: Sequence[Stack], choices: Choices, name: str, level: float, used: Sequence[int]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Channels (A, k, n), floors (k,), relative noise (A, k), sigmas of scales (A, k) and of biases (k,)."""
-    A = len(stacks[vary].alternatives)
-    rows = [slice(None) if i == vary else slice(choice[i], choice[i] + 1) for i in used]
-    channels = [stacks[i].channel(name) for i in used]
-    z = np.stack([np.broadcast_to(c[r], (A, c.shape[1])) for c, r in zip(channels, rows, strict=True) if c is not None], axis=1)
+    """Channels and floors (A, k, n), relative noise (A, k), sigmas of scales (A, k) and of biases (k,)."""
+    rows = {i: choices[:, i] for i in used}
+    z = np.stack([c[r] for i, r in rows.items() if (c := stacks[i].channel(name)) is not None], axis=1)
+    floor = level * np.stack([stacks[i].floor(name)[r] for i, r in rows.items()], axis=1)
+    tau = np.stack([stacks[i].tau[name][r] for i, r in rows.items()], axis=1)
     noise = [NOISE[stacks[i].kind] for i in used]
-    is_turn = name == "turn"
-    floor = level * np.array([n.turn_floor if is_turn else n.way_floor for n in noise])
-    relative = level * np.broadcast_to([n.relative for n in noise], (A, len(used)))
-    tau = np.stack([np.broadcast_to(stacks[i].tau[name][r], A) for i, r in zip(used, rows, strict=True)], axis=1)
-    bias_sigma = np.array([n.bias if is_turn else 0.0 for n in noise])
-    z, relative, tau = (np.ascontiguousarray(each) for each in (z, relative, tau))  # else each layout is compiled
+    relative = level * np.repeat([[n.relative for n in noise]], len(choices), axis=0)
+    bias_sigma = np.array([n.bias if name == "turn" else 0.0 for n in noise])
     return z, floor, relative, tau, bias_sigma

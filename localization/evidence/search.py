@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives import MAKERS, Alternative, Row
-from localization.evidence.alternatives.alternative import LEVELS, STILL_M_S, STILL_RAD_S, size_of, unrelated_evidence
+from localization.evidence.alternatives.alternative import LEVELS, size_of, unrelated_evidence
 from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
-from localization.evidence.likelihood import Choice, Stack, log_posterior
+from localization.evidence.likelihood import Choice, Stack, least_sizes, log_posterior, varied
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -79,10 +79,13 @@ def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> l
             second = source.rates(edges, delay, of_second=True)[bins] if source.second is not None else np.full_like(rates, np.nan)
             rows = (clock_row(source, delay),) if delay else ()
             found += [replace(a, rows=(*a.rows, *rows), delay_s=delay) for a in MAKERS[source.kind](source, rates, second, robot)]
-        found.append(_unrelated(source, found[0]))
+        stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins]))
+    least = {name: float(least_sizes(stacks, np.zeros((1, len(stacks)), int), name)[0]) for name in ("way", "turn")}
+    for i, (source, stack) in enumerate(zip(sources, stacks, strict=True)):
+        found = [*stack.alternatives, _unrelated(source, stack.alternatives[0], least)]
         if sum(other.kind == source.kind for other in sources) > 1:
             found = [replace(a, rows=tuple(_row_of(source.name, row) for row in a.rows)) for a in found]
-        stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins]))
+        stacks[i] = stack.of(found)
     return stacks
 
 
@@ -121,12 +124,11 @@ def _thinned(rows: IntArray, most: int) -> IntArray:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]
 
 
-def _unrelated(source: Source, by_file: Alternative) -> Alternative:
-    """A source whose channels are of another motion: each has its own size."""
+def _unrelated(source: Source, by_file: Alternative, least: Mapping[str, float]) -> Alternative:
+    """A source whose channels are of another motion: each has its own size, ``least`` at least as the robot's motion."""
     row = Row(f"{source.kind}.unrelated", f"{source.name} measures another motion than the others", _UNRELATED_ODDS)
     channels = {name: getattr(by_file, name) for name in ("way", "turn") if getattr(by_file, name) is not None}
-    floors = {"way": STILL_M_S, "turn": STILL_RAD_S}
-    own = by_file.own + sum(unrelated_evidence(channel, floors[name]) for name, channel in channels.items())
+    own = by_file.own + sum(unrelated_evidence(channel, least[name]) for name, channel in channels.items())
     return replace(by_file, rows=(row,), own=own, **{name: np.full_like(channel, np.nan) for name, channel in channels.items()})
 
 
@@ -152,8 +154,8 @@ def search(stacks: Sequence[Stack]) -> Found:
             against[key] = min(value, against.get(key, math.inf))
     best = [choice for choice in sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED] if found[choice] > -_FAR]
     stacks, changed = with_changes(stacks, list(dict.fromkeys([*best[:_CHANGED], null])))
-    kept = dict.fromkeys([null, *best, *changed])
-    return Found({choice: _marginal(stacks, choice) for choice in kept}, against, stacks)
+    kept = list(dict.fromkeys([null, *best, *changed]))
+    return Found(dict(zip(kept, _marginal(stacks, kept).tolist(), strict=True)), against, stacks)
 
 
 def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[Choice, float]) -> dict[str, float]:
@@ -164,7 +166,7 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
     def expand(choice: Choice) -> None:
         done.add(choice)
         for i in range(len(stacks)):
-            for k, value in enumerate(log_posterior(stacks, choice, i, level)):
+            for k, value in enumerate(log_posterior(stacks, varied(choice, i, stacks[i]), level)):
                 at_level[(*choice[:i], k, *choice[i + 1 :])] = float(value)
 
     expand(null)
@@ -174,10 +176,13 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
     for width in () if is_clear else _WIDTHS:
         for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
             expand(choice)
-    for choice in () if is_clear else sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
-        for twin in (*_mirrored(stacks, choice), *_shifted(stacks, choice)):
-            if twin not in done:
-                expand(twin)
+    best = sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]
+    twins = [twin for choice in best for twin in (*_mirrored(stacks, choice), *_shifted(stacks, choice))]
+    if twins and not is_clear:
+        at_level.update(zip(twins, log_posterior(stacks, np.array(twins), level).tolist(), strict=True))
+        for choice in sorted({*best, *twins}, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
+            if choice not in done:
+                expand(choice)
     best = sorted(at_level, key=at_level.__getitem__, reverse=True)[:_RESCORED]
     top = at_level[best[0]]
     for choice in best:
@@ -197,15 +202,17 @@ def _against(stacks: Sequence[Stack], null: Choice, scores: Mapping[Choice, floa
 
 
 def _mirrored(stacks: Sequence[Stack], choice: Choice) -> list[Choice]:
-    """Choices by which the robot moves backwards, to the other side, or both, whose sources agree as well as those of ``choice``.
+    """Choices by which the robot moves backwards, to the other side, or both, for all sources or for all but one.
 
-    They differ in each source at once, so that no change of one source leads to them.
+    They differ in several sources at once, so that no change of one source leads to them.
     """
     found = []
     for signs in ({"way": -1.0, "turn": 1.0}, {"way": 1.0, "turn": -1.0}, {"way": -1.0, "turn": -1.0}):
-        twin = [_mirror_of(stack, k, signs) for stack, k in zip(stacks, choice, strict=True)]
-        if all(k is not None for k in twin):
-            found.append(tuple(k for k in twin if k is not None))
+        mirrors = [_mirror_of(stack, k, signs) for stack, k in zip(stacks, choice, strict=True)]
+        for kept in (None, *range(len(stacks))):
+            twin = [k if i == kept else mirror for i, (k, mirror) in enumerate(zip(choice, mirrors, strict=True))]
+            if all(k is not None for k in twin):
+                found.append(tuple(k for k in twin if k is not None))
     return found
 
 
@@ -249,10 +256,9 @@ def _mirror_of(stack: Stack, k: int, signs: Mapping[str, float]) -> int | None:
     return int(np.flatnonzero(fits)[stack.own[fits].argmax()]) if fits.any() else None
 
 
-def _marginal(stacks: Sequence[Stack], choice: Choice) -> float:
-    """Log posterior of one choice, integrated over the level of the noise."""
-    single = [stack.only(k) for stack, k in zip(stacks, choice, strict=True)]
-    return float(np.logaddexp.reduce([log_posterior(single, [0] * len(single), 0, level)[0] for level in LEVELS]))
+def _marginal(stacks: Sequence[Stack], choices: Sequence[Choice]) -> FloatArray:
+    """Log posterior (A,) of ``choices``, integrated over the level of the noise."""
+    return np.asarray(np.logaddexp.reduce([log_posterior(stacks, np.array(choices), level) for level in LEVELS]))
 
 
 def rows_of(stacks: Sequence[Stack], choice: Choice) -> tuple[Row, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 from localization.evidence.alternatives import Row
 from localization.evidence.likelihood import Choice, Stack
 from localization.evidence.refine import measured_scales, refined_rows
-from localization.evidence.search import posterior, search
+from localization.evidence.search import posterior, rows_of, search
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 
@@ -84,23 +84,25 @@ def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own
     hypotheses = tuple(Hypothesis(p, rows) for p, _, rows in found if p >= _NAMED)
     by_file = sum(p for p, _, rows in found if not rows)
     if by_file > 1.0 - CERTAIN:
-        return SetUp(
-            "consistent", robot, hypotheses, by_file=by_file, against=searched.against, scales=measured_scales(stacks, ranked[0][1])
-        )
+        chosen = next(choice for _, choice, rows in found if not rows)
+        usual = _with_usual(robot, stacks, chosen)
+        scales, keys = measured_scales(stacks, chosen), changed_entries(robot, usual)
+        return SetUp("consistent", usual, hypotheses, keys=keys, by_file=by_file, against=searched.against, scales=scales)
     kept = [(p, choice, rows) for p, choice, rows in found if p >= _NAMED]
     common = _common(kept)
     is_certain = kept[0][0] >= CERTAIN or all(len(rows) == len(common) for _, _, rows in kept)
+    usual = _with_usual(robot, stacks, kept[0][1])
     if (alignment := _alignment(sources, kept, common)) is not None:
-        return _aligned(sources, kept, common, alignment, robot, hypotheses, by_file)
-    corrected = _correct(robot, common)
+        return _aligned(sources, kept, common, alignment, usual, hypotheses, by_file)
+    corrected = _correct(usual, common)
+    keys = changed_entries(robot, corrected)
     families = {row.family for row in common}
     rest = [] if is_certain else [tuple(row for row in rows if row.family not in families) for _, _, rows in kept]
     is_gyro_used = not any(row.source == "gyro" and row.correct is None for row in common)
     is_gyro_used &= not any(row.source == "gyro" for rows in rest for row in rows)
     unresolved = [(p, choice) for p, choice, rows in kept if any(row.correct is None or row.family not in families for row in rows)]
     corrected = _with_mixture_noise(corrected, stacks, unresolved)
-    keys = changed_entries(robot, _correct(robot, common))
-    sentences = (*_correction_warnings(sources, common, robot, kept), *_ambiguity_warnings(sources, kept, rest))
+    sentences = (*_correction_warnings(sources, common, usual, kept), *_ambiguity_warnings(sources, kept, rest))
     return SetUp("certain" if is_certain else "ambiguous", corrected, hypotheses, sentences, keys, is_gyro_used, by_file=by_file)
 
 
@@ -153,6 +155,11 @@ def _common(kept: Sequence[tuple[float, Choice, tuple[Row, ...]]]) -> tuple[Row,
     """Faults of the most probable set-up of whose family all named ones have one: their measured values hardly differ."""
     shared = set.intersection(*({row.family for row in rows} for _, _, rows in kept))
     return tuple(row for row in kept[0][2] if row.family in shared)
+
+
+def _with_usual(robot: Robot, stacks: Sequence[Stack], choice: Choice) -> Robot:
+    """``robot`` with the rows of a choice that are no faults, which its file leaves open."""
+    return _correct(robot, [row for row in rows_of(stacks, choice) if not row.is_fault])
 
 
 def _correct(robot: Robot, rows: Sequence[Row]) -> Robot:

@@ -113,6 +113,11 @@ class Log:
         """Time of recording less stamp of each stamped topic that is used [s], by its first messages: the latency, where clocks agree."""
         return {topic: (self._clocks.offset_ns - offset) * 1e-9 for topic, offset in self._clocks.latency_ns.items()}
 
+    @property
+    def shifted_s(self) -> Mapping[str, float]:
+        """Shift of the stamps of each topic whose clock is far from the others' [s]: they are moved to the time of recording."""
+        return {topic: shift * 1e-9 for topic, shift in self._clocks.shifts_ns.items()}
+
     def rate_errors(self) -> dict[str, float]:
         """By how much faster than the recorder's the clock of a topic in use runs [s/s], where it is another than the other topics', by the
         headers of the first minutes."""

@@ -120,7 +120,8 @@ def test_an_encoder_that_counts_nothing_is_left_out(tmp_path: Path) -> None:
 def test_units_of_velocities_alone_are_corrected(tmp_path: Path, unit: float, name: str) -> None:
     found = set_up_of(drive(tmp_path / "log.mcap", scaled(None, unit)))
     assert re.search(f"in (rev/s or )?{name}, not in rad/s", found.sentences[0])
-    assert found.robot.joints.rate_unit_rad_s == pytest.approx(unit, rel=1e-3)
+    named = (unit, math.tau) if "rev/s or" in found.sentences[0] else (unit,)  # k is not known to the 4 % that are between the two
+    assert any(found.robot.joints.rate_unit_rad_s == pytest.approx(one, rel=1e-3) for one in named)
 
 
 def test_units_of_positions_alone_are_measured(tmp_path: Path) -> None:
@@ -153,6 +154,20 @@ def test_positions_that_are_reset_once_are_no_counter(tmp_path: Path) -> None:
         return (position - 30.0 if next(numbers) > 500 else position), velocity
 
     assert set_up_of(drive(tmp_path / "log.mcap", reset)).sentences == ()
+
+
+@pytest.mark.parametrize(("is_first", "since_s", "until_s"), [(True, None, 30.0), (False, 30.0, None)], ids=["until", "since"])
+def test_velocities_that_double_within_a_log_are_named_with_the_time(
+    tmp_path: Path, is_first: bool, since_s: float | None, until_s: float | None
+) -> None:
+    numbers = itertools.count()
+
+    def doubled(position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return NOTHING, 2.0 * velocity if (next(numbers) < 300) == is_first else velocity
+
+    (row,) = set_up_of(drive(tmp_path / "log.mcap", doubled)).faults
+    assert (row.id, row.since_s, row.until_s) == ("wheels.factor", pytest.approx(since_s, abs=1.0), pytest.approx(until_s, abs=1.0))
+    assert row.value == pytest.approx(0.5, rel=0.1)
 
 
 def test_velocities_without_a_sign_are_named_beside_angles(tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ _ODDS = {
     "factor": math.log(2e-4),
     "twist": math.log(0.1),
 }
-"""Prior odds by kind, as of wheels; where the robot file has the default multiplier, a driver that corrects for
-skidding is as usual as one that does not (diff_drive_controller's wheel_separation_multiplier)."""
+"""Prior odds by kind, as of wheels; where the robot file has the default multiplier, a driver that corrects for skidding is as usual as one
+that does not, and no fault (diff_drive_controller's wheel_separation_multiplier)."""
 _K_SIGMA = 0.25
 """Sigma of the logarithm of k by geometry: that of seven robots whose k was measured (`motion_models.prior.EVIDENCE`), and of floors."""
 _MIN_BINS = 8
@@ -108,6 +108,7 @@ def _of_channels(source: Source, rates: FloatArray, robot: Robot, evidence: floa
                 _ODDS["usual" if is_default else "multiplier"],
                 value=float(f"{1.0 / expected_scaling(robot):.4g}"),
                 correct=partial(_set_multiplier, float(f"{1.0 / expected_scaling(robot):.4g}")),
+                is_fault=not is_default,
             )
             found.append(Alternative((*rows, corrected), v, w, -math.log(multiplier), evidence, sigma, sigma, is_crossed=sigma == 0.0))
     remedy = "Check the radius and the resolution in the driver's parameters."

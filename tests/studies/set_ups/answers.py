@@ -267,12 +267,21 @@ def _is_tag_near(key: str, ours: float, true: float) -> bool:
 def is_twin(rows: Sequence[Any], truth: Sequence[Any], body: Body) -> bool:
     """Whether two answers explain all channels alike: by other motions, mirrored or backwards, that no sensor of the log can separate."""
     ours, true = apply(rows, body), apply(truth, body)
+    for source in body.sources:
+        if not _has_witness(source, true):
+            ours[source].delay_s = true[source].delay_s
     if not all(_is_same_rest(ours[s], true[s]) and ours[s].gravity == true[s].gravity for s in body.sources):
         return False
     for v, w in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)):
         if all(_is_near(ours[s].matrix, true[s].matrix * (v, w)) for s in body.sources):
             return True
     return False
+
+
+def _has_witness(source: str, state: State) -> bool:
+    """Whether another source measures a channel that ``source`` has: else nothing shows its clock."""
+    own = np.abs(state[source].matrix).max(axis=0) > 0.0
+    return any(bool((own & (np.abs(other.matrix).max(axis=0) > 0.0)).any()) for name, other in state.items() if name != source)
 
 
 def is_part(rows: Sequence[Any], truth: Sequence[Any], body: Body) -> bool:

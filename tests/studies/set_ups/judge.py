@@ -6,12 +6,14 @@ import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from localization.evaluation.reference_files import load_reference
 from localization.logs import Log, open_log
+from localization.logs.decode import Oddity
+from tests.helpers.set_up_drives import TOPICS
 from tests.studies.set_ups.answers import is_part, is_same, is_twin
 from tests.studies.set_ups.draws import Draw
 
@@ -20,7 +22,7 @@ OUTCOMES = ("right", "ambiguous", "twin", "part", "misnamed", "silent", "false a
 """
 - right: certain, and corrects to the true motion; of a healthy log, silence
 - ambiguous: nothing is certain, and the truth is among what is named
-- twin: certain of as few rows that no sensor of the log can separate from the truth
+- twin: certain of as few rows, or of none, that no sensor of the log can separate from the truth
 - part: names some of what is wrong, and nothing that is right
 - misnamed: accuses what is right
 - silent: something is wrong, and nothing is named
@@ -60,7 +62,8 @@ def judge(draw: Draw, folder: Path, infer: Infer) -> Judged:
         text = f"{type(error).__name__}: {error}"
         return Judged(draw.name, draw.sources, truth, "failed", 0.0, False, text, time.process_time() - began, family)
     cpu = time.process_time() - began
-    outcome, is_top_right = outcome_of(answer, draw)
+    moved = [*log.shifted_s, *(warning.partition(":")[0] for warning in log.warnings() if Oddity.FOREIGN_CLOCK.value in warning)]
+    outcome, is_top_right = outcome_of(answer, without_clocks(draw, moved))
     hypotheses = answer.hypotheses
     named = "; ".join(f"{h.probability:.3f} {describe(h.rows)}" for h in hypotheses[:3])
     top = hypotheses[0].probability if hypotheses else 1.0
@@ -69,6 +72,13 @@ def judge(draw: Draw, folder: Path, infer: Infer) -> Judged:
 
 def _ask(infer: Infer, log: Log, reference: Any) -> Any:
     return infer(log, reference)
+
+
+def without_clocks(draw: Draw, topics: Sequence[str]) -> Draw:
+    """``draw`` without the faults of clocks of ``topics``: the log has named them, and takes the time of recording."""
+    sources = {"wheels" if s == "driver" else s for s in draw.sources if TOPICS[s] in topics}
+    faults = tuple(f for f in draw.faults if not (f.truth.id.startswith("clock.") and f.truth.id.partition(".")[2] in sources))
+    return replace(draw, faults=faults)
 
 
 def describe(rows: Sequence[Any]) -> str:
@@ -93,7 +103,7 @@ def outcome_of(answer: Any, draw: Draw) -> tuple[str, bool]:
     if not draw.truth:
         return ("right" if is_quiet or (answer.verdict == "certain" and is_top_right) else "false alarm"), is_top_right
     if is_quiet:
-        return "silent", is_top_right
+        return ("twin" if is_twin([], draw.truth, draw.body) else "silent"), is_top_right
     if answer.verdict == "certain":
         assert top is not None
         rows = rows_of(top)
@@ -124,12 +134,17 @@ def print_table(found: Sequence[Judged]) -> None:
         keys.append((f"{n} sources", lambda j, n=n: len(j.sources) == n and len(j.truth) > 0))
     for family in sorted({j.family for j in found}):
         keys.append((family, lambda j, f=family: j.family == f))
-    print(f"\n{'':14s}" + "".join(f"{o:>12s}" for o in OUTCOMES) + f"{'right+amb.':>12s}")
+    print(f"\n{'':14s}" + "".join(f"{o:>12s}" for o in OUTCOMES) + f"{'right+amb.':>12s}{'and twins':>12s}")
     for name, is_in in keys:
         these = [j for j in found if is_in(j)]
         counts = Counter(j.outcome for j in these)
         good = counts["right"] + counts["ambiguous"]
-        print(f"{name:14s}" + "".join(f"{counts[o] or '.':>12}" for o in OUTCOMES) + f"{100.0 * good / max(len(these), 1):>11.1f}%")
+        print(
+            f"{name:14s}"
+            + "".join(f"{counts[o] or '.':>12}" for o in OUTCOMES)
+            + f"{100.0 * good / max(len(these), 1):>11.1f}%"
+            + f"{100.0 * (good + counts['twin']) / max(len(these), 1):>11.1f}%"
+        )
     print("\nprobability of the most probable set-up, and how often it was the true one:")
     edges = (0.0, 0.5, 0.9, 0.97, 0.99, 1.0 + 1e-9)
     for low, high in itertools.pairwise(edges):
