@@ -92,7 +92,12 @@ def test_representations_are_short_and_have_the_errors(log: skidloc.RobotLog, ru
 
 @pytest.mark.parametrize(
     ("pair", "text"),
-    [("ekf", "MODEL/ESTIMATOR"), ("skid/ekf", "skid_steer"), ("diff_drive/efk", "there are odometry"), ("diff_drive/lidar", "needs scans")],
+    [
+        ("ekf", "MODEL/ESTIMATOR"),
+        ("skid/ekf", "skid_steer"),
+        ("diff_drive/efk", "did you mean .ekf.. There are odometry"),
+        ("diff_drive/lidar", "needs scans"),
+    ],
 )
 def test_unknown_pair_is_refused_with_what_there_is(log: skidloc.RobotLog, pair: str, text: str) -> None:
     with pytest.raises(SkidlocError, match=text):

@@ -210,7 +210,7 @@ class Node:
             has_estimate = False
             is_behind = self._waiting is not None and self._waiting.is_ready()
             messages: Sequence[Received] = self._transport.take(0.0 if is_behind else _POLL_S, self.batch_s())
-            if self._waiting is None:
+            if self._waiting is None and not self._run.node.use_sim_time:  # by that clock nothing waits for the processor
                 messages = self.inputs.without_overtaken(messages, self._transport.now_ns())
             for received in messages:
                 has_estimate |= self._receive(received)
