@@ -91,7 +91,7 @@ def _joined(stack: Stack, of_base: int, k: int, row: Row, m: int, is_since: bool
         rows=rows,
         way=_spliced(base.way, other.way, is_other),
         turn=_spliced(base.turn, other.turn, is_other),
-        log_jacobian=np.where(is_other, other.log_jacobian, base.log_jacobian),
+        units=(np.where(is_other, other.units[0], base.units[0]), np.where(is_other, other.units[1], base.units[1])),
         own=(1.0 - share) * base.own + share * other.own,
     )
 

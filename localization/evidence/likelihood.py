@@ -75,14 +75,8 @@ Choice = tuple[int, ...]
 """Index of an alternative, by source."""
 Choices = NDArray[np.intp]
 """(A, sources) choices."""
-_SCALE_SHARE: Mapping[Kind, tuple[float, float]] = {
-    "wheels": (0.5, 0.5),
-    "driver": (1.0, 0.0),
-    "gyro": (0.0, 1.0),
-    "lidar": (0.5, 0.0),
-    "reference": (0.5, 0.0),
-}
-"""Part of `Alternative.log_jacobian` that is the logarithm of the unit of the way, and of the turn."""
+_HAS_SIDE: frozenset[Kind] = frozenset(("lidar", "reference"))
+"""Sources that measure sideways motion as well, in the unit of the way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +99,7 @@ class Stack:
         if self.raw:
             return self.raw
         sizes = dict(STILL)
-        in_units = [a for a in self.alternatives if not np.any(a.log_jacobian)]
+        in_units = [a for a in self.alternatives if np.all(np.array(a.units[0]) == 1.0) and np.all(np.array(a.units[1]) == 1.0)]
         of = {name: [size_of(c) for a in in_units if (c := getattr(a, name)) is not None and np.isfinite(c).any()] for name in sizes}
         return {name: max([least, *of[name]]) for name, least in sizes.items() if getattr(self.alternatives[0], name) is not None}
 
@@ -140,12 +134,8 @@ class Stack:
     @cached_property
     def log_jacobians(self) -> FloatArray:
         """(A, n) tempered logarithm of the Jacobian of each bin, of all channels; what is sideways moves as the way does."""
-        of_side = 1.0 - sum(_SCALE_SHARE[self.kind])
-        shares = {name: share for name, share in zip(_SIZES, _SCALE_SHARE[self.kind], strict=True) if self.channel(name) is not None}
-        found = sum(self._jacobians_of(name) for name in shares)
-        if of_side > 0.0:
-            found = found + of_side / shares["way"] * self._jacobians_of("way")
-        return np.asarray(found)
+        found = sum(self._jacobians_of(name) for name in _SIZES if self.channel(name) is not None)
+        return np.asarray(found + self._jacobians_of("way") if self.kind in _HAS_SIDE else found)
 
     def _jacobians_of(self, name: str) -> FloatArray:
         """(A, n) tempered logarithm of the Jacobian of a channel: what counts nothing at rest does so in any unit."""
@@ -163,12 +153,11 @@ class Stack:
 
     @cached_property
     def _log_units(self) -> dict[str, FloatArray]:
-        found, shares = {}, _SCALE_SHARE[self.kind]
-        for name, channel in self._channels.items():
-            of_each = [shares[(name == "turn") != a.is_crossed] * a.log_jacobian for a in self.alternatives]
-            found[name] = np.zeros((len(of_each), 0 if channel is None else channel.shape[1]))
-            for row, of_one in zip(found[name], of_each, strict=True):
-                row[:] = of_one
+        found = {}
+        for (name, channel), of_name in zip(self._channels.items(), zip(*(a.units for a in self.alternatives), strict=True), strict=True):
+            found[name] = np.zeros((len(self.alternatives), 0 if channel is None else channel.shape[1]))
+            for row, of_one in zip(found[name], of_name, strict=True):
+                row[:] = np.log(of_one)
         return found
 
     def floor(self, name: str) -> FloatArray:

@@ -92,16 +92,14 @@ class Alternative:
     """(n,) forward speed [m/s]; None: not measured."""
     turn: FloatArray | None = None
     """(n,) yaw rate [rad/s]; None: not measured."""
-    log_jacobian: float | FloatArray = 0.0
-    """Logarithm of the Jacobian of all channels, of any bin or by bin (n,): the density of a change of units."""
+    units: tuple[float | FloatArray, float | FloatArray] = (1.0, 1.0)
+    """Units of the way and of the turn, in those of the robot file: factors of all bins, or by bin (n,)."""
     own: float = 0.0
     """Evidence that the source has by itself: wheels of a side turn alike, gravity is up, robots do not drive sideways."""
     way_sigma: float = 0.0
     """Sigma of the logarithm of the scale of ``way`` that this choice adds to the source's."""
     turn_sigma: float = 0.0
     delay_s: float = 0.0
-    is_crossed: bool = False
-    """Whether the way is made of what the source calls a turn, and the turn of its way: units go with them."""
 
     @property
     def log_prior(self) -> float:

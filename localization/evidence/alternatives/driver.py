@@ -97,8 +97,8 @@ def _of_channels(source: Source, rates: FloatArray, robot: Robot, evidence: floa
     for factor, of_unit in units:
         for v, w, sigma, of_side in _sides(factor * rates[:, 0], turned, robot):
             rows = (*of_side, *of_unit, *more)
-            is_crossed = sigma > 0.0
-            found.append(Alternative(rows, v, multiplier * w, math.log(factor), evidence, sigma, _K_SIGMA + sigma, is_crossed=is_crossed))
+            in_units = (1.0, factor) if sigma > 0.0 else (factor, 1.0)  # where a side is reversed, turns are made of ways
+            found.append(Alternative(rows, v, multiplier * w, in_units, evidence, sigma, _K_SIGMA + sigma))
     for v, w, sigma, of_side in _sides(way, turned, robot):
         rows = (*of_side, *more)
         if abs(math.log(multiplier)) > 0.05:
@@ -110,18 +110,18 @@ def _of_channels(source: Source, rates: FloatArray, robot: Robot, evidence: floa
                 correct=partial(_set_multiplier, float(f"{1.0 / expected_scaling(robot):.4g}")),
                 is_fault=not is_default,
             )
-            found.append(Alternative((*rows, corrected), v, w, -math.log(multiplier), evidence, sigma, sigma, is_crossed=sigma == 0.0))
+            found.append(Alternative((*rows, corrected), v, w, (1.0, 1.0 / multiplier), evidence, sigma, sigma))
     remedy = "Check the radius and the resolution in the driver's parameters."
-    for v, w, sigma, of_side in _sides(way, turned, robot):
+    for v, w, _, of_side in _sides(way, turned, robot):
         factor, of_factor = free_factor(v, w, source.sizes_by_others)
         text = f"the driver's odometry is {1.0 / factor:.3g} times too large"
         scaled = Row("driver.factor", text, _ODDS["factor"], "", factor, remedy=remedy)
-        values = factor * v, factor * multiplier * w, 2.0 * math.log(factor), evidence + of_factor, FACTOR_SIGMA, FACTOR_SIGMA
-        found.append(Alternative((*of_side, scaled, *more), *values, is_crossed=sigma > 0.0))
+        values = factor * v, factor * multiplier * w, (factor, factor), evidence + of_factor, FACTOR_SIGMA, FACTOR_SIGMA
+        found.append(Alternative((*of_side, scaled, *more), *values))
     no_turns = Row("driver.no_turns", "the driver publishes no turns", _ODDS["turns"], remedy="Correct the driver's yaw rate and heading.")
     sigma = min(max(size_of(turned), LEVELS[0] * STILL_RAD_S), STILL_RAD_S)
     still = evidence + noise_evidence(turned, sigma)
-    found.append(Alternative((no_turns, *more), way, np.full_like(turned, np.nan), 0.0, still))
+    found.append(Alternative((no_turns, *more), way, np.full_like(turned, np.nan), (1.0, 1.0), still))
     return found
 
 

@@ -48,9 +48,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
             if unit != 1.0:
                 correct = partial(_scale, _DEG)
                 more.append(Row("gyro.unit", "the gyro's rates are in deg/s", _ODDS["unit"], "deg/s", _DEG, correct))
-            found.append(
-                Alternative((*rows, *more), None, sign * unit * (rates @ axis), math.log(unit), own + _level_evidence(rates, axis))
-            )
+            found.append(Alternative((*rows, *more), None, sign * unit * (rates @ axis), (1.0, unit), own + _level_evidence(rates, axis)))
     return found
 
 

@@ -45,7 +45,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
             for place_sigma, is_elsewhere in places:
                 body, evidence, ahead = in_body(velocity, turn, source.place, yaw, place_sigma)
                 more = [_place_row(source.frame, mount, ahead)] if is_elsewhere else []
-                found.append(Alternative((*rows, *more), body.real, turn, 2.0 * math.log(factor), evidence))
+                found.append(Alternative((*rows, *more), body.real, turn, (factor, 1.0), evidence))
     return found
 
 

@@ -33,23 +33,23 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
             rows = (Row("reference.mirrored", text, _ODDS["mirror"]),)
         if unit:
             rows = (*rows, Row("reference.unit", f"the reference is in {unit}", _ODDS["unit"], unit, factor))
-        found += _of_motion(rows, velocity, turn, 2.0 * math.log(factor))
+        found += _of_motion(rows, velocity, turn, factor)
     if np.isfinite(second).any():
         inverse = Row("reference.inverse", "the reference's poses are those of the world by the robot", _ODDS["inverse"])
-        found += _of_motion((inverse,), second[:, 0] + 1j * second[:, 1], second[:, 2], 0.0)
+        found += _of_motion((inverse,), second[:, 0] + 1j * second[:, 1], second[:, 2], 1.0)
     return found
 
 
-def _of_motion(rows: tuple[Row, ...], velocity: FloatArray, turn: FloatArray, log_jacobian: float) -> list[Alternative]:
+def _of_motion(rows: tuple[Row, ...], velocity: FloatArray, turn: FloatArray, unit: float) -> list[Alternative]:
     """Yaws of the tracked body, at the robot's middle or elsewhere, times ``rows``."""
     found = []
     for yaw, odds in yaws(velocity, turn, 0.0, (_PLACE_SIGMA_M, _OTHER_PLACE_SIGMA_M)):
         of_yaw = f"its headings are turned by {math.degrees(yaw):.0f} deg"
         turned = (Row("reference.yaw", of_yaw, _ODDS["yaw"], sector(yaw), yaw),) if odds else ()
         body, evidence, _ = in_body(velocity, turn, 0.0, yaw, _PLACE_SIGMA_M)
-        found.append(Alternative((*rows, *turned), body.real, turn, log_jacobian, evidence))
+        found.append(Alternative((*rows, *turned), body.real, turn, (unit, 1.0), evidence))
         body, evidence, ahead = in_body(velocity, turn, 0.0, yaw, _OTHER_PLACE_SIGMA_M)
         text = f"the tracked point is {abs(ahead):.2f} m {'ahead of' if ahead > 0.0 else 'behind'} the middle of the wheels"
         place = Row("reference.place", text, _ODDS["place"], value=ahead)
-        found.append(Alternative((*rows, *turned, place), body.real, turn, log_jacobian, evidence))
+        found.append(Alternative((*rows, *turned, place), body.real, turn, (unit, 1.0), evidence))
     return found

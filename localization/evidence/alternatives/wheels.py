@@ -48,12 +48,12 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         of_left, of_right = (rates * signs)[:, left].mean(axis=1), (rates * signs)[:, right].mean(axis=1)
         way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
         for factor, sigma, unit_rows in (*fields, *_units(robot)[len(fields) > 0 :]):
-            found.append(Alternative((*rows, *unit_rows), factor * way, factor * turn, 2.0 * math.log(factor), alike, sigma, sigma))
+            found.append(Alternative((*rows, *unit_rows), factor * way, factor * turn, (factor, factor), alike, sigma, sigma))
         factor, of_factor = free_factor(way, turn, source.sizes_by_others)
         found.append(
             Alternative(
                 (*rows, _factor_row(factor, FACTOR_SIGMA)),
-                *(factor * way, factor * turn, 2.0 * math.log(factor), alike + of_factor, FACTOR_SIGMA, FACTOR_SIGMA),
+                *(factor * way, factor * turn, (factor, factor), alike + of_factor, FACTOR_SIGMA, FACTOR_SIGMA),
             )
         )
         if not rows:
@@ -216,7 +216,7 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
             text = f"rates of the {side} wheels are in another unit than the others' ({name})"
             row = Row(f"wheels.factor_{side}", text, _ODDS["side_unit"], name, factor, partial(_scale_side, side, factor))
             way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
-            yield Alternative((row,), way, turn, math.log(factor), _alike_evidence(rates, *sides), 0.05, 0.05)
+            yield Alternative((row,), way, turn, (math.sqrt(factor), math.sqrt(factor)), _alike_evidence(rates, *sides), 0.05, 0.05)
 
 
 def _set_sides(left: tuple[str, ...], right: tuple[str, ...], robot: Robot) -> Robot:
