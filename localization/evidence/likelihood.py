@@ -45,7 +45,7 @@ class Noise:
     turn_of_way: float = 0.0
     """Error of the turn by the way [rad/m]: sides that slip or grow; fr079, ACES, Husky: 0.03, 0.04, 0.003."""
     skid_of_way: float = 0.0
-    """The same where the robot skids."""
+    """Error of the turn by the way where the robot skids [rad/m]."""
 
     @property
     def floors(self) -> dict[str, float]:
