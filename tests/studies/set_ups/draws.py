@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,8 @@ class Draw:
     """Ids of rows that are true of the log before anything is hidden."""
     reference: str | None = None
     """Topic of the reference."""
+    topics: Mapping[str, str] = field(default_factory=dict)
+    """Topic of each source."""
 
     @property
     def truth(self) -> tuple[Truth, ...]:
@@ -79,7 +81,16 @@ def simulated(seed: int, count: int, sources: Sequence[str], allowed: Callable[[
     faults = tuple(draw_faults(rng, setting, count, allowed))
     body = Body(base.left, base.right, base.radius, setting.effective_track, setting.driver_track, tuple(sources))
     reference = TOPICS["reference"] if "reference" in sources else None
-    return Draw(f"drawn {seed}", tuple(sources), drawn.robot, drawn.records, faults, body, reference=reference)
+    return Draw(
+        f"drawn {seed}",
+        tuple(sources),
+        drawn.robot,
+        drawn.records,
+        faults,
+        body,
+        reference=reference,
+        topics={s: TOPICS[s] for s in sources},
+    )
 
 
 def real(seed: int, count: int, log: RealLog | None = None, allowed: Callable[[Symptom], bool] = lambda s: True) -> Draw:
@@ -113,7 +124,7 @@ def real(seed: int, count: int, log: RealLog | None = None, allowed: Callable[[S
     )
     faults = tuple(draw_faults(rng, setting, count, allowed))
     body = Body(robot.joints.left, robot.joints.right, geometry.wheel_radius_m, effective, setting.driver_track, tuple(sorted(topics)))
-    return Draw(f"{log.name} from {begin:.0f} s", tuple(topics), robot, records, faults, body, log.known, topics.get("reference"))
+    return Draw(f"{log.name} from {begin:.0f} s", tuple(topics), robot, records, faults, body, log.known, topics.get("reference"), topics)
 
 
 def _has_twists(records: Sequence[Record], topic: str | None) -> bool:

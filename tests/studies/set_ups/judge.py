@@ -13,7 +13,6 @@ from typing import Any
 from localization.evaluation.reference_files import load_reference
 from localization.logs import Log, open_log
 from localization.logs.decode import Oddity
-from tests.helpers.set_up_drives import TOPICS
 from tests.studies.set_ups.answers import is_part, is_same, is_twin
 from tests.studies.set_ups.draws import Draw
 
@@ -76,7 +75,7 @@ def _ask(infer: Infer, log: Log, reference: Any) -> Any:
 
 def without_clocks(draw: Draw, topics: Sequence[str]) -> Draw:
     """``draw`` without the faults of clocks of ``topics``: the log has named them, and takes the time of recording."""
-    sources = {"wheels" if s == "driver" else s for s in draw.sources if TOPICS[s] in topics}
+    sources = {"wheels" if s == "driver" else s for s in draw.sources if draw.topics[s] in topics}
     faults = tuple(f for f in draw.faults if not (f.truth.id.startswith("clock.") and f.truth.id.partition(".")[2] in sources))
     return replace(draw, faults=faults)
 
