@@ -34,19 +34,26 @@ _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Yaws times upside down times units of the ``rates`` (n, 3) ahead, to the left and turn at the sensor, in the axes of its mount."""
     mount, found = source.mount, list[Alternative]()
-    places = ((_WRONG_PLACE_SIGMA_M, False),) if source.is_second else ((_PLACE_SIGMA_M, False), (_WRONG_PLACE_SIGMA_M, True))
+    usual = _place_sigma_m(robot)
+    places = ((_WRONG_PLACE_SIGMA_M, False),) if source.is_second else ((usual, False), (_WRONG_PLACE_SIGMA_M, True))
     for is_flipped, (unit, factor) in itertools.product((False, True), (("", 1.0), *UNITS.items())):
         velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:
             velocity, turn = velocity.conj(), -turn
         in_unit = Row("lidar.unit", f"the LiDAR's ranges are in {unit}", _ODDS["unit"], unit, factor, partial(_set_range, 1.0 / factor))
-        for yaw, odds in yaws(velocity, turn, source.place, (_PLACE_SIGMA_M, _WRONG_PLACE_SIGMA_M)):
+        for yaw, odds in yaws(velocity, turn, source.place, (usual, _WRONG_PLACE_SIGMA_M)):
             rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
             for place_sigma, is_elsewhere in places:
                 body, evidence, ahead = in_body(velocity, turn, source.place, yaw, place_sigma)
                 more = [_place_row(source.frame, mount, ahead)] if is_elsewhere else []
                 found.append(Alternative((*rows, *more), body.real, turn, (factor, 1.0), evidence))
     return found
+
+
+def _place_sigma_m(robot: Robot) -> float:
+    """Standard deviation along the robot of a mount with the centre of rotation [m], which follows the centre of gravity of a robot with
+    arms: anywhere between the axles."""
+    return math.hypot(_PLACE_SIGMA_M, robot.geometry.wheelbase_m / math.sqrt(12.0) if robot.arms is not None else 0.0)
 
 
 def _place_row(frame: str, mount: Mount, ahead: float) -> Row:
