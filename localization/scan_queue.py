@@ -111,8 +111,7 @@ class ScanQueue:
         going back would count the motion since then twice."""
         if not self.frames.admit(scan):
             return
-        has_mount = self.frames.problem is None  # others are none of several
-        if has_mount and (scan.frame_id != self.choice.used or self.choice.lidars) and not self.choice.admit(scan):
+        if (scan.frame_id != self.choice.used or self.choice.lidars) and self.frames.problem is None and not self.choice.admit(scan):
             return
         self.faulty.empty += not len(scan.points)
         middle_ns = scan.middle_ns
