@@ -34,7 +34,7 @@ _TWO_SIDED_95 = 1.96
 _USUAL_SHARE = 0.75  # three of the four sigma up to which a size is plausible
 _MAX_MOVED_SHARE = 0.1  # of a size that is right although another finding beside it is not: accuracy of signatures
 _JOINT_LEVEL = 0.001
-"""Probability of all sizes within tolerance together below which it is said: a thousand healthy robots have one such."""
+"""Probability of all sizes within tolerance together below which it is reported: one of a thousand healthy robots has it."""
 _MAX_SUSPECTED_ALIASES = 3  # that a sentence names
 
 _CHANNEL_WORDS = {

@@ -48,7 +48,7 @@ def open_log_with_set_up(path: Path | str, robot: Robot, topics: TopicOverrides 
     """The log at ``path`` as `open_log` opens it, with what is certain corrected. Raises what that does."""
     log = open_log(path, robot, topics)
     found = infer_set_up(log)
-    if found.robot is not log.robot:
+    if not found.is_as_declared:
         log = open_log(path, found.robot, topics if found.is_gyro_used else replace(topics, imu=""))
         log.add_notes(found.sentences)
     return SetUpLog(log, found)

@@ -120,7 +120,7 @@ class Stack:
         known = np.isfinite(channel)
         mean_square = (np.where(known, channel, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         plausible = log_size_prior(0.5 * np.log(mean_square / size**2 + 1e-4))
-        stands = mean_square < (_AT_REST * self.sizes[name] * np.exp(self.log_unit(name).max(axis=1))) ** 2
+        stands = mean_square < (_AT_REST * self.sizes[name] * self.unit(name)) ** 2
         plausible = np.where(stands, np.maximum(plausible, _STANDS_ODDS), plausible)
         log_size = math.log(self.sizes[name]) + 0.5 * (1.0 + math.log(math.tau))
         of_unit = self._jacobians_of(name).sum(axis=1)
@@ -148,8 +148,12 @@ class Stack:
         return self._log_units[name]
 
     def unit(self, name: str) -> FloatArray:
-        """(A,) largest unit of a channel over the robot file's; 1 where all are smaller."""
-        return np.asarray(np.maximum(np.exp(self.log_unit(name).max(axis=1)), 1.0))
+        """(A,) largest unit of a channel over the bins."""
+        return self._largest_units[name]
+
+    @cached_property
+    def _largest_units(self) -> dict[str, FloatArray]:
+        return {name: np.exp(log_unit.max(axis=1)) for name, log_unit in self._log_units.items() if log_unit.shape[1]}
 
     @cached_property
     def _log_units(self) -> dict[str, FloatArray]:
@@ -163,7 +167,7 @@ class Stack:
     def floor(self, name: str) -> FloatArray:
         """(A, n) noise of a channel, or of turns while "skidding", that does not grow with the channel itself; that of turns grows with the
         way. It is in the unit of the channel, so that no unit has less noise than another."""
-        return self._floors.get(name, self._floors["turn"])
+        return self._floors[name]
 
     @cached_property
     def _floors(self) -> dict[str, FloatArray]:
@@ -174,8 +178,8 @@ class Stack:
                 continue
             scaled = floor * (self.sizes[name] if self._counts else 1.0) * np.exp(self.log_unit(name))
             found[name] = np.where(self._is_scaled, scaled, STILL[name])
-        if way is not None and "turn" in found:
-            by_way = np.exp(self.log_unit("turn") - self.log_unit("way")) * np.nan_to_num(way)
+        if "turn" in found:
+            by_way = 0.0 if way is None else np.exp(self.log_unit("turn") - self.log_unit("way")) * np.nan_to_num(way)
             found["skidding"] = np.hypot(found["turn"], noise.skid_of_way * by_way)
             found["turn"] = np.hypot(found["turn"], noise.turn_of_way * by_way)
         return found
@@ -253,7 +257,7 @@ def least_sizes(stacks: Sequence[Stack], choices: Choices, name: str) -> FloatAr
 
     It is part of the largest that its sensors may have measured, in the robot file's unit or in that of the choice, or of a fast robot's.
     """
-    measured = [s.sizes[name] * s.unit(name)[rows] for s, rows in zip(stacks, choices.T, strict=True) if name in s.sizes]
+    measured = [s.sizes[name] * np.maximum(s.unit(name)[rows], 1.0) for s, rows in zip(stacks, choices.T, strict=True) if name in s.sizes]
     largest = np.max([*measured, np.zeros(len(choices))], axis=0)
     return np.asarray(np.maximum(_AT_REST * np.minimum(largest, _FAST * _SIZES[name]), STILL[name]))
 

@@ -65,6 +65,11 @@ class SetUp:
     """By source and channel (way, turn): logarithm of what it measures over the motion, with the others as scale, and its sigma."""
 
     @property
+    def is_as_declared(self) -> bool:
+        """Whether the log is read as the robot file declares it."""
+        return not self.sentences and not self.keys
+
+    @property
     def is_ambiguous(self) -> bool:
         """Whether several set-ups remain."""
         return self.verdict == "ambiguous"
@@ -93,7 +98,7 @@ def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own
     is_certain = kept[0][0] >= CERTAIN or all(len(rows) == len(common) for _, _, rows in kept)
     usual = _with_usual(robot, stacks, kept[0][1])
     if (alignment := _alignment(sources, kept, common)) is not None:
-        return _aligned(sources, kept, common, alignment, usual, hypotheses, by_file)
+        return _aligned(sources, kept, common, alignment, (robot, usual), hypotheses, by_file)
     corrected = _correct(usual, common)
     keys = changed_entries(robot, corrected)
     families = {row.family for row in common}
@@ -121,20 +126,24 @@ def _aligned(
     kept: Sequence[tuple[float, Choice, tuple[Row, ...]]],
     common: tuple[Row, ...],
     clock: Row,
-    robot: Robot,
+    robots: tuple[Robot, Robot],
     hypotheses: tuple[Hypothesis, ...],
     by_file: float,
 ) -> SetUp:
-    """Two clocks are apart, and nothing shows which is off: they are brought together, and the covariance has the way in that time."""
+    """Two clocks are apart, and nothing shows which is off: they are brought together, and the covariance has the way in that time.
+
+    ``robots``: as declared, and with what the robot file leaves open.
+    """
+    robot, usual = robots
     rows = (*common, clock)
     families = {row.family for row in rows}
-    corrected = _correct(robot, rows)
+    corrected = _correct(usual, rows)
     others = sorted({" and ".join(row.text for row in r if row.family not in families) for _, _, r in kept} - {""})
     late_s = abs(clock.value or 0.0)
     keys = changed_entries(robot, corrected)
     text = _alignment_warning(sources, clock, others, keys)
     corrected = replace(corrected, clock=replace(corrected.clock, sigma_s=max(corrected.clock.sigma_s, late_s)))
-    return SetUp("ambiguous", corrected, hypotheses, (*_correction_warnings(sources, common, robot, kept), text), keys, by_file=by_file)
+    return SetUp("ambiguous", corrected, hypotheses, (*_correction_warnings(sources, common, usual, kept), text), keys, by_file=by_file)
 
 
 def _alignment_warning(sources: Sequence[Source], clock: Row, others: Sequence[str], keys: Mapping[str, str]) -> str:

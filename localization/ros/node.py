@@ -439,7 +439,7 @@ class Node:
         reading = self.inputs.open_stream(MessageStats())
         reading.restore(self.inputs.stream.wheel_angles)
         self.inputs.stream.on_reading, found = None, entrance.found
-        if found is None or not (found.sentences or found.keys):
+        if found is None or found.is_as_declared:
             self.session.start_error_m = 0.0
             return
         self.session.state.wiring = LiveRobot(found.robot, found.is_gyro_used)  # checkpoints hold it from now on

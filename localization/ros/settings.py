@@ -82,14 +82,14 @@ class Names(Settings):
     def resolve(self, topic: str) -> str:
         """The absolute name of ``topic`` after remapping; the first rule that fits counts. Of several topics with commas, each."""
         if "," in topic:
-            return ",".join(self.resolve(part.strip()) for part in topic.split(",") if part.strip())
+            return _each(topic, self.resolve)
         full = self._expand(topic)
         return next((self._expand(after) for before, after in self._rules() if self._expand(before) == full), full)
 
     def in_namespace(self, topic: str) -> str:
         """``topic`` of a robot file, where namespaces are not known: absolute there, inside the namespace here."""
         if "," in topic:
-            return ",".join(self.in_namespace(part.strip()) for part in topic.split(","))
+            return _each(topic, self.in_namespace)
         return self.resolve(topic if topic in _GLOBAL else topic.lstrip("/")) if topic else topic
 
     def apply_to_robot(self, robot: Robot) -> Robot:
@@ -318,6 +318,11 @@ def to_yaml(values: Mapping[str, Value] | None = None) -> str:
         lines += [f"    # {line}" for line in textwrap.wrap(text, 130)]
         lines.append(f"    {parameter.name}: {_yaml((values or {}).get(parameter.name, parameter.default))}")
     return "\n".join(lines) + "\n"
+
+
+def _each(topics: str, name: Callable[[str], str]) -> str:
+    """``topics`` with commas, each by ``name``."""
+    return ",".join(name(part.strip()) for part in topics.split(",") if part.strip())
 
 
 def _flatten(settings: Any, path: tuple[str, ...]) -> Iterator[Parameter]:

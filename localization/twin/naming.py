@@ -5,7 +5,7 @@ file's own value. A set S of wrong numbers has the evidence (MacKay 2003, ch. 28
 
     ln p(y | S) = -(c - b' M^-1 b) / 2 - ln det M / 2,    M = I + J_S' J_S,  b = J_S' (y - J_S m),  c = |y - J_S m|^2
 
-with m the robot file's value, and a prior: each number is right with odds of 20 to 1, times what the robot file says of the file's value.
+with m the robot file's value, and a prior: each number is right with odds of 20 to 1, times its likelihood by the robot file.
 Numbers that may take another's place in S within odds of 20 to 1 cannot be separated from it by these data.
 """
 

@@ -14,15 +14,11 @@ if importlib.util.find_spec("localization.evidence") is None:
     pytest.skip("the inference of set-ups is not there", allow_module_level=True)
 
 USUAL = ["encoder of 90 to 200 counts", "circles one way", "turns less at speed", "short range"]
-OPEN: dict[str, str] = {}
-"""Healthy drives that are accused, and why."""
 SOURCES = {"short range": ("wheels", "gyro", "lidar"), "yaw rate that jitters": ("driver", "gyro", "lidar")}
 
 
 @pytest.mark.parametrize("kind", cases(KINDS, usual=USUAL))
-def test_healthy_drive_of_a_kind_is_accused_of_nothing(kind: str, request: pytest.FixtureRequest) -> None:
-    if kind in OPEN:
-        request.applymarker(pytest.mark.xfail(reason=OPEN[kind], strict=True))
+def test_healthy_drive_of_a_kind_is_accused_of_nothing(kind: str) -> None:
     assert check(kind, 20, SOURCES.get(kind, ("wheels", "gyro"))).accusations == ()
 
 
