@@ -76,6 +76,8 @@ class Source:
     """Least time of recording less stamp [s]; None where that is unknown."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
+    is_mounted: bool = True
+    """Whether log or robot file give its mount."""
     is_second: bool = False
     """A LiDAR beside another, whose place shows the centre of rotation already: its own place ahead is not asked for."""
 
@@ -202,7 +204,8 @@ def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], fi
     at_sensor = (moves[:, 0] + 1j * moves[:, 1] + 1j * moves[:, 2] * lever) / scale
     columns = np.stack([at_sensor.real, at_sensor.imag, moves[:, 2]], axis=1)
     integrals = np.vstack([np.zeros((1, 3)), np.cumsum(columns, axis=0)])
-    return Source(name, "lidar", np.array(t), integrals, np.array(known), frame=frame or "", mount=mount)
+    is_mounted = not frame or frame in mounts
+    return Source(name, "lidar", np.array(t), integrals, np.array(known), frame=frame or "", mount=mount, is_mounted=is_mounted)
 
 
 def _to_room_scale(scan: Scan, config: LidarConfig) -> float:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import os
+import re
 import sys
 import time
 import types
@@ -360,7 +361,8 @@ def test_lidar_without_a_mount_is_an_error_until_its_place_is_found():
     node, reports = run_node(lost)
     text, place = reports[:2]
     assert "frame 'laser'" in text
-    assert "the LiDAR is 0.40 m ahead of its mount" in place
+    ahead = float(re.search(r"the LiDAR is ([\d.]+) m ahead of the body's origin", place)[1])
+    assert ahead == pytest.approx(0.40, abs=0.02)
     assert "Publish it on /tf_static, or add [mounts.laser] to the robot file." in text
     assert {(s.level, s.message) for s in lidar_statuses(lost)} == {(ERROR, text), (OK, "ok")}
     assert "the mount of IMU 'imu_link' is unknown" in " ".join(node.warnings())

@@ -35,7 +35,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
     """Yaws times upside down times units of the ``rates`` (n, 3) ahead, to the left and turn at the sensor, in the axes of its mount."""
     mount, found = source.mount, list[Alternative]()
     usual = _place_sigma_m(robot)
-    places = ((_WRONG_PLACE_SIGMA_M, False),) if source.is_second else ((usual, False), (_WRONG_PLACE_SIGMA_M, True))
+    places = [(_WRONG_PLACE_SIGMA_M, False)] if source.is_second else [(usual, False), (_WRONG_PLACE_SIGMA_M, True)]
     for is_flipped, (unit, factor) in itertools.product((False, True), (("", 1.0), *UNITS.items())):
         velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:
@@ -45,7 +45,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
             rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
             for place_sigma, is_elsewhere in places:
                 body, evidence, ahead = in_body(velocity, turn, source.place, yaw, place_sigma)
-                more = [_place_row(source.frame, mount, ahead)] if is_elsewhere else []
+                more = [_place_row(source, ahead)] if is_elsewhere else []
                 found.append(Alternative((*rows, *more), body.real, turn, (factor, 1.0), evidence))
     return found
 
@@ -56,10 +56,13 @@ def _place_sigma_m(robot: Robot) -> float:
     return math.hypot(_PLACE_SIGMA_M, robot.geometry.wheelbase_m / math.sqrt(12.0) if robot.arms is not None else 0.0)
 
 
-def _place_row(frame: str, mount: Mount, ahead: float) -> Row:
-    text = f"the LiDAR is {abs(ahead):.2f} m {'ahead of' if ahead > 0 else 'behind'} its mount"
-    correct = mount_correction(frame, mount, partial(_moved, ahead)) if frame else None
-    return Row("lidar.place", text, _ODDS["place"], value=ahead, correct=correct)
+def _place_row(source: Source, ahead: float) -> Row:
+    """A place that neither log nor robot file give is as likely as the body's origin, and no fault."""
+    of = "its mount" if source.is_mounted else "the body's origin"
+    text = f"the LiDAR is {abs(ahead):.2f} m {'ahead of' if ahead > 0 else 'behind'} {of}"
+    correct = mount_correction(source.frame, source.mount, partial(_moved, ahead)) if source.frame else None
+    odds = _ODDS["place"] if source.is_mounted else 0.0
+    return Row("lidar.place", text, odds, value=ahead, correct=correct, is_fault=source.is_mounted, is_told=True)
 
 
 def in_body(velocity: Velocity, turn: FloatArray, place: complex, yaw: float, place_sigma_m: float) -> tuple[Velocity, float, float]:
