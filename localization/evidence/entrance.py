@@ -23,7 +23,7 @@ from localization.evidence.verdict import CORRECTED, SetUp, decide
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.decode import MAX_RATE_RAD_S, JointReading, OdometryReading, imu_decoder
 from localization.logs.event_decoder import TopicDecoder, late_ns
-from localization.logs.wheel_messages import odometry_decoder, wheel_decoder
+from localization.logs.wheel_messages import angle_period_rad, odometry_decoder, wheel_decoder
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -136,7 +136,7 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
     begin_ns = first_ns if moving_ns is None else max(first_ns, moving_ns - round(_STANDING_S * 1e9))
     rows = {topic: [r for r in readings if r.stamp_ns >= begin_ns] for topic, readings in gathered.items()}
     found = sources_of_readings(log, rows, begin_ns)
-    found += scan_sources(log.sources.lidars, _scans_of(log, begin_ns), log.mounts, begin_ns)
+    found += scan_sources(log, _scans_of(log, begin_ns), begin_ns)
     if reference is not None and reference.yaws is not None:
         of_reference = from_poses(reference.source, reference.stamps_ns, reference.poses, begin_ns)
         found += [] if of_reference is None else [of_reference]
@@ -144,14 +144,15 @@ def read_sources(log: Log, reference: ReferencePoses | None = None) -> list[Sour
 
 
 def sources_of_readings(log: Any, readings: Mapping[str, Sequence[Any]], first_ns: int) -> list[Source]:
-    """Sources of ``readings`` by topic; ``log``: what has `sources`, `joints` and `mounts`."""
+    """Sources of ``readings`` by topic; ``log``: what has `robot`, `sources`, `joints` and `mounts`."""
     found: list[Source | None] = []
     wheels = sorted((r for source in log.sources.all_wheels for r in readings.get(source.topic, ())), key=lambda reading: reading.stamp_ns)
     name = " and ".join(source.topic for source in log.sources.all_wheels)
     joints = [r for r in wheels if isinstance(r, JointReading)]
     odometry = [r for r in wheels if isinstance(r, OdometryReading)]
     if joints:
-        found.append(from_joints(name, joints, log.joints, first_ns))
+        period = angle_period_rad(log.robot.joints, log.sources.all_wheels[0].type)
+        found.append(from_joints(name, joints, log.joints, period, first_ns))
     elif odometry:
         found.append(from_odometry(name, odometry, first_ns))
     if log.sources.imu is not None and readings.get(log.sources.imu.topic):

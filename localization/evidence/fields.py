@@ -77,8 +77,6 @@ def _counter(source: Source, robot: Robot) -> tuple[Row, ...]:
     is_one_size = float(np.abs(sizes / size - 1.0).max()) <= _SAME_JUMP
     if not is_one_size or (counter is None and len(set(source.jumps[:, 0])) < _MIN_JUMPS):
         return ()
-    if abs(size * robot.joints.angle_unit_rad / math.tau - 1.0) <= _SAME_JUMP:
-        return ()  # a full turn, which the decoder undoes by itself
     value = counter if counter is not None else float(f"{size:.6g}")
     what = f"a counter of {math.log2(value):.0f} bits wraps" if counter is not None else "a counter wraps"
     text = f"positions jump by {value:.10g} ({len(sizes)} times): {what}"

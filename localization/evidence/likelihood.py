@@ -19,8 +19,9 @@ from localization.evidence.alternatives.alternative import (
     Alternative,
     size_of,
 )
+from localization.evidence.angles import BoolArray
 from localization.evidence.channel import channel_evidence, log_size_prior
-from localization.evidence.signals import BoolArray, Kind
+from localization.evidence.signals import Kind
 from motion_models.se2 import FloatArray
 
 

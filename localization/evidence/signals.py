@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.events import ImuSample, Scan
+from localization.evidence.angles import BoolArray, jumps, of_one_publisher, on_circle, without_resets
 from localization.lidar import LidarConfig
 from localization.logs.decode import JointReading, OdometryReading
 from localization.logs.event_decoder import arc
-from localization.logs.topic_roles import TopicSource
 from localization.sensor_checks.scan_motion import ScanOdometry, profile_of
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
-
-BoolArray = NDArray[np.bool_]
 
 Kind = Literal["wheels", "driver", "gyro", "lidar", "reference"]
 
@@ -38,8 +36,6 @@ _ROOM_M = 4.0
 """Range of rooms [m]."""
 _STEADY_SAMPLES = 200
 """Samples at the start whose mean specific force is gravity, where the robot stands."""
-_RESET_FACTOR = 8.0
-"""Increment of a wheel's angle over the 97th percentile of all, from where on it is a reset or a counter that wrapped, no motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +72,8 @@ class Source:
     """Least time of recording less stamp [s]; None where that is unknown."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
+    moves_cg: bool = False
+    """Whether the robot's centre of gravity moves, and its centre of rotation with it."""
     is_mounted: bool = True
     """Whether log or robot file give its mount."""
     is_second: bool = False
@@ -120,20 +118,26 @@ def is_comparable(source: Source | None) -> bool:
     return source is not None and len(source.t) > 3 and source.period_s <= _MAX_PERIOD_S
 
 
-def from_joints(name: str, readings: Sequence[JointReading], joints: tuple[Sequence[str], Sequence[str]], first_ns: int) -> Source | None:
-    """Wheels by their angles, and by their velocities where they have both; by velocities where they have no angles."""
+def from_joints(
+    name: str, readings: Sequence[JointReading], joints: tuple[Sequence[str], Sequence[str]], period_rad: float, first_ns: int
+) -> Source | None:
+    """Wheels by their angles, and by their velocities where they have both; by velocities where they have no angles.
+
+    ``period_rad``: after which angles wrap.
+    """
     t, rows = _increasing(readings, first_ns)
     if len(rows) < 4:
         return None
     names, left = (*joints[0], *joints[1]), len(joints[0])
-    velocity = _integrated(t, np.array([reading.velocity for reading in rows]))
-    angles = np.array([reading.position for reading in rows])
-    position, is_known = _without_resets(angles)
+    angles, rates = np.array([reading.position for reading in rows]), np.array([reading.velocity for reading in rows])
+    is_one = of_one_publisher(angles)
+    t, angles, velocity = t[is_one], on_circle(angles[is_one], period_rad), _integrated(t[is_one], rates[is_one])
+    position, is_known = without_resets(angles)
     has_angles = bool(np.isfinite(position).any(axis=0).all() and np.ptp(np.nan_to_num(position), axis=0).any())
     if has_angles:
         has_rates = bool(np.isfinite(velocity).all() and np.ptp(velocity, axis=0).any())
         second = velocity if has_rates else None
-        return Source(name, "wheels", t, position, is_known, second, names, left, jumps=_jumps(angles, is_known))
+        return Source(name, "wheels", t, position, is_known, second, names, left, jumps=jumps(angles, is_known))
     return Source(name, "wheels", t, np.nan_to_num(velocity), _finite_steps(velocity), None, names, left)
 
 
@@ -146,7 +150,7 @@ def from_odometry(name: str, readings: Sequence[OdometryReading], first_ns: int)
     twist = _integrated(t, twists)
     steps = np.array([arc(a, b) for a, b in itertools.pairwise(poses)])
     if np.isfinite(poses).all() and np.ptp(poses, axis=0).any():
-        way, is_known = _without_resets(np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
+        way, is_known = without_resets(np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)]))
         has_twist = bool(np.isfinite(twist).all() and np.ptp(twist, axis=0).any())
         return Source(name, "driver", t, way, is_known, twist if has_twist else None)
     return Source(name, "driver", t, np.nan_to_num(twist), _finite_steps(twist))
@@ -164,17 +168,18 @@ def from_gyro(name: str, samples: Sequence[ImuSample], mounts: Mapping[str, Moun
     return Source(name, "gyro", t, angles, known, force=force, frame=frame, mount=mounts.get(frame, Mount()))
 
 
-def scan_sources(lidars: Sequence[TopicSource], scans: Iterable[Scan], mounts: Mapping[str, Mount], first_ns: int) -> list[Source]:
-    """Motion by the scans of each of ``lidars``, of several by its frame."""
-    if len(lidars) < 2:
-        found = [from_scans(lidar.topic, scans, mounts, first_ns) for lidar in lidars]
+def scan_sources(log: Any, scans: Iterable[Scan], first_ns: int) -> list[Source]:
+    """Motion by the scans of each LiDAR of a ``log``, of several by its frame; ``log``: what has `robot`, `sources` and `mounts`."""
+    if len(log.sources.lidars) < 2:
+        found = [from_scans(lidar.topic, scans, log.mounts, first_ns) for lidar in log.sources.lidars]
     else:
         by_frame: dict[str, list[Scan]] = {}
         for scan in scans:
             by_frame.setdefault(scan.frame_id, []).append(scan)
-        found = [from_scans(f"the scanner '{frame}'", by_frame[frame], mounts, first_ns) for frame in sorted(by_frame)]
+        found = [from_scans(f"the scanner '{frame}'", by_frame[frame], log.mounts, first_ns) for frame in sorted(by_frame)]
     there = [source for source in found if source is not None]
-    return [replace(source, is_second=i > 0) for i, source in enumerate(there)]
+    moves_cg = bool(log.robot.arms is not None or log.sources.center_of_gravity is not None or log.sources.arms)
+    return [replace(source, is_second=i > 0, moves_cg=moves_cg) for i, source in enumerate(there)]
 
 
 def from_scans(name: str, scans: Iterable[Scan], mounts: Mapping[str, Mount], first_ns: int) -> Source | None:
@@ -259,21 +264,3 @@ def _integrated(t: FloatArray, rates: FloatArray) -> FloatArray:
 
 def _finite_steps(integrals: FloatArray) -> BoolArray:
     return np.isfinite(np.diff(integrals, axis=0))
-
-
-def _jumps(values: FloatArray, is_known: BoolArray) -> FloatArray:
-    """(m, 2) row and size of the finite steps of ``values`` (n, c) that are no motion."""
-    steps = np.diff(values, axis=0)
-    rows, columns = np.nonzero(np.isfinite(steps) & ~is_known)
-    return np.column_stack([rows.astype(float), steps[rows, columns]])
-
-
-def _without_resets(values: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """``values`` (m, c) without steps that no motion explains, and (m - 1, c) where they are known."""
-    steps = np.diff(values, axis=0)
-    known = np.isfinite(steps)
-    sizes = np.abs(steps[known])
-    usual = float(np.percentile(sizes[sizes > 0.0], 97.0)) if (sizes > 0.0).any() else math.inf
-    known &= np.abs(np.nan_to_num(steps)) <= _RESET_FACTOR * usual
-    first = np.nan_to_num(values[:1])
-    return np.vstack([first, first + np.cumsum(np.where(known, steps, 0.0), axis=0)]), known

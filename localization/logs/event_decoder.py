@@ -32,9 +32,8 @@ from localization.logs.decode import (
     scan_decoder,
     stamp_ns,
 )
-from localization.logs.driver_messages import DRIVER_MESSAGES
 from localization.logs.topic_roles import Sources, TopicSource
-from localization.logs.wheel_messages import ODOMETRY_DECODERS, odometry_decoder, wheel_decoder
+from localization.logs.wheel_messages import ODOMETRY_DECODERS, angle_period_rad, odometry_decoder, wheel_decoder
 from motion_models.center_of_gravity.cg_model import CgModel, CgTracker
 from motion_models.center_of_gravity.parts import CgEstimate, support_margin
 from motion_models.robot import Clock, Driver, Geometry, Lidar, Robot
@@ -108,9 +107,7 @@ class EventDecoder:
         self._has_multipliers = bool((self._multipliers != 1.0).any())
         least_radius = robot.geometry.wheel_radius_m * min(1.0, float(self._multipliers.min()))
         self.from_joints = JointsToWheels(left, right, least_radius, wheels, stats)
-        counter = DRIVER_MESSAGES.get(odometry_type)
-        counter_range = 0.0 if counter is None else counter.angle_range_rad
-        self.from_joints.angle_period = robot.joints.angle_range * robot.joints.angle_unit_rad or counter_range or math.tau
+        self.from_joints.angle_period = angle_period_rad(robot.joints, odometry_type)
         self.from_odometry = OdometryToWheels(robot.driver, wheels, stats, is_whole=odometry_type not in ODOMETRY_DECODERS)
         named = " and ".join(source.topic for source in sources.arms)
         self._from_arms = None if arms is None else make_arm_cg_converter(arms, robot.geometry, named, stats)
@@ -346,6 +343,7 @@ class JointsToWheels:
         self._by_rates, self._last_ns = np.zeros(len(self._names)), 0  # turned while no angle has changed [rad]
         self.angle_period = math.tau
         """After which angles wrap [rad]."""
+        self._least, self._most = [math.inf] * len(self._names), [-math.inf] * len(self._names)
 
     def __call__(self, reading: JointReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
@@ -366,6 +364,8 @@ class JointsToWheels:
             self._stats.count(self._topic, Oddity.CONSTANT_ANGLES)
             yield WheelSample(reading.stamp_ns, self._side_means(velocity), np.full(2, np.nan))
             return
+        positions = reading.position.tolist()
+        self._least, self._most = list(map(min, self._least, positions)), list(map(max, self._most, positions))
         publisher = self._publisher
         if publisher is None:
             publisher = self._publisher = _PublisherState(reading, reading.position)
@@ -433,7 +433,13 @@ class JointsToWheels:
         if publisher is self._second_publisher and passed_ns > _MAX_PUBLISHER_GAP_NS:
             return False
         step = max(map(abs, (reading.position - publisher.reading.position).tolist()))  # faster than numpy on four numbers
+        if step > 0.5 * self.angle_period and any(self._on_circle()):
+            return False
         return bool(step * self._radius <= _MAX_SPEED_M_S * max(passed_ns * 1e-9, _MIN_INTERVAL_S))
+
+    def _on_circle(self) -> list[bool]:
+        """Joints whose angles have stayed within one period so far: they may wrap."""
+        return [most - least <= self.angle_period * (1.0 + 1e-6) for least, most in zip(self._least, self._most, strict=True)]
 
     def _accumulate(self, publisher: _PublisherState, reading: JointReading, step: FloatArray) -> _PublisherState:
         turned = publisher.turned if self._second_publisher is None else publisher.turned + sum(map(abs, step.tolist()))
@@ -444,12 +450,14 @@ class JointsToWheels:
         """(n,) increments where some are too large: of an angle that wrapped, or from the rates for one that was reset; whether one was."""
         dt = (reading.stamp_ns - known.stamp_ns) * 1e-9
         step = reading.position - known.position
-        jumped = np.abs(step) * self._radius > _MAX_SPEED_M_S * max(dt, _MIN_INTERVAL_S)
+        is_too_fast = np.abs(step) * self._radius > _MAX_SPEED_M_S * max(dt, _MIN_INTERVAL_S)
         expected = np.nan_to_num(velocity) * dt
         wrapped = np.remainder(step + 0.5 * self.angle_period, self.angle_period) - 0.5 * self.angle_period
         deviation = np.where(np.isfinite(velocity), _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD)
         is_wrap = (np.abs(step) < 1.5 * self.angle_period) & (np.abs(wrapped - expected) < deviation)  # one period, never two
-        return np.where(jumped, np.where(is_wrap, wrapped, expected), step), bool((jumped & ~is_wrap).any())
+        may_wrap = is_too_fast | ((np.abs(step) > 0.5 * self.angle_period) & np.array(self._on_circle()))
+        corrected = np.where(may_wrap & is_wrap, wrapped, np.where(is_too_fast, expected, step))
+        return corrected, bool((is_too_fast & ~is_wrap).any())
 
     def _side_means(self, values: FloatArray) -> FloatArray:
         numbers = self._failing.fill(values).tolist()

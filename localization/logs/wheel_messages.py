@@ -22,6 +22,7 @@ from localization.logs.decode import (
     stamp_ns,
     yaw_of,
 )
+from localization.logs.driver_messages import DRIVER_MESSAGES
 from motion_models.robot import Joints
 
 TWIST_TYPES = (
@@ -47,6 +48,12 @@ Sample = tuple[int, float, float]
 def is_measured_twist(topic: str) -> bool:
     """Whether a topic of velocities may be measured by its name, rather than a command or of another estimator."""
     return bool(_MEASURED.search(topic)) and not _COMMAND.search(topic)
+
+
+def angle_period_rad(units: Joints, message_type: str) -> float:
+    """After which angles of wheels wrap [rad]: as the robot file says, else as drivers of ``message_type`` count, else a full turn."""
+    counter = DRIVER_MESSAGES.get(message_type)
+    return units.angle_range * units.angle_unit_rad or (0.0 if counter is None else counter.angle_range_rad) or math.tau
 
 
 def wheel_decoder(joints: tuple[str, ...], units: Joints = Joints()) -> Decoder:  # noqa: B008 (frozen)

@@ -68,7 +68,7 @@ class _Readings:
         if imu is not None:
             readings[imu.topic] = self.gyro
         found = sources_of_readings(sensors, readings, first_ns)
-        return [*found, *scan_sources(sensors.sources.lidars, self.scans, sensors.mounts, first_ns)]
+        return [*found, *scan_sources(sensors, self.scans, first_ns)]
 
 
 class LiveSetUp:

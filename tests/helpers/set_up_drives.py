@@ -26,6 +26,7 @@ TOPICS = {
     "lidar": "/scan",
     "reference": "/reference/pose",
 }
+CENTER_OF_GRAVITY = "/center_of_gravity"
 """Topic of each source."""
 
 
@@ -52,6 +53,9 @@ class Base:
     """Effective track that the driver divides by, over its wheels' track: 1 without regard to skidding, 1/k with it."""
     driver_jitter: float = 0.0
     """Standard deviation of the published yaw rate [rad/s]."""
+    load: tuple[float, ...] = ()
+    """How far ahead the centre of gravity is in equal parts of the drive, and the centre of rotation with it [m]."""
+    has_load_topic: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -190,7 +194,9 @@ def drawn_log(
     """
     base = draw_base(rng, "wheels" in names) if base is None else base
     sensors = draw_sensors(rng, names) if sensors is None else sensors
-    t, twists, poses = drive_legs(rng, draw_legs(rng, base) if legs is None else legs)
+    t, twists, turned_about = drive_legs(rng, draw_legs(rng, base) if legs is None else legs)
+    ahead = np.array(base.load or (0.0,))[np.arange(len(t)) * max(len(base.load), 1) // len(t)]
+    poses = se2.compose(turned_about, np.stack([-ahead, 0.0 * ahead, 0.0 * ahead], axis=1))
     fastest = max(float(np.abs(twists[:, 0]).max()), 1e-9)
     k = base.k * (1.0 - k_falls * np.abs(twists[:, 0]) / fastest)
     half = 0.5 * base.track / k * twists[:, 1]
@@ -213,6 +219,10 @@ def drawn_log(
     late = round(sensors.latency_s * S)
     records: list[Record] = [("/tf_static", _mounts(sensors), START)]
     records += [(TOPICS[source], message, START + round(at * S) + late) for source, at, message in rows]
+    if base.load and base.has_load_topic:
+        records += [
+            (CENTER_OF_GRAVITY, bags.point_stamped(START + i * S // 100, ahead[i], 0.0), START + i * S // 100) for i in range(0, len(t), 50)
+        ]
     return Drawn(base, sensors, tuple(names), t, twists, poses, _robot(base), sorted(records, key=lambda r: r[2]), tuple(remarks))
 
 

@@ -72,6 +72,11 @@ def _in_place(rng: Rng, names: Sequence[str]) -> Drawn:
     return _drawn(rng, names, legs=lambda b: [(3.0, 0.0, 0.0), (15.0, 0.0, w), (2.0, 0.0, 0.0), (12.0, 0.0, -w), (5.0, 0.0, 0.0)])
 
 
+def _loaded(rng: Rng, names: Sequence[str]) -> Drawn:
+    """A load, or an arm, that moves the centre of gravity, and the centre of rotation with it, between the axles."""
+    return _drawn(rng, names, lambda b: replace(b, load=tuple((b.wheelbase * rng.uniform(-0.4, 0.4, 3)).tolist())))
+
+
 Kind = Callable[[Rng, Sequence[str]], Drawn]
 KINDS: Mapping[str, Kind] = {
     "usual": _drawn,
@@ -95,6 +100,10 @@ KINDS: Mapping[str, Kind] = {
     ),
     "short range": lambda rng, n: _drawn(rng, n, sensors=lambda s: replace(s, range_max=rng.uniform(2.5, 4.0))),
     "yaw rate that jitters": lambda rng, n: _drawn(rng, n, lambda b: replace(b, driver_jitter=rng.uniform(0.2, 0.5), hz=50.0)),
+    "load that moves": _loaded,
+    "load that stays": lambda rng, n: _drawn(
+        rng, n, lambda b: replace(b, load=(b.wheelbase * rng.uniform(-0.15, 0.15),), has_load_topic=False)
+    ),
     "recorded late": lambda rng, n: _drawn(rng, n, sensors=lambda s: replace(s, latency_s=rng.uniform(0.1, 0.5))),
     "noisy reference": lambda rng, n: _drawn(rng, n, sensors=lambda s: replace(s, reference_noise=(0.05, 0.03))),
 }

@@ -13,8 +13,12 @@ from tests.studies.healthy_set_ups import KINDS, check, check_window
 if importlib.util.find_spec("localization.evidence") is None:
     pytest.skip("the inference of set-ups is not there", allow_module_level=True)
 
-USUAL = ["encoder of 90 to 200 counts", "circles one way", "turns less at speed", "short range"]
-SOURCES = {"short range": ("wheels", "gyro", "lidar"), "yaw rate that jitters": ("driver", "gyro", "lidar")}
+USUAL = ["encoder of 90 to 200 counts", "circles one way", "turns less at speed", "short range", "load that moves"]
+SOURCES = {
+    "short range": ("wheels", "gyro", "lidar"),
+    "load that moves": ("wheels", "gyro", "lidar"),
+    "yaw rate that jitters": ("driver", "gyro", "lidar"),
+}
 
 
 @pytest.mark.parametrize("kind", cases(KINDS, usual=USUAL))

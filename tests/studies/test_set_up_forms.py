@@ -10,14 +10,11 @@ from tests.helpers.extended import cases
 from tests.studies.set_ups.forms import FORMS, Form, compare, drawn, read
 
 USUAL = ["scans in bursts of 2.5 s", "gyro of another day", "wheels and gyro jump together"]
-OPEN = ["a second publisher of zeros", "angles that wrap at half a turn"]
-"""Rows that replay reads and the set-up does not, or hardly; `python -m tests.studies.set_ups.forms` counts them."""
-SOLVED = [form for form in FORMS if form.id not in OPEN]
 _drawn = cache(lambda source: drawn(1, source))
 _healthy = cache(lambda source: read(_drawn(source)[1], _drawn(source)[0], None, is_judged=False)[0])
 
 
-@pytest.mark.parametrize("form", cases(SOLVED, usual=USUAL, ids=[form.id for form in SOLVED]))
+@pytest.mark.parametrize("form", cases(FORMS, usual=USUAL, ids=[form.id for form in FORMS]))
 def test_form_of_messages_is_read_as_before(form: Form) -> None:
     robot, records = _drawn(form.source)
     before = _healthy(form.source)

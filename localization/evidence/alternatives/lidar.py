@@ -34,7 +34,7 @@ _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Yaws times upside down times units of the ``rates`` (n, 3) ahead, to the left and turn at the sensor, in the axes of its mount."""
     mount, found = source.mount, list[Alternative]()
-    usual = _place_sigma_m(robot)
+    usual = _place_sigma_m(robot, source.moves_cg)
     places = [(_WRONG_PLACE_SIGMA_M, False)] if source.is_second else [(usual, False), (_WRONG_PLACE_SIGMA_M, True)]
     for is_flipped, (unit, factor) in itertools.product((False, True), (("", 1.0), *UNITS.items())):
         velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
@@ -50,10 +50,10 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
     return found
 
 
-def _place_sigma_m(robot: Robot) -> float:
-    """Standard deviation along the robot of a mount with the centre of rotation [m], which follows the centre of gravity of a robot with
-    arms: anywhere between the axles."""
-    return math.hypot(_PLACE_SIGMA_M, robot.geometry.wheelbase_m / math.sqrt(12.0) if robot.arms is not None else 0.0)
+def _place_sigma_m(robot: Robot, moves_cg: bool) -> float:
+    """Standard deviation along the robot of a mount with the centre of rotation [m], which follows a centre of gravity that moves: anywhere
+    between the axles."""
+    return math.hypot(_PLACE_SIGMA_M, robot.geometry.wheelbase_m / math.sqrt(12.0) if moves_cg else 0.0)
 
 
 def _place_row(source: Source, ahead: float) -> Row:
