@@ -47,9 +47,10 @@ def channel_evidence(
     x, b = np.zeros(n), np.zeros(k)
     for i in range(A):
         noise = floor[i], relative[i]
-        _first_scales(z[i], tau[i], c[i])
-        b[:] = x[:] = 0.0
-        _motion(z[i], noise, np.exp(c[i]), b, size, x)  # by the floors of the noise first, then with its part of the motion
+        b[:] = 0.0
+        _first(z[i], floor[i], tau[i], x, c[i])
+        if k > 1:
+            _scales(z[i], noise, (tau[i], bias_sigma), x, c[i], b, information[i])
         for _ in range(_ITERATIONS):
             _motion(z[i], noise, np.exp(c[i]), b, size, x)
             if k > 1:
@@ -73,16 +74,27 @@ def _price(c: FloatArray, b: FloatArray, information: FloatArray, tau: FloatArra
 
 
 @subroutine
-def _first_scales(z: FloatArray, tau: FloatArray, c: FloatArray) -> None:
-    """Logarithms of the scales (k,) by the source whose own is known best: from there the alternation with the motion converges."""
+def _first(z: FloatArray, floor: FloatArray, tau: FloatArray, x: FloatArray, c: FloatArray) -> None:
+    """Motion (n,) and logarithms of the scales (k,) by the source whose scale is known best beside its noise: from there the alternation with the scales converges. Noise of
+    the first motion would make all scales small."""
     k, n = z.shape
-    best = tau.argmin()
+    best, least = 0, math.inf
+    for j in range(k):
+        noise, square = 0.0, 1e-12
+        for m in range(n):
+            if math.isfinite(z[j, m]):
+                noise += floor[j, m] ** 2
+                square += z[j, m] ** 2
+        if tau[j] ** 2 + noise / square < least:
+            best, least = j, tau[j] ** 2 + noise / square
+    for m in range(n):
+        x[m] = z[best, m] if math.isfinite(z[best, m]) else 0.0
     for j in range(k):
         product, square = 0.0, 1e-12
         for m in range(n):
-            if math.isfinite(z[j, m]) and math.isfinite(z[best, m]):
-                product += z[j, m] * z[best, m]
-                square += z[best, m] ** 2
+            if math.isfinite(z[j, m]):
+                product += z[j, m] * x[m]
+                square += x[m] ** 2
         ratio = product / square
         c[j] = math.log(min(max(ratio, 1e-4), 1e4)) if ratio > 0.0 else 0.0
 

@@ -92,6 +92,8 @@ class Stack:
     """`Source.behind_s`."""
     t: FloatArray = field(default_factory=lambda: np.zeros(0))
     """(n,) begin of each bin [s]."""
+    jitter: Mapping[str, float] = field(default_factory=dict)
+    """Noise of the way and of the turn over a bin that the source itself shows, at any level, in its own unit."""
 
     @cached_property
     def sizes(self) -> Mapping[str, float]:
@@ -169,6 +171,12 @@ class Stack:
         """(A, n) noise of a channel, or of turns while "skidding", that does not grow with the channel itself; that of turns grows with the
         way. It is in the unit of the channel, so that no unit has less noise than another."""
         return self._floors[name]
+
+    def noise_floor(self, name: str, level: float) -> FloatArray:
+        """(A, n) `floor` at a ``level`` of the noise, with what the source itself shows."""
+        channel = "turn" if name == "skidding" else name
+        own = self.jitter.get(channel, 0.0)
+        return np.hypot(level * self.floor(name), own * self.unit(channel)[:, None]) if own else level * self.floor(name)
 
     @cached_property
     def _floors(self) -> dict[str, FloatArray]:
@@ -270,9 +278,12 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float
     least = least_sizes(stacks, choices, name)
     of_bins, price, _, _ = channel_evidence(*inputs, _SIZES[name], least)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
-    skidding = level * np.stack([stacks[i].floor("skidding")[choices[:, i]] for i in used], axis=1) if name == "turn" else floor
-    for share in (level * skids, relative) if name == "turn" and skids.any() else ():  # k changes, or is unusual
-        of_share = np.ascontiguousarray(np.where(skids > 0.0, share, relative))
+    slips = np.array([NOISE[stacks[i].kind].relative for i in used])
+    slides = [(skids, level), (slips, level), *([(slips, 1.0)] if level < 1.0 else [])]  # the floor is not as quiet as the sensors
+    for part, slip_level in slides if name == "turn" and skids.any() else ():
+        skidding = np.stack([stacks[i].noise_floor("skidding", slip_level)[choices[:, i]] for i in used], axis=1)
+        skidding = np.where(skids[:, None] > 0.0, skidding, floor)
+        of_share = np.ascontiguousarray(np.where(skids > 0.0, slip_level * part, relative))
         of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
         of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, _SIZES[name], least)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
@@ -299,7 +310,7 @@ def _inputs(
     """Channels and floors (A, k, n), relative noise (A, k), sigmas of scales (A, k) and of biases (k,)."""
     rows = {i: choices[:, i] for i in used}
     z = np.stack([c[r] for i, r in rows.items() if (c := stacks[i].channel(name)) is not None], axis=1)
-    floor = level * np.stack([stacks[i].floor(name)[r] for i, r in rows.items()], axis=1)
+    floor = np.stack([stacks[i].noise_floor(name, level)[r] for i, r in rows.items()], axis=1)
     tau = np.stack([stacks[i].tau[name][r] for i, r in rows.items()], axis=1)
     noise = [NOISE[stacks[i].kind] for i in used]
     relative = level * np.repeat([[n.relative for n in noise]], len(choices), axis=0)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives.alternative import OUTLIER, TEMPER, mixture
+from localization.evidence.signals import position_noise
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray
 
@@ -110,17 +111,6 @@ class Fit:
     """Headings of the tracked body less those of the path [rad]; None where they show nothing."""
     aligned: float
     """Log likelihood of the headings' offsets with ``yaw``."""
-
-
-def position_noise(positions: FloatArray) -> float:
-    """Standard deviation of the noise of ``positions`` (N, 2), N > 3, at even times [m]: by the median of third differences, which motion
-    hardly changes.
-
-    Where a robot at 0.8 m/s turns and stops every 1.5 to 5 s, noise of 20 mm is found 2 % too large at 5 Hz, 16 % at 2 Hz and twice at
-    1 Hz, by second differences 3 %, 35 % and 2.6 times.
-    """
-    third = np.diff(positions, n=3, axis=0)
-    return float(np.median(np.abs(third))) / (0.6745 * math.sqrt(20.0))  # 1 + 9 + 9 + 1 variances
 
 
 def make_path(trajectory: Trajectory, origin_ns: int) -> Path:

@@ -79,7 +79,8 @@ def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> l
             second = source.rates(edges, delay, of_second=True)[bins] if source.second is not None else np.full_like(rates, np.nan)
             rows = (clock_row(source, delay),) if delay else ()
             found += [replace(a, rows=(*a.rows, *rows), delay_s=delay) for a in MAKERS[source.kind](source, rates, second, robot)]
-        stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins]))
+        jitter = {name: math.sqrt(2.0) * of / (edges[1] - edges[0]) for name, of in zip(("way", "turn"), source.jitter, strict=True)}
+        stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins], jitter=jitter))
     least = {name: float(least_sizes(stacks, np.zeros((1, len(stacks)), int), name)[0]) for name in ("way", "turn")}
     for i, (source, stack) in enumerate(zip(sources, stacks, strict=True)):
         found = [*stack.alternatives, _unrelated(source, stack.alternatives[0], least)]

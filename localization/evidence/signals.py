@@ -72,6 +72,8 @@ class Source:
     """Least time of recording less stamp [s]; None where that is unknown."""
     first_ns: int = 0
     """Stamp from which ``t`` counts; set by `entrance.read_sources`."""
+    jitter: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the white noise of the way and of the turn in ``integrals``, as the source itself shows it."""
     moves_cg: bool = False
     """Whether the robot's centre of gravity moves, and its centre of rotation with it."""
     is_mounted: bool = True
@@ -228,11 +230,24 @@ def from_poses(name: str, stamps_ns: NDArray[np.int64], poses: FloatArray, first
     t, poses = t[is_new], poses[order][is_new]
     if len(t) < 4 or not np.isfinite(poses).all():
         return None
+    jitter = position_noise(poses[:, :2]), position_noise(np.unwrap(poses[:, 2:], axis=0))
     place = poses[:, 0] + 1j * poses[:, 1]
     inverse = -place * np.exp(-1j * poses[:, 2])
     gap = np.diff(t) > 4.0 * np.median(np.diff(t)) + _BIN_S
     known = np.repeat(~gap[:, None], 3, axis=1)
-    return Source(name, "reference", np.asarray(t, dtype=float), _moved(place, poses[:, 2]), known, _moved(inverse, -poses[:, 2]))
+    integrals = _moved(place, poses[:, 2])
+    return Source(name, "reference", np.asarray(t, dtype=float), integrals, known, _moved(inverse, -poses[:, 2]), jitter=jitter)
+
+
+def position_noise(positions: FloatArray) -> float:
+    """Standard deviation of the noise of ``positions`` (N, 2), N > 3, at even times [m]: by the median of third differences, which motion
+    hardly changes.
+
+    Where a robot at 0.8 m/s turns and stops every 1.5 to 5 s, noise of 20 mm is found 2 % too large at 5 Hz, 16 % at 2 Hz and twice at
+    1 Hz, by second differences 3 %, 35 % and 2.6 times.
+    """
+    third = np.diff(positions, n=3, axis=0)
+    return float(np.median(np.abs(third))) / (0.6745 * math.sqrt(20.0))  # 1 + 9 + 9 + 1 variances
 
 
 def _moved(place: NDArray[np.complex128], yaws: FloatArray) -> FloatArray:

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import norm
 
 from localization.evaluation.references import ReferenceTrack
-from localization.evidence.paths import position_noise
 from localization.evidence.references import compare_reference
+from localization.evidence.signals import position_noise
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import FloatArray
