@@ -75,8 +75,8 @@ def _price(c: FloatArray, b: FloatArray, information: FloatArray, tau: FloatArra
 
 @subroutine
 def _first(z: FloatArray, floor: FloatArray, tau: FloatArray, x: FloatArray, c: FloatArray) -> None:
-    """Motion (n,) and logarithms of the scales (k,) by the source whose scale is known best beside its noise: from there the alternation with the scales converges. Noise of
-    the first motion would make all scales small."""
+    """Motion (n,) and logarithms of the scales (k,) by the source whose scale is known best beside its noise: from there the alternation
+    with the scales converges. Noise of the first motion would make all scales small."""
     k, n = z.shape
     best, least = 0, math.inf
     for j in range(k):

@@ -7,6 +7,7 @@ in `Log.warnings`. Replay, calibration, diagnosis, comparison and the live node 
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,12 +47,23 @@ class SetUpLog:
 
 def open_log_with_set_up(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> SetUpLog:  # noqa: B008
     """The log at ``path`` as `open_log` opens it, with what is certain corrected. Raises what that does."""
-    log = open_log(path, robot, topics)
-    found = infer_set_up(log)
+    log, question = open_log(path, robot, topics), _question(Path(path), robot, topics)
+    found = _ANSWERS[question] if question in _ANSWERS else infer_set_up(log)
+    _ANSWERS[question] = found
     if not found.is_as_declared:
         log = open_log(path, found.robot, topics if found.is_gyro_used else replace(topics, imu=""))
         log.add_notes(found.sentences)
     return SetUpLog(log, found)
+
+
+_ANSWERS: dict[bytes, SetUp] = {}
+"""By question: commands of several parts ask the same one for each."""
+
+
+def _question(path: Path, robot: Robot, topics: TopicOverrides) -> bytes:
+    """What is asked, of files as they are now."""
+    files = [file.stat() for file in ([path] if path.is_file() else sorted(path.iterdir()))]
+    return pickle.dumps((str(path.resolve()), [(file.st_size, file.st_mtime_ns) for file in files], robot, topics))
 
 
 def open_log_as_declared(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008

@@ -16,7 +16,7 @@ import pytest
 import skidloc
 from localization.cli import main
 from localization.events import WheelSample
-from localization.evidence import SetUp, infer_set_up, open_log_with_set_up
+from localization.evidence import SetUp, entrance, infer_set_up, open_log_with_set_up
 from localization.evidence.alternatives.alternative import mount_correction
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot import Mount
@@ -66,6 +66,19 @@ def faults(found: SetUp) -> set[str]:
 def test_healthy_log_has_no_sentence(name: str) -> None:
     found = open_log_with_set_up(CASES / name / "log.mcap", ROBOT)
     assert (found.set_up.verdict, found.set_up.sentences, found.log.robot) == ("consistent", (), ROBOT)
+
+
+def test_a_log_is_asked_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr(entrance, "infer_set_up", lambda log: asked.append(log) or infer_set_up(log))
+    log = drive(tmp_path / "log.mcap")
+    first, again = open_log_with_set_up(log, ROBOT), open_log_with_set_up(log, ROBOT)
+    assert first.set_up is again.set_up
+    assert first.log is not again.log
+    assert len(asked) == 1
+    drive(log, signs("left"))
+    assert open_log_with_set_up(log, ROBOT).set_up.verdict == "certain"
+    assert len(asked) == 2
 
 
 @pytest.mark.parametrize(("kind", "reversed_"), [("left", LEFT), ("right", RIGHT), ("one", ("rear_left_wheel",))])
