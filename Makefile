@@ -5,6 +5,8 @@ DEMO := demo-out
 DATA := tests/data
 # As the commands themselves ask for, see localization/blas_threads.py.
 export OPENBLAS_NUM_THREADS ?= 1
+# Bytecode is kept, also where a container's environment says not to: else each process of the tests compiles all sources again.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo demo-buildings test test-extended test-all test-ros2 check docs benchmark clean
 

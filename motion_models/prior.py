@@ -11,6 +11,7 @@ gravity (CG). Nothing here is fitted to a robot; measured robots only set the st
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -116,8 +117,9 @@ def skid_prior(robot: Robot) -> SkidPrior:
         values[0], sigmas[0] = 1.0, _DRIVEN_SIGMA
         return SkidPrior(values, sigmas, "two driven wheels and a caster")
     source = "geometry"
+    model, lengths = FrictionModel.from_robot(robot), (g.wheelbase_m, g.track_width_m, *map(float, robot.center_of_gravity))
     try:
-        values = _polynomials(robot)
+        values = np.array(_polynomials(model.nominal.tobytes(), model.saturation, model.centripetal, *lengths))
     except (CgError, ModelError):  # a CG outside its wheels: their limit for a centred CG remains
         values[0] = geometric_scaling(g.wheelbase_m, g.track_width_m)
         source = "wheelbase and track alone"
@@ -126,27 +128,30 @@ def skid_prior(robot: Robot) -> SkidPrior:
     return SkidPrior(values, sigmas, source)
 
 
-def _polynomials(robot: Robot) -> FloatArray:
-    """(11,) regressions of the friction model's rotations in place on the CG, in the form of Ebersole 2016, 4.21-4.24.
+@functools.lru_cache(maxsize=64)  # 20 ms, and a command makes dozens of models of one robot
+def _polynomials(
+    nominal: bytes, saturation: float, centripetal: bool, wheelbase: float, track_width: float, x_0: float, y_0: float
+) -> tuple[float, ...]:
+    """Eleven regressions of the friction model's rotations in place on the CG, in the form of Ebersole 2016, 4.21-4.24.
 
-    k is exact at the nominal CG; the rest is least squares over a grid around it.
+    k is exact at the nominal CG (``x_0``, ``y_0``); the rest is least squares over a grid around it. The first three arguments are those
+    of the friction model, ``nominal`` as bytes. Lengths are in m.
     """
-    model, g = FrictionModel.from_robot(robot), robot.geometry
-    x_0, y_0 = robot.center_of_gravity
-    x, y = np.meshgrid(
-        x_0 + np.linspace(-_GRID_X, _GRID_X, _POINTS_X) * g.wheelbase_m,
-        y_0 + np.linspace(-_GRID_Y, _GRID_Y, _POINTS_Y) * g.track_width_m,
+    model = FrictionModel(np.frombuffer(nominal), saturation, centripetal)
+    grid = np.meshgrid(
+        x_0 + np.linspace(-_GRID_X, _GRID_X, _POINTS_X) * wheelbase,
+        y_0 + np.linspace(-_GRID_Y, _GRID_Y, _POINTS_Y) * track_width,
     )
-    x, y = x.ravel(), y.ravel()
+    x, y = (axis.ravel() for axis in grid)
     turn = np.array([-1.0, 1.0])
-    k, x_cr, y_cr = _rotation(model, turn, np.stack([x, y], axis=-1), g.track_width_m)
-    k_nominal = float(_rotation(model, turn, np.array([[x_0, y_0]]), g.track_width_m)[0][0])
+    k, x_cr, y_cr = _rotation(model, turn, np.stack([x, y], axis=-1), track_width)
+    k_nominal = float(_rotation(model, turn, np.array([[x_0, y_0]]), track_width)[0][0])
     dx, one = x - x_0, np.ones_like(x)
     slope, curve = np.linalg.lstsq(np.stack([dx, dx**2], axis=-1), k - k_nominal, rcond=None)[0]
     by_x = np.linalg.lstsq(np.stack([one, x], axis=-1), x_cr, rcond=None)[0]
     by_xy = np.linalg.lstsq(np.stack([one, x, x**2, y, x * y, x**2 * y], axis=-1), y_cr, rcond=None)[0]
     k_0 = k_nominal - slope * x_0 + curve * x_0**2
-    return np.array([k_0, slope - 2.0 * curve * x_0, curve, *by_x, *by_xy])
+    return k_0, slope - 2.0 * curve * x_0, curve, *by_x, *by_xy
 
 
 def _rotation(model: FrictionModel, wheels: FloatArray, cg: FloatArray, track_width_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:

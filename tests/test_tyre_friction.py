@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.slope import Slope
 
+pytestmark = pytest.mark.xdist_group("tyre_friction")
 ROBOT, STEP_S, CG = load_robot("husky_a200"), 0.05, np.zeros((2, 2))
 SKID = make_model("skid_steer", ROBOT)
 DOWNHILL = math.tan(math.radians(10.0))
@@ -29,7 +31,8 @@ def with_tyres(stiffness, mu):
     return replace(ROBOT, models={**ROBOT.models, "friction": {**ROBOT.models.get("friction", {}), **tyres}})
 
 
-def drive_on_slope(stiffness=1.0, mu=1.0, seconds=90.0, seed=1):
+@functools.cache
+def drive_on_slope(stiffness, mu, seconds=90.0, seed=1):
     """Arcs and turns in place on 10 degrees, by wheels and a gyro with bias, of a robot whose k is 5 % larger than by its geometry."""
     rng, friction = np.random.default_rng(seed), FrictionModel.from_robot(with_tyres(stiffness, mu))
     filtered = MotionOnSlopes(ROBOT, noise_vector(ROBOT.wheel_noise), np.array([1.0, 1.0, 1.0]))
@@ -58,8 +61,8 @@ def test_tyre_friction_is_that_of_the_turns_on_slopes(stiffness, mu):
 
 
 def test_tyre_friction_tells_hard_from_soft_and_dry_from_wet():
-    assert drive_on_slope(3.0).logs[0] - drive_on_slope(0.5).logs[0] > 0.8
-    assert drive_on_slope(mu=1.3).logs[1] - drive_on_slope(mu=0.7).logs[1] > 0.3
+    assert drive_on_slope(3.0, 1.0).logs[0] - drive_on_slope(0.5, 1.0).logs[0] > 0.8
+    assert drive_on_slope(1.0, 1.3).logs[1] - drive_on_slope(1.0, 0.7).logs[1] > 0.3
 
 
 def test_slope_effect_by_tyres_equals_differences():
@@ -86,7 +89,7 @@ def test_motion_on_slopes_beyond_the_limits_measures_no_tyres():
 
 
 def test_tyre_friction_of_absurd_turns_stays_within_its_limits():
-    found = drive_on_slope(seconds=5.0)
+    found = drive_on_slope(1.0, 1.0, seconds=5.0)
     for _ in range(1000):
         found.update(10.0, np.array([0.01, -0.02, 0.1, STEP_S]), 1e-8)
     stiffness, mu = found.logs

@@ -79,7 +79,7 @@ class McapFile:
         used = "ros1" if self.is_ros1 else "cdr"
         self._topics = {key: t for key, t in self._described.items() if t.encoding == used}
         self.channels = [Channel(t.name, t.type, t.definition, totals[key]) for key, t in sorted(self._topics.items())]
-        self._set_backs = find_set_backs(self._chunks, self._times)
+        self._set_backs = find_set_backs(path, self._chunks, self._times)
         self._chunks = move_chunks(self._chunks, self._set_backs, self._times)
         self.start_ns = min((c.start_ns for c in self._chunks), default=0)
         self.end_ns = max((c.end_ns for c in self._chunks), default=0)

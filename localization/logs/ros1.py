@@ -68,7 +68,7 @@ class Ros1Bag:
             Channel(c.topic, c.type, MessageDefinition(MessageDefinitionFormat.MSG, c.definition), totals[key])
             for key, c in sorted(self._connections.items())
         ]
-        self._set_backs = find_set_backs([c for c in self._chunks if c.counts], self._times)
+        self._set_backs = find_set_backs(path, [c for c in self._chunks if c.counts], self._times)
         self._chunks = move_chunks(self._chunks, self._set_backs, self._times)
         filled = [c for c in self._chunks if c.counts]
         self.start_ns = min((c.start_ns for c in filled), default=0)

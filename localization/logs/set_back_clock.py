@@ -9,9 +9,11 @@ holds after it.
 from __future__ import annotations
 
 import statistics
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from localization.logs.chunks import Chunk
 
@@ -24,6 +26,10 @@ _SMALL_BYTES = 50_000_000
 """Size of files whose chunks are all read [bytes]: 0.3 s. Chunks of larger ones hold a second or less, or hours are recorded."""
 MAX_CANDIDATES = 100
 """Steps of a chunk that are compared; more are no clock that was set, but times that mean nothing."""
+_SETTLED_NS = 2_000_000_000
+"""A file that was written longer ago has another time of change when it is written again, whatever clock the file system has."""
+_found: dict[tuple[str, int, int, int], list[SetBack]] = {}
+"""By path, node, size and time of change: commands open a log several times, and all of a small one is read for these."""
 Times = Sequence[tuple[int, int]]
 """Number of the topic and time of recording [ns] of the messages of a chunk, in order of the file."""
 
@@ -41,11 +47,31 @@ class SetBack:
     by_ns: int
 
 
-def find_set_backs(chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> list[SetBack]:
-    """Where the clock was set back, in order of the file.
+def find_set_backs(path: Path, chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> list[SetBack]:
+    """Where the clock was set back, in order of the file at ``path``: once in a process for a file that stays as it is.
 
     Of large files only chunks are read that overlap with the next by over a second, and the last.
     """
+    status = path.stat()
+    key = str(path.resolve()), status.st_ino, status.st_size, status.st_mtime_ns
+    if key not in _found:
+        found = _find(chunks, read)
+        if time.time_ns() - status.st_mtime_ns < _SETTLED_NS:
+            return found
+        _found[key] = found
+    return _found[key]
+
+
+def _find(chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> list[SetBack]:
+    kept: dict[int, Times] = {}  # of the previous chunk, this one and the following
+
+    def read_once(chunk: Chunk) -> Times:
+        if chunk.position not in kept:
+            if len(kept) == 3:
+                del kept[next(iter(kept))]
+            kept[chunk.position] = read(chunk)
+        return kept[chunk.position]
+
     ordered: list[Chunk | None] = [None, *sorted(chunks, key=lambda chunk: chunk.position), None]
     places = [chunk.position for chunk in ordered if chunk is not None]
     is_small = max(places, default=0) - min(places, default=0) <= _SMALL_BYTES
@@ -55,7 +81,7 @@ def find_set_backs(chunks: Iterable[Chunk], read: Callable[[Chunk], Times]) -> l
             continue
         if is_small and chunk.end_ns - chunk.start_ns <= MIN_STEP_NS and (following is None or chunk.end_ns <= following.start_ns):
             continue
-        before, inside, after = ([] if part is None else list(read(part)) for part in (previous, chunk, following))
+        before, inside, after = ([] if part is None else read_once(part) for part in (previous, chunk, following))
         before, after = before[-COMPARED:], after[:COMPARED]
         times, first, last = [*before, *inside, *after], max(len(before), 1), len(before) + len(inside)
         steps = [k for k in range(first, min(last + 1, len(times))) if times[k - 1][1] - times[k][1] > MIN_STEP_NS]

@@ -13,7 +13,7 @@ from localization.lidar.ground_hits import GroundHits
 from localization.log_replay import replay
 from localization.logs import open_log
 from localization.pipeline import ReplayConfig, Trial
-from localization.simulation.experiments import EXPERIMENTS, OpenLoop, Rest, constant
+from localization.simulation.experiments import EXPERIMENTS, ExperimentConfig, OpenLoop, Rest, constant
 from localization.simulation.hill_sensors import body_poses
 from localization.simulation.scanners import SpinningConfig
 from localization.simulation.sensors import SensorConfig
@@ -59,7 +59,8 @@ def test_motion_over_ground_is_the_twist_in_the_bodys_plane(heading):
 @pytest.mark.extended
 def test_planar_scanner_on_hills_leaves_the_ground_out(tmp_path, monkeypatch):
     """Most beams hit the ground: with them the estimate goes where the ground seems to go, and healthy sensors are accused."""
-    simulation = Simulation(EXPERIMENTS["hills"], load_robot("husky_a200"), 4, {}, SimulationConfig())
+    config = SimulationConfig(experiment=ExperimentConfig(laps=1))
+    simulation = Simulation(EXPERIMENTS["hills"], load_robot("husky_a200"), 4, {}, config)
     write_simulation(tmp_path / "hills.mcap", simulation)
     log = skidloc.open(tmp_path / "hills.mcap", "husky_a200")
     (run,) = log.replay(["skid_steer/ekf"])
