@@ -36,7 +36,6 @@ from localization.commands.calibration_tables import (
 from localization.commands.common import in_radians, write_json
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
-from localization.report.calibrate_page import write_calibrate_page
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_foreign_frames
 from motion_models.calibration.regressions import RotationTable, read_rotations, rotations_as_maneuvers, skid_steer_fit
@@ -150,6 +149,8 @@ class Calibrate:
             new = dataclasses.replace(with_clock(found.fit.robot(robot), found), wheel_noise=found.noise.scaled(robot.wheel_noise))
             sigmas = found.sigmas
         if self.page is not None:
+            from localization.report.calibrate_page import write_calibrate_page  # matplotlib, which takes half a second
+
             write_calibrate_page(self.page, robot, new, [m for each in cuts for m in each.maneuvers], numbers)
             console.print(f"page: {self.page}", markup=False, soft_wrap=True)
         return new, sigmas, numbers

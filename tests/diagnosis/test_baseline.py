@@ -47,7 +47,12 @@ def test_estimate_baseline_of_short_drive_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("factors", "kind"),
-    [((1.0, 1.0, 1.0), "independent"), ((3.0, 1.0, 2.0), "independent"), ((2.0, 2.0, 2.0), "correlated"), ((2.0, 2.0, 2.0), "outlier")],
+    [
+        pytest.param((1.0, 1.0, 1.0), "independent", marks=pytest.mark.extended),
+        ((3.0, 1.0, 2.0), "independent"),
+        pytest.param((2.0, 2.0, 2.0), "correlated", marks=pytest.mark.extended),
+        ((2.0, 2.0, 2.0), "outlier"),
+    ],
 )
 def test_estimate_baseline_noise_over_reference_is_that_drawn(factors: tuple[float, float, float], kind: str) -> None:
     healthy = law_drive("husky_a200", windows=48)

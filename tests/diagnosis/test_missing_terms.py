@@ -78,7 +78,7 @@ def test_term_columns_of_a_rise_equal_those_of_its_limit() -> None:
     assert columns[late, :, 1] == pytest.approx(columns[late, :, 0], abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.extended)])
 def test_extend_finds_what_fades(seed: int) -> None:
     """exp(-t/12) is 1 - rise(t,12): neither term is an improvement by itself."""
     effect: Effect = lambda m: (0.4 * m.v * np.exp(-m.t / 12.0), 0.0, 0.0)  # noqa: E731
@@ -88,7 +88,13 @@ def test_extend_finds_what_fades(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("component", "text"), [("wz", "max(wz,0)"), ("vx", "min(v,0)"), ("vy", "abs(v)*min(wz,0)"), ("vx", "min(v,0)*wz*abs(wz)")]
+    ("component", "text"),
+    [
+        ("wz", "max(wz,0)"),
+        pytest.param("vx", "min(v,0)", marks=pytest.mark.extended),
+        pytest.param("vy", "abs(v)*min(wz,0)", marks=pytest.mark.extended),
+        ("vx", "min(v,0)*wz*abs(wz)"),
+    ],
 )
 def test_extend_finds_what_acts_to_one_side(component: str, text: str) -> None:
     """By abs() half of it would be a term, and half within the tolerance of radii, track and mounts, which no file holds."""

@@ -83,7 +83,15 @@ def test_weighing_p_values_of_a_right_file_are_uniform() -> None:
     assert kstest([_weighing((x, y)).p_value for x, y in draws.tolist()], "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("factor", "kind"), [(1.0, "independent"), (3.0, "independent"), (2.0, "correlated"), (2.0, "outlier")])
+@pytest.mark.parametrize(
+    ("factor", "kind"),
+    [
+        pytest.param(1.0, "independent", marks=pytest.mark.extended),
+        (3.0, "independent"),
+        pytest.param(2.0, "correlated", marks=pytest.mark.extended),
+        (2.0, "outlier"),
+    ],
+)
 def test_weigh_noise_ratio_is_that_drawn(factor: float, kind: str) -> None:
     drive = law_drive("husky_a200", windows=48)
     model, rng = make_model("friction", drive.robot), np.random.default_rng(0)
