@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from motion_models import se2
-from tests.league import joined, page, tuning
+from tests.league import joined, page, tables, tuning
 from tests.league.__main__ import main
 from tests.league.evalio_pipelines import PIPELINES
 from tests.league.logs import find_logs, peer_arrays
@@ -64,6 +64,26 @@ def test_page_names_the_least_error_and_what_failed(tmp_path):
     assert ") in RPE" not in text
     assert "No module named &#x27;genz_icp&#x27;" in text
     assert text.count("class=best") == 2
+
+
+def test_tables_take_what_was_run_and_keep_the_rest(tmp_path):
+    """A run of one peer on one log changes its cells alone, and the best peer of that log in README.md."""
+    (tmp_path / "docs/lab").mkdir(parents=True)
+    journal, readme = tmp_path / "docs/lab/league.md", tmp_path / "README.md"
+    journal.write_text("above\n<!-- league: begin -->\n<!-- league: end -->\nbelow\n")
+    readme.write_text("| best peer, by the league | | | | |\n| EKF | 1 | 2 | 3 | 4 |\n")
+
+    def row(log, system, ate):
+        return {"log": log, "system": system, "ate_m": ate, "rpe_m": 0.5, "cpu_per_s": 0.002, "memory_mb": 50.0}
+
+    tables.write([row(log, system, ate) for log in ("fr079", "csail", "aces") for system, ate in (("A", 3.0), ("skidloc", 1.0))], tmp_path)
+    tables.write([row("csail", "B", 2.0), {"log": "aces", "system": "B", "failure": "crashed"}], tmp_path)
+    assert journal.read_text().startswith("above\n")
+    assert journal.read_text().endswith("below\n")
+    assert "| A | 3.000 / 0.500 | 3.000 / 0.500 | 3.000 / 0.500 | – | – | 2.0 | 50 |" in journal.read_text()  # noqa: RUF001
+    assert "| B | – | 2.000 / 0.500 | failed | – | – | – | – |" in journal.read_text()  # noqa: RUF001
+    best = "| best peer, by the league | A: 3.000 / 0.500 | B: 2.000 / 0.500 | A: 3.000 / 0.500 | |"
+    assert readme.read_text() == f"{best}\n| EKF | 1 | 2 | 3 | 4 |\n"
 
 
 def test_memory_of_a_process_is_its_own():

@@ -1,7 +1,7 @@
 """Run skidloc and its peers on the same logs, with the defaults of each or tuned on another log, and judge them by evo and smfeval.
 
 python -m tests.league [--log fr079,csail,aces,hills-trees,hills-grass] [--system NAME,...] [--folder MY_LOGS] [--out league-out]
-    [--peer NAME=PATH ...] [--tune LOG] [--budget 40]
+    [--peer NAME=PATH ...] [--tune LOG] [--budget 40] [--write]
 
 Peers are installed into .league/, an environment of their own, from tests/league/requirements.txt; what cannot be installed or crashes
 is a row with the reason, and is tried again by the next run. What has been run is kept in the output folder and is not run again: delete a
@@ -10,7 +10,7 @@ league.html has tables, plots and settings; league.json the numbers. CPU seconds
 without reading the log. `--peer` adds a system that is built from sources in PATH, or a folder of finished LOG.tum files (`joined`).
 `--tune` gives each peer with settings of its own a row more on every other log: those settings that were best on LOG, of at most
 `--budget` drawn from its grid. skidloc is never tuned: its rows are its defaults. `--folder` adds NAME.mcap with NAME.toml and a
-reference NAME.tum, .csv, .txt or .relations beside it.
+reference NAME.tum, .csv, .txt or .relations beside it. `--write` puts what was run into the tables of docs/lab/league.md and README.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 from localization.evaluation.metrics import relation_errors
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.trajectory import Trajectory
-from tests.league import joined, page, tuning
+from tests.league import joined, page, tables, tuning
 from tests.league.hills import HILLS, SECONDS
 from tests.league.logs import find_logs, peer_arrays
 from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE, System
@@ -204,6 +204,7 @@ def _arguments(words: Sequence[str] | None, logs: Sequence[str]) -> argparse.Nam
     parser.add_argument("--peer", action="append", default=[], metavar="NAME=PATH")
     parser.add_argument("--tune", metavar="LOG")
     parser.add_argument("--budget", type=int, default=40)
+    parser.add_argument("--write", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("league-out"))
     return parser.parse_args(words)
 
@@ -232,6 +233,8 @@ def main(words: Sequence[str] | None = None) -> None:
     rows += [row for log in options.log if log in HILLS for row in rows_in_space(log, in_space, options.out)]
     (options.out / "league.json").write_text(json.dumps(rows, indent=1))
     page.write(rows, [*systems, *in_space], options.out)
+    if options.write:
+        tables.write(rows)
     print(f"{options.out / 'league.html'}")
 
 
