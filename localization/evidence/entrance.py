@@ -31,6 +31,8 @@ from motion_models.se2 import FloatArray
 
 _MOVING_S, _READ_S, _SCANS_S, _STANDING_S = 120.0, 900.0, 75.0, 5.0
 """Time after the first motion that is read, in all, with scans (registering one takes a millisecond), and kept from before it [s]."""
+_MIN_BINS = 12
+"""Bins in which sources are compared, at least: 6 s."""
 _MOVED = 0.02
 """Change of an angle, or rate, from where on wheels have moved, in any unit that practice has: above the noise of rates at standstill."""
 _DEG_PER_RAD = 180.0 / math.pi
@@ -117,8 +119,11 @@ def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
         return SetUp("undecidable", robot, reason=f"{there} alone measures the motion often enough: nothing can be compared.")
     start, end = max(source.t[0] for source in used), min(source.t[-1] for source in used)
     edges = bin_edges(used, start, end)
-    if len(edges) < 12:
+    if len(edges) < _MIN_BINS:
         return SetUp("undecidable", robot, reason=f"the sources overlap by {max(end - start, 0.0):.1f} s: too short to be compared.")
+    used = [source for source in used if np.isfinite(source.rates(edges)).any(axis=1).sum() >= _MIN_BINS]
+    if len(used) < 2:
+        return SetUp("undecidable", robot, reason="no two sources know their motion for long enough: nothing can be compared.")
     if all(float(np.nanmax(np.abs(source.rates(edges)), initial=0.0)) < 1e-3 for source in used):
         return SetUp("undecidable", robot, reason="nothing moves: drive straight on for 10 s and turn in place both ways.")
     return decide(used, make_stacks(used, edges, robot), robot, own)

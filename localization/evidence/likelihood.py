@@ -208,6 +208,12 @@ class Stack:
         ]
         return np.asarray(np.max(of_rates, axis=0) > (_AT_REST if self._counts else -1.0))
 
+    def known(self, name: str) -> FloatArray:
+        """(A,) bins in which a channel is known."""
+        channel = self.channel(name)
+        assert channel is not None
+        return np.asarray(np.isfinite(channel).sum(axis=1))
+
     def channel(self, name: str) -> FloatArray | None:
         """(A, n) way or turn; None where it is not measured."""
         return self._channels[name]
@@ -279,7 +285,7 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float
     of_bins, price, _, _ = channel_evidence(*inputs, _SIZES[name], least)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
     slips = np.array([NOISE[stacks[i].kind].relative for i in used])
-    slides = [(skids, level), (slips, level), *([(slips, 1.0)] if level < 1.0 else [])]  # the floor is not as quiet as the sensors
+    slides = [(skids, level), (slips, level), *([(skids, 1.0)] if level < 1.0 else [])]  # the floor is not as quiet as the sensors
     for part, slip_level in slides if name == "turn" and skids.any() else ():
         skidding = np.stack([stacks[i].noise_floor("skidding", slip_level)[choices[:, i]] for i in used], axis=1)
         skidding = np.where(skids[:, None] > 0.0, skidding, floor)
@@ -292,16 +298,22 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float
     is_alone = np.isfinite(z).any(axis=2).sum(axis=1) < 2
     found = of_bins + price[:, None] / z.shape[2]
     if is_alone.any():
-        found[is_alone] = (_of_one_source(stacks, choices, name, used) / z.shape[2])[is_alone, None]
+        found[is_alone] = (_of_one_source(stacks, choices, name, used, least) / z.shape[2])[is_alone, None]
     return np.asarray(found)
 
 
-def _of_one_source(stacks: Sequence[Stack], choices: Choices, name: str, used: Sequence[int]) -> FloatArray:
+def _of_one_source(stacks: Sequence[Stack], choices: Choices, name: str, used: Sequence[int], least: FloatArray) -> FloatArray:
     """Evidence (A,) of a channel that one source measures alone: of its unit, and of nothing else.
 
-    Flat over motions up to the size of the source's rates: a map by which the robot moves less than its wheels turn explains nothing.
+    Flat over motions up to the size of the source's rates, and of the ``least`` motion (A,) as beside other sources: a map by which the
+    robot moves less than its wheels turn explains nothing.
     """
-    return np.asarray(sum(stacks[i].alone[name][choices[:, i]] for i in used))
+    found = np.zeros(len(choices))
+    for i in used:
+        rows = choices[:, i]
+        smaller = np.log(np.maximum(least / stacks[i].sizes[name], 1.0))
+        found += stacks[i].alone[name][rows] - TEMPER * stacks[i].known(name)[rows] * smaller
+    return found
 
 
 def _inputs(

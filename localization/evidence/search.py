@@ -83,7 +83,8 @@ def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> l
         stacks.append(Stack(source.kind, found, behind_s=source.behind_s, t=edges[bins], jitter=jitter))
     least = {name: float(least_sizes(stacks, np.zeros((1, len(stacks)), int), name)[0]) for name in ("way", "turn")}
     for i, (source, stack) in enumerate(zip(sources, stacks, strict=True)):
-        found = [*stack.alternatives, _unrelated(source, stack.alternatives[0], least)]
+        of_others = [other.alternatives[0] for other in (*stacks[:i], *stacks[i + 1 :])]
+        found = [*stack.alternatives, _unrelated(source, stack.alternatives[0], of_others, least)]
         if sum(other.kind == source.kind for other in sources) > 1:
             found = [replace(a, rows=tuple(_row_of(source.name, row) for row in a.rows)) for a in found]
         stacks[i] = stack.of(found)
@@ -125,12 +126,19 @@ def _thinned(rows: IntArray, most: int) -> IntArray:
     return rows if len(rows) <= most else rows[np.linspace(0, len(rows) - 1, most).astype(int)]
 
 
-def _unrelated(source: Source, by_file: Alternative, least: Mapping[str, float]) -> Alternative:
-    """A source whose channels are of another motion: each has its own size, ``least`` at least as the robot's motion."""
+def _unrelated(source: Source, by_file: Alternative, of_others: Sequence[Alternative], least: Mapping[str, float]) -> Alternative:
+    """A source whose channels are of another motion than those ``of_others``: each has its own size, ``least`` at least as the robot's
+    motion. What no other source measures stays: nothing contradicts it."""
     row = Row(f"{source.kind}.unrelated", f"{source.name} measures another motion than the others", _UNRELATED_ODDS)
-    channels = {name: getattr(by_file, name) for name in ("way", "turn") if getattr(by_file, name) is not None}
-    own = by_file.own + sum(unrelated_evidence(channel, least[name]) for name, channel in channels.items())
-    return replace(by_file, rows=(row,), own=own, **{name: np.full_like(channel, np.nan) for name, channel in channels.items()})
+    shared = {
+        name: channel for name in ("way", "turn") if (channel := getattr(by_file, name)) is not None and _is_measured(of_others, name)
+    }
+    own = by_file.own + sum(unrelated_evidence(channel, least[name]) for name, channel in shared.items())
+    return replace(by_file, rows=(row,), own=own, **{name: np.full_like(channel, np.nan) for name, channel in shared.items()})
+
+
+def _is_measured(alternatives: Sequence[Alternative], name: str) -> bool:
+    return any((channel := getattr(a, name)) is not None and np.isfinite(channel).any() for a in alternatives)
 
 
 @dataclass(frozen=True)

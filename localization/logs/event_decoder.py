@@ -55,14 +55,12 @@ _MAX_WRAP_DEVIATION_RAD, _MAX_WRAPPED_STEP_WITHOUT_RATE_RAD = 0.3, 1.0
 _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its reading before; drivers publish at 10 Hz and more
 
 
-_MIN_SWAPS = 6
-"""Changes from one publisher to the other and back, before one is left out."""
-_VELOCITY_NOISE, _MAX_ACCELERATION = 0.05, 5.0
-"""Noise and largest acceleration of readings without angles, and of a driver's twist [m/s, m/s^2; rad/s, rad/s^2]. Robots of this size
-brake at up to 3 m/s^2."""
-_SAME_WAY = 0.3
-"""Difference of the way from pose to pose and of that by the speed, of this one, up to which they agree: a speed changes by so much from
-one message to the next."""
+_ARE_TWO, _IS_ONE, _CERTAIN = math.log(1e-6), math.log(0.5), math.log(100.0)
+"""Logarithms: prior odds that two publishers share a topic; price of saying whose a reading is; odds from where on one is left out."""
+_ENCODER_STEPS = 3.0
+"""Scale of the changes over the smallest one that was seen: speeds by encoders are multiples of one step per message."""
+_FORGET = 0.05
+"""Share by which the mean size of changes is renewed by each reading."""
 _MORE = 1.2
 """Travelled by a second publisher over that of the one in use, from where on the second is used: equal ones do not take turns."""
 _FROZEN_AFTER_RAD = 0.5
@@ -252,76 +250,87 @@ class _PublisherState:
     """Sum of the wheels' steps since there are two publishers [rad]."""
 
 
-class _Motion(NamedTuple):
-    """Last reading of one publisher."""
-
-    velocity: FloatArray
-    """(n,) [m/s, or rad/s in the last entry of a twist]; NaN where absent."""
-    pose: FloatArray
-    """(3,) [m, m, rad], or (0,)."""
-
-
 @dataclass
 class _Publisher:
     stamp_ns: int
-    motion: _Motion
+    values: list[float]
     travelled: float = 0.0
     """Since there are two publishers [m]."""
 
 
 class PublisherSeparator:
-    """Separates the readings of two publishers that share a topic: velocities and poses alternate between them.
+    """Separates two publishers that share a topic, of velocities and poses, by the evidence for two.
 
-    The one whose wheels travel more is used, of equal ones one. A single step to other values is a reset, a stop, or noise.
+    Each goes on from its own last reading, so that its changes are smaller than those from reading to reading, by more than it costs to say
+    whose each is. Changes have Cauchy densities with the scale of their mean size. Speeds of coarse encoders, which jump by one step and
+    back, are no second publisher's. The one whose wheels travel more is used, of equal ones one.
     """
 
     def __init__(self) -> None:
         self._current: _Publisher | None = None
         self._other: _Publisher | None = None
         self._used: _Publisher | None = None
-        self._swaps = 0
+        self._log_odds = _ARE_TWO
+        self._largest = 0.0  # cost of the jump that made the other one
+        self._sizes: list[float] = []
+        self._steps: list[float] = []
 
-    def admit(self, stamp_ns: int, motion: _Motion, speed: float) -> bool:
-        """Whether a reading of ``motion`` at ``speed`` [m/s] is to be used."""
-        if self._other is not None and stamp_ns - self._other.stamp_ns > _MAX_PUBLISHER_GAP_NS:
-            self._other, self._swaps = None, 0
+    def admit(self, stamp_ns: int, values: Sequence[float], speed: float) -> bool:
+        """Whether a reading of ``values`` (velocities, pose; NaN where absent) at ``speed`` [m/s] is to be used."""
         current = self._current
         if current is None:
-            self._current = _Publisher(stamp_ns, motion)
+            self._current = _Publisher(stamp_ns, list(values))
+            self._sizes, self._steps = [0.0] * len(values), [math.inf] * len(values)
             return True
-        if not _may_follow(current, stamp_ns, motion):
-            if self._other is not None and _may_follow(self._other, stamp_ns, motion):
-                current, self._other = self._other, current
-                self._swaps += 1
-            else:
-                current, self._other, self._swaps = _Publisher(stamp_ns, motion), replace(current, travelled=0.0), 0
+        if self._other is not None and stamp_ns - self._other.stamp_ns > _MAX_PUBLISHER_GAP_NS:
+            self._other, self._log_odds, self._largest = None, _ARE_TWO, 0.0
+        current = self._current = self._chosen(current, stamp_ns, values)
         if math.isfinite(speed):
             current.travelled += speed * (stamp_ns - current.stamp_ns) * 1e-9
-        current.stamp_ns, current.motion = stamp_ns, motion
-        self._current = current
-        if self._other is None or self._swaps < _MIN_SWAPS:
+        current.stamp_ns, current.values = stamp_ns, list(values)
+        if self._other is None or self._log_odds < _CERTAIN:
             return True
         used, rival = (current, self._other) if current is self._used else (self._other, current)
         if used is not self._used or rival.travelled > _MORE * used.travelled:
             self._used = max(used, rival, key=lambda publisher: publisher.travelled)
         return current is self._used
 
+    def _chosen(self, current: _Publisher, stamp_ns: int, values: Sequence[float]) -> _Publisher:
+        """The publisher of a reading; the one before, where it is another, is the other one."""
+        changes, other = self._changes(values, current), self._other
+        back = changes if other is None else self._changes(values, other)
+        cost = self._cost(changes)
+        if other is not None:
+            cost_of_other = self._cost(back)
+            self._log_odds = min(max(self._log_odds + cost - min(cost, cost_of_other) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
+            if cost_of_other < cost:
+                self._learn(back)
+                self._other = current
+                return other
+        self._largest += _IS_ONE
+        if self._log_odds < _CERTAIN and cost > self._largest:
+            self._other, self._largest = replace(current, travelled=0.0), cost
+            current.travelled = 0.0
+        else:
+            self._learn(changes)
+        return current
 
-def _may_follow(publisher: _Publisher, stamp_ns: int, motion: _Motion) -> bool:
-    """Whether a robot can have come from the publisher's last reading to ``motion``."""
-    passed_s = max((stamp_ns - publisher.stamp_ns) * 1e-9, _MIN_INTERVAL_S)
-    change = np.abs(motion.velocity - publisher.motion.velocity)
-    moved = np.abs(motion.pose - publisher.motion.pose)[:2]
-    is_too_fast = bool((change > _VELOCITY_NOISE + _MAX_ACCELERATION * passed_s).any() or (moved > _MAX_SPEED_M_S * passed_s).any())
-    return not is_too_fast or _has_moved_as_fast(motion, moved, passed_s)  # a comparison with NaN is false
+    def _changes(self, values: Sequence[float], publisher: _Publisher) -> list[float]:
+        """Sizes of the changes since the last reading of a ``publisher``; the smallest are kept."""
+        found = [abs(a - b) for a, b in zip(values, publisher.values, strict=True)]
+        self._steps = [min(step, change) if change > 0.0 else step for step, change in zip(self._steps, found, strict=True)]
+        return found
 
+    def _cost(self, changes: Sequence[float]) -> float:
+        """Minus the logarithm of the density of ``changes``, up to a constant; 0 where nothing is known."""
+        scales = [max(size, _ENCODER_STEPS * step) for size, step in zip(self._sizes, self._steps, strict=True)]
+        known = [(change, scale) for change, scale in zip(changes, scales, strict=True) if change == change and 0.0 < scale < math.inf]
+        return sum(2.0 * math.log(math.hypot(1.0, change / scale)) for change, scale in known)
 
-def _has_moved_as_fast(motion: _Motion, moved: FloatArray, passed_s: float) -> bool:
-    """Whether the pose has gone on by the way (0 or 2,) that the reading's own speed makes, as none of another publisher has."""
-    if not len(moved):
-        return False
-    expected = math.hypot(*motion.velocity[:2].tolist()) * passed_s
-    return abs(math.hypot(*moved.tolist()) - expected) < _SAME_WAY * expected
+    def _learn(self, changes: Sequence[float]) -> None:
+        self._sizes = [
+            size + _FORGET * (change - size) if change == change else size for size, change in zip(self._sizes, changes, strict=True)
+        ]
 
 
 class JointsToWheels:
@@ -422,7 +431,7 @@ class JointsToWheels:
             return
         speed = velocity * self._radius
         travel_m_s = float(np.nanmax(np.abs(speed))) if np.isfinite(speed).any() else 0.0
-        if not self._rates.admit(stamp_ns, _Motion(speed, np.zeros(0)), travel_m_s):
+        if not self._rates.admit(stamp_ns, speed.tolist(), travel_m_s):
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
             return
         yield WheelSample(stamp_ns, self._side_means(velocity), np.full(2, np.nan))
@@ -549,7 +558,8 @@ class OdometryToWheels:
 
     def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
-        if not self._publishers.admit(reading.stamp_ns, _Motion(reading.twist, reading.pose), float(np.hypot(*reading.twist[:2]))):
+        values = [*reading.twist.tolist(), *reading.pose.tolist()]
+        if not self._publishers.admit(reading.stamp_ns, values, float(np.hypot(*reading.twist[:2]))):
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
             return
         vx, _, wz = reading.twist
