@@ -59,6 +59,8 @@ _ARE_TWO, _IS_ONE, _CERTAIN = math.log(1e-6), math.log(0.5), math.log(100.0)
 """Logarithms: prior odds that two publishers share a topic; price of saying whose a reading is; odds from where on one is left out."""
 _ENCODER_STEPS = 3.0
 """Scale of the changes over the smallest one that was seen: speeds by encoders are multiples of one step per message."""
+_RESOLUTION = 1e-3
+"""Least scale of changes: less is rounding [m, m/s, rad/s]."""
 _FORGET = 0.05
 """Share by which the mean size of changes is renewed by each reading."""
 _MORE = 1.2
@@ -67,6 +69,8 @@ _FROZEN_AFTER_RAD = 0.5
 """Turned by another wheel of the same side; these are coupled by a chain or by the ground."""
 _SAME_CG_NS = 1_000_000_000
 """A centre of gravity that stays is an event no more often than this [ns]; drivers of arms publish at 50 to 500 Hz."""
+_NO_POSE_AFTER = 0.1
+"""Way [m] or turn [rad] by the twist alone, from where on a pose that never moved is none."""
 _NO_ANGLES_AFTER_RAD = 0.1
 """Turned by the rates alone, from where on angles that never changed are none: above encoders' steps and the rates' noise at standstill."""
 
@@ -323,8 +327,8 @@ class PublisherSeparator:
 
     def _cost(self, changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``changes``, up to a constant; 0 where nothing is known."""
-        scales = [max(size, _ENCODER_STEPS * step) for size, step in zip(self._sizes, self._steps, strict=True)]
-        known = [(change, scale) for change, scale in zip(changes, scales, strict=True) if change == change and 0.0 < scale < math.inf]
+        scales = [max(size, _ENCODER_STEPS * step, _RESOLUTION) for size, step in zip(self._sizes, self._steps, strict=True)]
+        known = [(change, scale) for change, scale in zip(changes, scales, strict=True) if change == change and scale < math.inf]
         return sum(2.0 * math.log(math.hypot(1.0, change / scale)) for change, scale in known)
 
     def _learn(self, changes: Sequence[float]) -> None:
@@ -554,11 +558,13 @@ class OdometryToWheels:
         self._previous: OdometryReading | None = None
         self._angle = np.zeros(2)
         self._pose_has_moved = self._twist_has_moved = False
+        self._by_twist = np.zeros(2)  # way and turn while the pose has not moved [m, rad]
         self._publishers = PublisherSeparator()
 
     def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
-        values = [*reading.twist.tolist(), *reading.pose.tolist()]
+        twist = [math.nan] * 3 if self._pose_has_moved else reading.twist.tolist()  # speeds and headings jump by a count and return
+        values = [*twist, *reading.pose[:2].tolist()]
         if not self._publishers.admit(reading.stamp_ns, values, float(np.hypot(*reading.twist[:2]))):
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
             return
@@ -587,7 +593,8 @@ class OdometryToWheels:
             elif moved:
                 self._pose_has_moved = True
             elif not self._pose_has_moved and self._twist_has_moved:
-                if from_twist != (0.0, 0.0):
+                self._by_twist += from_twist
+                if np.abs(self._by_twist).max() > _NO_POSE_AFTER:  # a twist that jitters at rest goes nowhere
                     self._stats.count(self._topic, Oddity.NO_POSE)
                 forward, turn = from_twist
             increment = self._wheels(forward, turn)
