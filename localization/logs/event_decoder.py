@@ -322,7 +322,7 @@ class PublisherSeparator:
     def _changes(self, values: Sequence[float], publisher: _Publisher) -> list[float]:
         """Sizes of the changes since the last reading of a ``publisher``; the smallest are kept."""
         found = [abs(a - b) for a, b in zip(values, publisher.values, strict=True)]
-        self._steps = [min(step, change) if change > 0.0 else step for step, change in zip(self._steps, found, strict=True)]
+        self._steps = [min(step, change) if change > _RESOLUTION else step for step, change in zip(self._steps, found, strict=True)]
         return found
 
     def _cost(self, changes: Sequence[float]) -> float:
