@@ -33,7 +33,7 @@ def of_one_publisher(angles: FloatArray) -> BoolArray:
     """(m,) which readings of ``angles`` (m, c) are of one publisher: of two, of the one whose wheels turn more.
 
     Of two publishers each goes on from its own last readings: its increments change by less than those from reading to reading do, and by
-    more than it costs to say whose each reading is. Changes have a Cauchy density: a restart is one large change.
+    more than it costs to label each reading. Changes have a Cauchy density: a restart is one large change.
     """
     every = np.ones(len(angles), bool)
     if not np.isfinite(angles).all() or len(angles) < 4:

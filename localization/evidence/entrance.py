@@ -121,11 +121,12 @@ def infer(sources: Sequence[Source], robot: Robot) -> SetUp:
     edges = bin_edges(used, start, end)
     if len(edges) < _MIN_BINS:
         return SetUp("undecidable", robot, reason=f"the sources overlap by {max(end - start, 0.0):.1f} s: too short to be compared.")
-    used = [source for source in used if np.isfinite(source.rates(edges)).any(axis=1).sum() >= _MIN_BINS]
-    if len(used) < 2:
+    measured = [(source, rates) for source in used if np.isfinite(rates := source.rates(edges)).any(axis=1).sum() >= _MIN_BINS]
+    if len(measured) < 2:
         return SetUp("undecidable", robot, reason="no two sources know their motion for long enough: nothing can be compared.")
-    if all(float(np.nanmax(np.abs(source.rates(edges)), initial=0.0)) < 1e-3 for source in used):
+    if all(float(np.nanmax(np.abs(rates), initial=0.0)) < 1e-3 for _, rates in measured):
         return SetUp("undecidable", robot, reason="nothing moves: drive straight on for 10 s and turn in place both ways.")
+    used = [source for source, _ in measured]
     return decide(used, make_stacks(used, edges, robot), robot, own)
 
 

@@ -92,8 +92,8 @@ def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own
         chosen = next(choice for _, choice, rows in found if not rows)
         usual = _with_usual(robot, stacks, chosen)
         scales, keys = measured_scales(stacks, chosen), changed_entries(robot, usual)
-        told = _told(sources, stacks, robot, ranked, chosen)
-        return SetUp("consistent", usual, hypotheses, told, keys, by_file=by_file, against=searched.against, scales=scales)
+        reported = _reported(sources, stacks, robot, ranked, chosen)
+        return SetUp("consistent", usual, hypotheses, reported, keys, by_file=by_file, against=searched.against, scales=scales)
     kept = [(p, choice, rows) for p, choice, rows in found if p >= _NAMED]
     common = _common(kept)
     is_certain = kept[0][0] >= CERTAIN or all(len(rows) == len(common) for _, _, rows in kept)
@@ -108,8 +108,8 @@ def decide(sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, own
     is_gyro_used &= not any(row.source == "gyro" for rows in rest for row in rows)
     unresolved = [(p, choice) for p, choice, rows in kept if any(row.correct is None or row.family not in families for row in rows)]
     corrected = _with_mixture_noise(corrected, stacks, unresolved)
-    told = _told(sources, stacks, robot, ranked, kept[0][1])
-    sentences = (*told, *_correction_warnings(sources, common, usual, kept), *_ambiguity_warnings(sources, kept, rest))
+    reported = _reported(sources, stacks, robot, ranked, kept[0][1])
+    sentences = (*reported, *_correction_warnings(sources, common, usual, kept), *_ambiguity_warnings(sources, kept, rest))
     return SetUp("certain" if is_certain else "ambiguous", corrected, hypotheses, sentences, keys, is_gyro_used, by_file=by_file)
 
 
@@ -173,13 +173,13 @@ def _with_usual(robot: Robot, stacks: Sequence[Stack], choice: Choice) -> Robot:
     return _correct(robot, [row for row in rows_of(stacks, choice) if not row.is_fault])
 
 
-def _told(
+def _reported(
     sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, ranked: Sequence[tuple[float, Choice]], chosen: Choice
 ) -> tuple[str, ...]:
     """Sentences on what the robot file leaves open and should have, which the ``chosen`` set-up shows."""
     found = list[str]()
     for row in rows_of(stacks, chosen):
-        if not row.is_fault and row.is_told:
+        if not row.is_fault and row.is_reported:
             having = [(p, choice, (row,)) for p, choice in ranked if any(other.key == row.key for other in rows_of(stacks, choice))]
             found += _correction_warnings(sources, [row], robot, having)
     return tuple(found)

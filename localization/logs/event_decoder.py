@@ -56,7 +56,7 @@ _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its readin
 
 
 _ARE_TWO, _IS_ONE, _CERTAIN = math.log(1e-6), math.log(0.5), math.log(100.0)
-"""Logarithms: prior odds that two publishers share a topic; price of saying whose a reading is; odds from where on one is left out."""
+"""Logarithms: prior odds that two publishers share a topic; price of labelling a reading; odds from where on one is left out."""
 _ENCODER_STEPS = 3.0
 """Scale of the changes over the smallest one that was seen: speeds by encoders are multiples of one step per message."""
 _RESOLUTION = 1e-3
@@ -265,8 +265,8 @@ class _Publisher:
 class PublisherSeparator:
     """Separates two publishers that share a topic, of velocities and poses, by the evidence for two.
 
-    Each goes on from its own last reading, so that its changes are smaller than those from reading to reading, by more than it costs to say
-    whose each is. Changes have Cauchy densities with the scale of their mean size. Speeds of coarse encoders, which jump by one step and
+    Each goes on from its own last reading, so that its changes are smaller than those from reading to reading, by more than it costs to
+    label each. Changes have Cauchy densities with the scale of their mean size. Speeds of coarse encoders, which jump by one step and
     back, are no second publisher's. The one whose wheels travel more is used, of equal ones one.
     """
 

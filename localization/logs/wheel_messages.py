@@ -51,7 +51,7 @@ def is_measured_twist(topic: str) -> bool:
 
 
 def angle_period_rad(units: Joints, message_type: str) -> float:
-    """After which angles of wheels wrap [rad]: as the robot file says, else as drivers of ``message_type`` count, else a full turn."""
+    """After which angles of wheels wrap [rad]: of the robot file, else of the counters of ``message_type``, else a full turn."""
     counter = DRIVER_MESSAGES.get(message_type)
     return units.angle_range * units.angle_unit_rad or (0.0 if counter is None else counter.angle_range_rad) or math.tau
 

@@ -26,8 +26,8 @@ TOPICS = {
     "lidar": "/scan",
     "reference": "/reference/pose",
 }
-CENTER_OF_GRAVITY = "/center_of_gravity"
 """Topic of each source."""
+CENTER_OF_GRAVITY = "/center_of_gravity"
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class Base:
     load: tuple[float, ...] = ()
     """How far ahead the centre of gravity is in equal parts of the drive, and the centre of rotation with it [m]."""
     has_load_topic: bool = True
+    """Whether the centre of gravity is published."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -57,8 +57,8 @@ class Row:
     is_fault: bool = True
     """False for what healthy robots have as well, as latencies: it competes with faults for the evidence, and accuses nobody. Where the
     robot file can express it, the most probable set-up has it without a warning."""
-    is_told: bool = False
-    """Whether it is told where it is no fault: an entry that the robot file should have."""
+    is_reported: bool = False
+    """Whether it is reported where it is no fault: an entry that the robot file should have."""
     may_change: bool = False
     """Whether practice has it from some time on, or until then: a restart at another resolution, a mount that is knocked. Wiring and units
     stay while a driver runs."""

@@ -62,7 +62,7 @@ def _place_row(source: Source, ahead: float) -> Row:
     text = f"the LiDAR is {abs(ahead):.2f} m {'ahead of' if ahead > 0 else 'behind'} {of}"
     correct = mount_correction(source.frame, source.mount, partial(_moved, ahead)) if source.frame else None
     odds = _ODDS["place"] if source.is_mounted else 0.0
-    return Row("lidar.place", text, odds, value=ahead, correct=correct, is_fault=source.is_mounted, is_told=True)
+    return Row("lidar.place", text, odds, value=ahead, correct=correct, is_fault=source.is_mounted, is_reported=True)
 
 
 def in_body(velocity: Velocity, turn: FloatArray, place: complex, yaw: float, place_sigma_m: float) -> tuple[Velocity, float, float]:
