@@ -24,6 +24,7 @@ from array import array
 from collections import deque
 from collections.abc import Mapping, Sequence
 from enum import Enum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -186,7 +187,9 @@ def _state(value: Any) -> Any:
     if state is None:
         return {}
     if isinstance(state, tuple):  # slots
-        return {**(state[0] or {}), **(state[1] or {})}
+        state = {**(state[0] or {}), **(state[1] or {})}
+    if type(state) is dict:  # what follows from the rest is computed again, so that what was asked of an object is no part of it
+        return {name: part for name, part in state.items() if not isinstance(getattr(type(value), name, None), cached_property)}
     return state
 
 

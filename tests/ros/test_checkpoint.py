@@ -312,6 +312,14 @@ def test_read_checkpoint_of_another_robot_or_model_is_refused(state):
     assert isinstance(read_checkpoint(state, made_by(moved), {}).value, Pipeline)
 
 
+def test_fingerprints_of_a_mount_that_was_used_are_those_of_a_new_one():
+    """A process that asked for its rotation resumes what one wrote that had not."""
+    used = Mount(x=0.4, yaw=0.1)
+    assert np.isfinite(used.rotation).all()
+    assert fingerprints(mount=used) == fingerprints(mount=Mount(x=0.4, yaw=0.1))
+    assert fingerprints(mount=used) != fingerprints(mount=Mount(x=0.4, yaw=0.2))
+
+
 def test_write_checkpoint_interrupted_keeps_the_old_state(state, monkeypatch):
     before = state.read_bytes()
 
