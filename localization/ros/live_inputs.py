@@ -19,8 +19,8 @@ from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount
 
-_MAX_WAIT = 1.5
-"""For how many periods a scan waits for the processor, where a newer one is here."""
+_MAX_WAIT_S = 0.5
+"""For how long a scan waits for the processor, where a newer one is here [s]: slam_toolbox takes one per half second at all."""
 
 
 class LiveInputs:
@@ -79,7 +79,7 @@ class LiveInputs:
         self._transport.restrict([*others, *self.topics, *commands], [*urgent, *commands])
 
     def without_overtaken(self, messages: Sequence[Received], now_ns: int) -> Sequence[Received]:
-        """``messages`` without the scans that have waited for `_MAX_WAIT` of their period while a newer one came.
+        """``messages`` without the scans that have waited for more than `_MAX_WAIT_S` while a newer one came.
 
         Where the processor is too slow for all, the newest counts; messages of wheels and gyro are all integrated.
         """
@@ -89,9 +89,8 @@ class LiveInputs:
         newest, kept = {received.topic: received for received in messages if received.topic in lidars}, list[Received]()
         for received in messages:
             if received.topic in lidars and received is not newest[received.topic]:
-                rate = self.stream.topic_rates[received.topic]
-                if (now_ns - received.received_ns) * 1e-9 > _MAX_WAIT * rate.period_s > 0.0:
-                    rate.count(received.received_ns)
+                if (now_ns - received.received_ns) * 1e-9 > _MAX_WAIT_S:
+                    self.stream.topic_rates[received.topic].count(received.received_ns)
                     self.stats.count(received.topic, Oddity.OVERTAKEN)
                     continue
             kept.append(received)
