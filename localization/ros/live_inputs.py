@@ -88,11 +88,11 @@ class LiveInputs:
         lidars = {source.topic for source in self.sources.lidars}
         newest, kept = {received.topic: received for received in messages if received.topic in lidars}, list[Received]()
         for received in messages:
-            if received.topic in lidars and received is not newest[received.topic]:
-                if (now_ns - received.received_ns) * 1e-9 > _MAX_WAIT_S:
-                    self.stream.topic_rates[received.topic].count(received.received_ns)
-                    self.stats.count(received.topic, Oddity.OVERTAKEN)
-                    continue
+            has_waited_s = (now_ns - received.received_ns) * 1e-9
+            if received.topic in lidars and received is not newest[received.topic] and has_waited_s > _MAX_WAIT_S:
+                self.stream.topic_rates[received.topic].count(received.received_ns)
+                self.stats.count(received.topic, Oddity.OVERTAKEN)
+                continue
             kept.append(received)
         return kept
 

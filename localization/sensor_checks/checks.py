@@ -79,11 +79,11 @@ class SensorChecks:
     """
 
     def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, robot: Robot | None = None) -> None:
-        """``robot``: whose clocks and front may not be known for sure; None where they are."""
+        """``robot``: whose clocks, front and slip may not be known for sure; None where they are."""
         self._inflation = CovarianceInflation()
         self._faults = faults = FaultLog(self._inflation, PathUncertainty(lever_of_unknown_front(robot, mounts)))
         self._steps = StepChecks(faults, mounts, config, step_config)
-        self._consistency, self._places = SensorConsistency(faults), KnownPlaces(faults)
+        self._consistency, self._places = SensorConsistency(faults, robot), KnownPlaces(faults)
         self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
         self._biases = BiasChangeCheck(faults)
         self._mounts, self._is_lidar_placed = mounts, True

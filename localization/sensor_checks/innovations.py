@@ -9,7 +9,7 @@ from __future__ import annotations
 import bisect
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -66,6 +66,14 @@ class InnovationWindow(NamedTuple):
     innovation: float
     """Their sum [rad, m]."""
     sigmas: float
+    """Of its size, by the noise of both sensors alone."""
+
+    def beyond(self, usual: Mapping[int, float]) -> float:
+        """Sigmas of its size where healthy sensors err by ``usual`` standard deviations per unit of what causes are proportional to. Such
+        errors last for seconds, as a floor does, and add up over the window as the causes themselves do."""
+        sizes = np.abs([b.regressors for b in self.bins[1:]]).sum(axis=0)
+        noise = self.innovation / self.sigmas if self.sigmas else 0.0
+        return abs(self.innovation) / math.hypot(noise, *(sigma * sizes[regressor] for regressor, sigma in usual.items())) if noise else 0.0
 
     def explain(self, pair: Pair, causes: Causes) -> tuple[int, str]:
         """Index and sentence of the one of ``causes`` of a ``pair`` that reduces the innovations' chi-square most."""

@@ -14,9 +14,10 @@ from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.innovations import NO_REGRESSORS, TURN, TURN_CHANGE, InnovationWindows, Pair, add_step
-from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED
+from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED, usual_errors
 from localization.sensor_checks.reckoning import FILE, FILE_GYRO
 from localization.sensor_checks.scales import RADIUS, ScaleCheck
+from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 DIFFERENCES: Mapping[Pair, SensorFault] = {
@@ -90,8 +91,10 @@ class SensorConsistency:
     dead reckoning by the wheels with the robot file's parameters (LiDAR and gyro: with the gyro's turns); it stays afterwards, as no scan
     takes it back. Where scans are matched, and it is not their stamps that explain the difference, they decide."""
 
-    def __init__(self, faults: FaultLog) -> None:
+    def __init__(self, faults: FaultLog, robot: Robot | None = None) -> None:
+        """``robot``: whose wheels slip as its drive's do, and whose file may not have all parameters; None where nothing is unknown."""
         self._faults, self._clipping, self._scales = faults, _Clipping(), ScaleCheck(faults)
+        self._robot, self._usual = robot, usual_errors(robot)
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._reckoning = faults.inflation.reckoning
         self._totals = NO_REGRESSORS
@@ -166,14 +169,16 @@ class SensorConsistency:
         episode = self._episodes[fault] = _Episode(begin_s, poses, row, is_by_lidar)
         unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
         numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
-        self._report(fault, episode, worst.sigmas, numbers)
+        sigmas = worst.beyond(self._usual.get(pair, {}))
+        if is_clipped or sigmas >= _MAX_SIGMAS:  # what floors do as well is no fault of a sensor
+            self._report(fault, episode, sigmas, numbers)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
         """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""
         if learned and learned[0].name == RADIUS:
             self._scales.compare(learned[0])
             learned = learned[1:]
-        off = _farthest(learned)
+        off = _farthest([p for p in learned if self._is_declared(p)])
         if off is None or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
             self._end(PARAMETER_FAR)
             return
@@ -184,6 +189,13 @@ class SensorConsistency:
         far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
         numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
         self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
+
+    def _is_declared(self, parameter: LearnedParameter) -> bool:
+        """Whether the robot file has a value that what was learned contradicts. Without one, factors on turns are what is to be learned."""
+        name, value = parameter.name, parameter.file_value
+        if self._robot is None or name not in _TURNING:
+            return True
+        return name in self._robot.models.get(parameter.owner, {}) if name != _MULTIPLIER else value != 1.0 or parameter.value < value
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
@@ -236,8 +248,6 @@ def _farthest(learned: Sequence[LearnedParameter]) -> LearnedParameter | None:
 
     def distance(p: LearnedParameter) -> float:
         least = max(_MIN_PRIOR_SIGMAS * p.prior_sigma, _MIN_LEARNED_SIGMAS * p.sigma)
-        if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value:
-            return 0.0  # a driver's factor that nobody has set, of a robot that slides as it turns
         if p.name in _TURNING:
             least = max(_MIN_TURNING_SIGMAS * p.prior_sigma, _MIN_TURNING_SHARE * abs(p.file_value), _MIN_LEARNED_SIGMAS * p.sigma)
         return abs(p.value - p.file_value) / least if least else 0.0
