@@ -19,6 +19,8 @@ from motion_models.se2 import FloatArray
 
 BIN_S = 0.5
 WINDOWS_S = (2.0, 10.0, 60.0)
+_SLIP_S = 5.0
+"""Time for which half of what healthy sensors err by lasts, as slip does; the other half is of the whole window, as a floor is [s]."""
 _MIN_FILLED = 0.9
 """Part of a window that must have been measured."""
 SECONDS, TURN, WAY, TURN_CHANGE = range(4)
@@ -40,8 +42,29 @@ class Pair(NamedTuple):
     """Standard deviation over a window of what no model has [rad, m]."""
 
 
-Causes = Sequence[tuple[int, Callable[[float], str]]]
-"""What each cause is proportional to, and its sentence by the factor."""
+class Cause(NamedTuple):
+    """What may be the reason for innovations."""
+
+    regressor: int
+    """What it is proportional to."""
+    sigma: float
+    """Standard deviation of the factor where this is the reason, in the unit of innovations per that of the regressor."""
+    describe: Callable[[float], str]
+    """Sentence by the factor."""
+
+
+Causes = Sequence[Cause]
+
+
+class Explanation(NamedTuple):
+    """A cause of the innovations of a window."""
+
+    regressor: int
+    sentence: str
+    log_odds: float
+    """Logarithm of the evidence for it over that for healthy sensors."""
+    sigmas: float
+    """Size of its factor by what healthy sensors err by."""
 
 
 class Bin(NamedTuple):
@@ -68,24 +91,22 @@ class InnovationWindow(NamedTuple):
     sigmas: float
     """Of its size, by the noise of both sensors alone."""
 
-    def beyond(self, usual: Mapping[int, float]) -> float:
-        """Sigmas of its size where healthy sensors err by ``usual`` standard deviations per unit of what causes are proportional to. Such
-        errors last for seconds, as a floor does, and add up over the window as the causes themselves do."""
-        sizes = np.abs([b.regressors for b in self.bins[1:]]).sum(axis=0)
-        noise = self.innovation / self.sigmas if self.sigmas else 0.0
-        return abs(self.innovation) / math.hypot(noise, *(sigma * sizes[regressor] for regressor, sigma in usual.items())) if noise else 0.0
-
-    def explain(self, pair: Pair, causes: Causes) -> tuple[int, str]:
-        """Index and sentence of the one of ``causes`` of a ``pair`` that reduces the innovations' chi-square most."""
-        rows = np.array([(b.innovation, b.variance, b.seconds) for b in self.bins])
-        innovation, variance, _ = np.diff(rows, axis=0).T
+    def explain(self, pair: Pair, causes: Causes, usual: Mapping[int, float]) -> Explanation:
+        """The most probable of ``causes`` of a ``pair``, where healthy sensors err by ``usual`` standard deviations per unit of what causes
+        are proportional to."""
+        rows = np.array([(b.innovation, b.variance) for b in self.bins])
+        innovation, variance = np.diff(rows, axis=0).T
         X = np.array([b.regressors for b in self.bins[1:]])
+        end_s = np.array([b.end_s for b in self.bins[1:]])
+        C = np.diag(variance) + (pair.floor / len(X)) ** 2
+        lasting = 0.5 + 0.5 * np.exp(-np.abs(end_s[:, None] - end_s) / _SLIP_S)
+        for regressor, sigma in usual.items():
+            C += sigma**2 * np.outer(X[:, regressor], X[:, regressor]) * lasting
+        found = [_explanation(cause, X[:, cause.regressor], innovation, C) for cause in causes]
+        best = max(found, key=operator.attrgetter("log_odds"))
         if np.allclose(X[:, [TURN, WAY]], 0.0):
-            return SECONDS, _STANDING[pair.quantity].format(first=pair.first)
-        gains = [_fit(X[:, regressor], innovation, variance) for regressor, _ in causes]
-        best = max(range(len(gains)), key=lambda k: gains[k][0])
-        regressor, describe = causes[best]
-        return regressor, describe(gains[best][1])
+            return best._replace(regressor=SECONDS, sentence=_STANDING[pair.quantity].format(first=pair.first))
+        return best
 
 
 _END_S = operator.attrgetter("end_s")
@@ -95,10 +116,15 @@ _STANDING = {
 }
 
 
-def _fit(x: FloatArray, innovation: FloatArray, variance: FloatArray) -> tuple[float, float]:
-    """Chi-square that a multiple of ``x`` takes away from ``innovation`` (n,) with ``variance`` (n,), and the factor."""
-    power, product = float(x @ (x / variance)), float(x @ (innovation / variance))
-    return (product**2 / power, product / power) if power else (0.0, 0.0)
+def _explanation(cause: Cause, x: FloatArray, innovation: FloatArray, C: FloatArray) -> Explanation:
+    """How well a factor on ``x`` (n,) explains ``innovation`` (n,) of covariance ``C`` (n, n): its evidence against none, with the factor
+    integrated out over its prior (Bar-Shalom, Li, Kirubarajan 2001, 1.4; a Bayes factor of two Gaussians)."""
+    weighted = np.linalg.solve(C, np.column_stack([x, innovation]))
+    power, product = (x @ weighted).tolist()
+    gain = cause.sigma**2 * power
+    chi_square = product**2 / power if power else 0.0
+    log_odds = 0.5 * chi_square * gain / (1.0 + gain) - 0.5 * math.log1p(gain)
+    return Explanation(cause.regressor, cause.describe(product / power if power else 0.0), log_odds, math.sqrt(chi_square))
 
 
 def add_step(totals: Regressors, step: Step) -> Regressors:

@@ -16,7 +16,7 @@ from localization.sensor_checks.contradictions import (
 )
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
-from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Causes, Pair
+from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Cause, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.sweep_times import NO_SWEEP, OTHER_UNIT, REVERSED_TIMES
 from motion_models.robot import DIFF_DRIVE, Robot
@@ -98,12 +98,21 @@ def usual_errors(robot: Robot | None) -> Mapping[Pair, Mapping[int, float]]:
 
 
 CAUSES: Mapping[Pair, Causes] = {
-    GYRO_WHEELS: ((SECONDS, _describe_bias), (TURN, _describe_turn_factor), (WAY, _describe_side)),
-    LIDAR_GYRO: ((TURN_CHANGE, _describe_stamps), (SECONDS, _describe_gyro_bias), (TURN, _describe_gyro_scale)),
-    LIDAR_WHEELS_TURNS: ((TURN, _describe_turn_factor), (WAY, _describe_side)),
-    LIDAR_WHEELS_WAYS: ((WAY, _describe_way_factor), (SECONDS, _describe_moving)),
+    GYRO_WHEELS: (
+        Cause(SECONDS, 0.1, _describe_bias),
+        Cause(TURN, 0.5, _describe_turn_factor),
+        Cause(WAY, 0.5, _describe_side),
+    ),
+    LIDAR_GYRO: (
+        Cause(TURN_CHANGE, 0.1, _describe_stamps),
+        Cause(SECONDS, 0.1, _describe_gyro_bias),
+        Cause(TURN, 0.2, _describe_gyro_scale),
+    ),
+    LIDAR_WHEELS_TURNS: (Cause(TURN, 0.5, _describe_turn_factor), Cause(WAY, 0.5, _describe_side)),
+    LIDAR_WHEELS_WAYS: (Cause(WAY, 0.5, _describe_way_factor), Cause(SECONDS, 0.5, _describe_moving)),
 }
-"""What may explain why a pair differs. Between wheels and LiDAR the filter estimates an offset of the clocks."""
+"""What may explain why a pair differs, by factors of a half (of encoders, of a side of .6 m [rad/m], of speed [m/s]), .1 rad/s and .1 s.
+Between wheels and LiDAR the filter estimates an offset of the clocks."""
 
 _OF_WHEELS = (WHEELS_OPPOSITE, WHEELS_STANDING)
 _OF_GYRO = (GYRO_RATE, GYRO_OPPOSITE, GYRO_STUCK, GYRO_UNIT)

@@ -41,6 +41,8 @@ _NAMED_WITHIN_S = 10.0
 _MAX_SIGMAS = 4.5
 """Largest sum of innovations over a window, in sigmas: 7e-6 by chance, one of 60 hours. Largest of healthy drives: gyro and wheels 4.0 (six
 simulated robots; Husky outdoors 1.0), LiDAR and gyro 3.3, ways by LiDAR and wheels 3.1 (ACES), turns by both 1.0 (ACES)."""
+_FAULT_ODDS, _CERTAIN_ODDS = math.log(1e-3), math.log(99.0)
+"""Logarithms of the odds that a sensor fails within a window, and from where on it is said to have failed."""
 _MIN_LEARNED_SIGMAS = 4.0
 """Distance of a learned parameter from the robot file's, in its own sigmas."""
 _MIN_PRIOR_SIGMAS = 3.0
@@ -156,7 +158,8 @@ class SensorConsistency:
         if self._is_explained(fault, NAMED[pair]) or worst is None or worst.sigmas < (_MAX_CLIPPED_SIGMAS if is_clipped else _MAX_SIGMAS):
             self._end(fault)
             return
-        regressor, cause = worst.explain(pair, CAUSES[pair])
+        best = worst.explain(pair, CAUSES[pair], self._usual.get(pair, {}))
+        regressor, cause = best.regressor, best.sentence
         if regressor == TURN:
             unset = [p for p in learned() if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value]
             cause += "".join(_PLAIN_MODEL.format(model=p.owner) for p in unset)
@@ -169,9 +172,8 @@ class SensorConsistency:
         episode = self._episodes[fault] = _Episode(begin_s, poses, row, is_by_lidar)
         unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
         numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
-        sigmas = worst.beyond(self._usual.get(pair, {}))
-        if is_clipped or sigmas >= _MAX_SIGMAS:  # what floors do as well is no fault of a sensor
-            self._report(fault, episode, sigmas, numbers)
+        if is_clipped or best.log_odds + _FAULT_ODDS > _CERTAIN_ODDS:  # what floors do as well is no fault of a sensor
+            self._report(fault, episode, worst.sigmas if is_clipped else best.sigmas, numbers)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
         """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""

@@ -47,7 +47,8 @@ def test_healthy_drive_is_not_reported(robot: str, model: str) -> None:
 def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> None:
     drive = without_lidar("husky_a200")
     outcome = run(drive, faults_of_turns(upright_axis(drive))[name], "skid_steer")
-    assert set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR, BIAS_CHANGED}, outcome.warnings
+    found = set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR, BIAS_CHANGED}
+    assert bool(found) == (name != "left ticks lost"), outcome.warnings  # of a robot that skids, a floor explains a side as well
     assert "saturated" not in name or any("end at 20 deg/s, its range" in warning for warning in outcome.warnings)
     error, sigma = outcome.last
     assert error < max(3.0 * sigma, 0.1)
