@@ -217,7 +217,9 @@ class AttitudeFilter:
         turn = Turn(float(self._sums.wheels[1]) - turned - float(self._sums.state[5]) * dt, white, dt)
         if self._downhill is not None and has_wheels:
             way = 0.5 * self._robot.radius * float(dt_s @ rates.sum(axis=1))
-            self._curvature.advance(self._downhill, self._slope(), (way, turn.angle), white)
+            error = self._ground.mount_error  # turns with the body, as no ground does
+            unknown = self.tilt_variances[1] * turn.angle**2
+            self._curvature.advance(self._downhill - error, self._slope() - error, (way, turn.angle), white + unknown)
         if self._sums.window[6] >= (_FIRST_WINDOW_S if self._downhill is None else _WINDOW_S):
             self._measure(has_wheels)
         return None if self._downhill is None else self._tilt(self._downhill, turn)

@@ -35,6 +35,8 @@ _MIN_TURNING_S = 1.0
 _SHAKE_M_S2, _SHAKE_SAMPLES, _SHAKE_PARTS = 0.4, 20, 5
 """Standard deviation of the specific force in a second, the median of its fifths, as a knock is in two of them at most: Husky outdoors at
 rest 0.005 to 0.10, driving 0.51 to 1.5 (5 to 95 %). Another Husky (BorealTC) has more in all seconds but those on snow (82 %)."""
+_SHAKE_FACTOR = 3.0
+"""Shaking on a robot that drives over that of the calmest second so far, beside no other sensor: a fan or a motor shakes at rest."""
 _SHAKE_S = 2.0
 _NS = 1e-9
 
@@ -124,14 +126,15 @@ class Standstill:
         is_compared = (recent.is_standing > 0.0) & np.isfinite(recent.lidar[:, 0])
         bins = Bins.of(recent.rows[-_RECENT_BINS:][is_compared[-_RECENT_BINS:]])
         travelled, lasted = float(np.hypot(*bins.lidar[:, :2].T).sum()), float(bins.durations_s.sum())
-        shaken_s = max((detector.lasted_s for detector in self._shaking.values()), default=0.0)
-        is_shaking = min(shaken_s, self._stop.stood_s) >= _SHAKE_S
+        shaking = [d for d in self._shaking.values() if min(d.lasted_s, self._stop.stood_s) >= _SHAKE_S]
+        is_shaking = bool(shaking)
         if lasted >= _MIN_LIDAR_S and travelled >= _STANDING_SPEED_M_S * lasted:
             rates = bins.gyro / bins.durations_s
             self._stop.is_confirmed |= is_shaking or _has_turned(rates)
             has_second = _is_working(rates) or any(detector.has_noise for detector in self._shaking.values())
             return _LIDAR_MOVED if self._stop.is_confirmed or not has_second else ""
-        return "the IMU shakes as if it moved" if is_shaking and not len(bins.rows) else ""
+        is_alone = not len(bins.rows) and any(detector.is_unusual for detector in shaking)
+        return "the IMU shakes as if it moved" if is_alone else ""
 
 
 def _is_turning(step: Step) -> bool:
@@ -150,12 +153,12 @@ def _has_turned(rates: FloatArray) -> bool:
     return _is_working(rates) and bool(rates.std() > _MIN_RATE_SIGMA_RAD_S or abs(rates.mean()) > _MAX_STANDING_RATE_RAD_S)
 
 
-def _is_shaking(forces: FloatArray) -> bool:
-    """Whether specific ``forces`` (n, 3) of a second [m/s^2] vary as on a robot that drives."""
+def _shake(forces: FloatArray) -> float:
+    """How much specific ``forces`` (n, 3) of a second vary [m/s^2]; nan of too few."""
     if len(forces) < _SHAKE_SAMPLES:
-        return False
+        return math.nan
     parts = np.array_split(forces, _SHAKE_PARTS)
-    return bool(np.median([np.linalg.norm(part.std(axis=0, ddof=1)) for part in parts]) > _SHAKE_M_S2)
+    return float(np.median([np.linalg.norm(part.std(axis=0, ddof=1)) for part in parts]))
 
 
 class ShakeDetector:
@@ -165,8 +168,14 @@ class ShakeDetector:
         self._forces: deque[tuple[int, FloatArray]] = deque(maxlen=400)
         self._since_ns: int | None = None
         self._now_ns = 0
+        self._least = self._shake = math.inf
         self.has_noise = False
         """Whether the specific force has ever changed: some drivers leave it at zero."""
+
+    @property
+    def is_unusual(self) -> bool:
+        """It shakes far more than in the calmest second so far."""
+        return self._shake > _SHAKE_FACTOR * self._least
 
     @property
     def lasted_s(self) -> float:
@@ -183,7 +192,9 @@ class ShakeDetector:
         forces = np.array([force for _, force in self._forces])
         self._forces.clear()
         self.has_noise |= bool(np.ptp(forces, axis=0).any())
-        if not _is_shaking(forces):
+        self._shake = _shake(forces)
+        self._least = min(self._least, self._shake)
+        if not self._shake > _SHAKE_M_S2:
             self._since_ns = None
         elif self._since_ns is None:
             self._since_ns = start_ns

@@ -166,17 +166,23 @@ def draw_legs(rng: np.random.Generator, base: Base) -> list[Leg]:
     return [(2.0, 0.0, 0.0), *(part for i in order for part in ((legs[i][0] * rng.uniform(0.8, 1.3), *legs[i][1:]), stops[i]))]
 
 
-def drive_legs(rng: np.random.Generator, legs: Sequence[Leg], wobble: float = 0.1) -> tuple[Floats, Floats, Floats]:
-    """Times, twists (n, 2) and poses (n, 3)."""
+def drive_legs(rng: np.random.Generator, legs: Sequence[Leg], wobble: float = 0.1) -> tuple[Floats, Floats]:
+    """Times and twists (n, 2)."""
     wanted = np.concatenate([np.tile([[v, w]], (max(round(s / STEP_S), 1), 1)) for s, v, w in legs])
     smooth = np.ones(40) / 40.0
     twists = np.stack([np.convolve(column, smooth, "same") for column in wanted.T], axis=1)
     slow = np.convolve(rng.normal(0.0, 1.0, len(twists)), np.ones(60) / 60.0, "same")
     twists[:, 1] += wobble * slow * (np.abs(twists[:, 0]) > 0.05)
-    poses = [np.zeros(3)]
-    for v, w in twists[:-1]:
-        poses.append(se2.compose(poses[-1], se2.exp(np.array([v, 0.0, w]) * STEP_S)))
-    return np.arange(len(twists)) * STEP_S, twists, np.array(poses)
+    return np.arange(len(twists)) * STEP_S, twists
+
+
+def turned_about(twists: Floats, ahead: Floats) -> Floats:
+    """Poses (n, 3) of a robot that turns about a centre which is ``ahead`` (n,) [m]; ``twists`` (n, 2)."""
+    v, w = twists.T
+    poses = [np.array([-ahead[0], 0.0, 0.0])]
+    for twist in np.stack([v, -ahead * w, w], axis=1)[:-1]:
+        poses.append(se2.compose(poses[-1], se2.exp(twist * STEP_S)))
+    return np.array(poses)
 
 
 def drawn_log(
@@ -195,9 +201,9 @@ def drawn_log(
     """
     base = draw_base(rng, "wheels" in names) if base is None else base
     sensors = draw_sensors(rng, names) if sensors is None else sensors
-    t, twists, turned_about = drive_legs(rng, draw_legs(rng, base) if legs is None else legs)
+    t, twists = drive_legs(rng, draw_legs(rng, base) if legs is None else legs)
     ahead = np.array(base.load or (0.0,))[np.arange(len(t)) * max(len(base.load), 1) // len(t)]
-    poses = se2.compose(turned_about, np.stack([-ahead, 0.0 * ahead, 0.0 * ahead], axis=1))
+    poses = turned_about(twists, ahead)
     fastest = max(float(np.abs(twists[:, 0]).max()), 1e-9)
     k = base.k * (1.0 - k_falls * np.abs(twists[:, 0]) / fastest)
     half = 0.5 * base.track / k * twists[:, 1]

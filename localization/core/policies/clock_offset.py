@@ -34,8 +34,9 @@ def find_clocks_apart(state: State, has_gyro: bool, has_lidar: bool) -> ClocksAp
 
 
 def clock_warnings(apart: ClocksApart | None, has_gyro: bool, has_lidar: bool) -> list[str]:
-    """Which clock is off, and the remedy. Two sensors whose offset no latency explains are reported by `sensor_checks.clocks`."""
-    if apart is None or not apart.is_latency:
+    """Which clock is off, and the remedy. A driver's latency is corrected and no fault; two sensors whose offset it does not explain are
+    reported by `sensor_checks.clocks`."""
+    if apart is None or not apart.is_latency or abs(apart.late_s) < _MAX_LATENCY_S:
         return []
     others = "LiDAR" if not has_gyro else "gyro" if not has_lidar else "LiDAR or gyro"
     direction = "later" if apart.late_s > 0.0 else "earlier"
