@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,14 +19,16 @@ from localization.ros.state_serialization import deserialize, serialize
 from localization.sensor_checks.bias_changes import BIAS_CHANGED
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
-from localization.sensor_checks.innovations import InnovationWindows
-from localization.sensor_checks.pairs import GYRO_WHEELS, LIDAR_GYRO
+from localization.sensor_checks.innovations import Bin, Explanation, InnovationWindow, InnovationWindows
+from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, usual_errors
 from localization.sensor_checks.reckoning import ESTIMATE
 from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency
 from localization.sensor_checks.sweep_times import OTHER_UNIT, REVERSED_TIMES
 from motion_models import se2
 from motion_models.motion import Motion
 from motion_models.registry import make_model
+from motion_models.robot_file import load_robot
+from motion_models.se2 import FloatArray
 from tests.helpers import bags, entrance_drives
 from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.helpers.event_faults import EventFault, change_scans, faults_of_stamps, faults_of_turns, without_gyro
@@ -215,6 +218,45 @@ def test_sums_of_innovations_exceed_a_limit_as_often_as_a_normal_variable(limit:
         assert worst is not None
         beyond += worst.sigmas > limit
     assert abs(beyond - n * expected) < 3.0 * math.sqrt(n * expected * (1.0 - expected))
+
+
+def explained(innovation: FloatArray, variance: FloatArray, X: FloatArray, usual: Mapping[int, float]) -> Explanation:
+    """Of a window of half seconds with ``innovation`` and ``variance`` (n,), and what causes are proportional to (n, 4)."""
+    bins, sums = [Bin(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0), np.zeros((5, 3)))], np.zeros(3)
+    for k, x in enumerate(X):
+        sums += [innovation[k], variance[k], 0.5]
+        bins.append(Bin(0.5 * (k + 1), *sums.tolist(), tuple(x.tolist()), np.zeros((5, 3))))
+    sigmas = abs(sums[0]) / math.sqrt(sums[1])
+    return InnovationWindow(bins, 0.5 * len(X), float(sums[0]), sigmas).explain(GYRO_WHEELS, CAUSES[GYRO_WHEELS], usual)
+
+
+def drawn_window(rng: np.random.Generator, usual: Mapping[int, float], side: float = 0.0) -> Explanation:
+    """Of 10 s of driving in arcs: healthy wheels err by ``usual``, half of it for seconds; a side's share ``side`` of its way [rad/m]."""
+    way, turn = np.full(20, 0.25), 0.2 * np.sin(0.4 * np.arange(20) + rng.uniform(0.0, 6.0))
+    X, variance = np.column_stack([np.full(20, 0.5), turn, way, np.zeros(20)]), np.full(20, 1e-5)
+    seconds = 0.5 * np.arange(20)
+    slow = np.linalg.cholesky(np.exp(-np.abs(seconds[:, None] - seconds) / 5.0))
+    innovation = np.sqrt(variance) * rng.normal(size=20) + side * way
+    for regressor, sigma in usual.items():
+        lasting = math.sqrt(0.5) * (rng.normal() + slow @ rng.normal(size=20))
+        innovation = innovation + sigma * X[:, regressor] * lasting
+    return explained(innovation, variance, X, usual)
+
+
+def test_causes_of_healthy_wheels_that_slip_are_improbable_and_their_sigmas_those_of_one_of_three() -> None:
+    """Monte Carlo of 2000 windows: a cause with odds of 99 after its prior of 1e-3 is no more frequent than these odds allow."""
+    rng, usual = np.random.default_rng(7), usual_errors(load_robot("husky_a200"))[GYRO_WHEELS]
+    found = [drawn_window(rng, usual) for _ in range(2000)]
+    assert sum(e.log_odds > math.log(99e3) for e in found) == 0
+    assert sum(e.log_odds > math.log(100.0) for e in found) <= 0.03 * len(found)  # 1 % by each of three causes at most
+    assert np.mean([e.sigmas > 3.0 for e in found]) < 3.0 * math.erfc(3.0 / math.sqrt(2.0)) + 0.003
+
+
+def test_side_that_loses_far_more_than_slip_is_found_and_named() -> None:
+    rng, usual = np.random.default_rng(8), usual_errors(load_robot("husky_a200"))[GYRO_WHEELS]
+    found = [drawn_window(rng, usual, side=-0.7) for _ in range(100)]
+    assert all(e.log_odds > math.log(99e3) for e in found)
+    assert all("of the left wheels explain it best" in e.sentence for e in found)
 
 
 def as_clouds(unit: float) -> EventFault:

@@ -26,6 +26,12 @@ def test_healthy_drive_of_a_kind_is_accused_of_nothing(kind: str) -> None:
     assert check(kind, 20, SOURCES.get(kind, ("wheels", "gyro"))).accusations == ()
 
 
+@pytest.mark.extended
+@pytest.mark.parametrize("kind", ["mostly standing", "caster in the joint states", "turns less at speed", "vibration", "load that moves"])
+def test_replay_of_a_healthy_drive_of_a_kind_warns_of_nothing(kind: str) -> None:
+    assert check(kind, 21, ("driver", "gyro", "lidar"), "replay").accusations == ()
+
+
 WINDOWS = [(log, begin) for log in REAL[:3] for begin in (60.0, 200.0)]
 
 
