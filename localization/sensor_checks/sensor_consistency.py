@@ -96,7 +96,8 @@ class SensorConsistency:
     def __init__(self, faults: FaultLog, robot: Robot | None = None) -> None:
         """``robot``: whose wheels slip as its drive's do, and whose file may not have all parameters; None where nothing is unknown."""
         self._faults, self._clipping, self._scales = faults, _Clipping(), ScaleCheck(faults)
-        self._robot, self._usual = robot, usual_errors(robot)
+        self._models = None if robot is None else {name: list(values) for name, values in robot.models.items()}
+        self._usual = usual_errors(robot)
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._reckoning = faults.inflation.reckoning
         self._totals = NO_REGRESSORS
@@ -195,9 +196,9 @@ class SensorConsistency:
     def _is_declared(self, parameter: LearnedParameter) -> bool:
         """Whether the robot file has a value that what was learned contradicts. Without one, factors on turns are what is to be learned."""
         name, value = parameter.name, parameter.file_value
-        if self._robot is None or name not in _TURNING:
+        if self._models is None or name not in _TURNING:
             return True
-        return name in self._robot.models.get(parameter.owner, {}) if name != _MULTIPLIER else value != 1.0 or parameter.value < value
+        return name in self._models.get(parameter.owner, []) if name != _MULTIPLIER else value != 1.0 or parameter.value < value
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
