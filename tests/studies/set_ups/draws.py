@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from motion_models.robot import Robot
+from motion_models.robot import Mount, Robot
 from tests.helpers import bags
 from tests.helpers.bags import Record, S
 from tests.helpers.cut_logs import RealLog, cut, there
@@ -121,10 +121,18 @@ def real(seed: int, count: int, log: RealLog | None = None, allowed: Callable[[S
         effective,
         robot.driver.track_width_m * robot.driver.wheel_separation_multiplier,
         has_twists=_has_twists(records, topics.get("driver")),
+        imu_up=_imu_up(records, topics.get("gyro"), robot),
     )
     faults = tuple(draw_faults(rng, setting, count, allowed))
     body = Body(robot.joints.left, robot.joints.right, geometry.wheel_radius_m, effective, setting.driver_track, tuple(sorted(topics)))
     return Draw(f"{log.name} from {begin:.0f} s", tuple(topics), robot, records, faults, body, log.known, topics.get("reference"), topics)
+
+
+def _imu_up(records: Sequence[Record], topic: str | None, robot: Robot) -> tuple[float, float, float]:
+    """The vertical in the IMU's axes, by the robot file's mount of its frame."""
+    mount = next((robot.mounts.get(m.header.frame_id, Mount()) for t, m, _ in records if t == topic), Mount())
+    x, y, z = mount.rotation[2].tolist()
+    return x, y, z
 
 
 def _has_twists(records: Sequence[Record], topic: str | None) -> bool:

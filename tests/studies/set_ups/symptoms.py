@@ -38,6 +38,8 @@ class Setting:
     has_twists: bool = True
     """Whether the driver publishes twists beside its poses."""
     has_rates: bool = True
+    imu_up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """The vertical in the IMU's axes, by its mount."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -335,11 +337,17 @@ def _pose_against_twist(rng: np.random.Generator, setting: Setting) -> Fault:
 # rows: gyro
 
 
+def _with_axis(axis: np.ndarray) -> np.ndarray:
+    """A rotation that takes z to one of the ``axis`` (3,) of a frame."""
+    other = np.roll(np.abs(axis), 1)
+    return np.stack([other, np.cross(axis, other), axis], axis=1)
+
+
 def _gyro_axis(rng: np.random.Generator, setting: Setting) -> Fault:
-    name = str(rng.choice(["+x", "-x", "+y", "-y", "-z"]))
-    axis = (1.0 if name[0] == "+" else -1.0) * np.eye(3)["xyz".index(name[1])]
-    other = np.eye(3)[("xyz".index(name[1]) + 1) % 3]
-    rotation = np.stack([other, np.cross(axis, other), axis], axis=1)  # takes z to the axis
+    up = np.round(setting.imu_up)
+    axes = {f"{sign}{name}": size * axis for name, axis in zip("xyz", np.eye(3), strict=True) for sign, size in (("+", 1.0), ("-", -1.0))}
+    name = str(rng.choice([name for name, axis in axes.items() if (axis != up).any()]))
+    rotation = _with_axis(axes[name]) @ _with_axis(up).T
     return Fault(Truth("gyro.axis", name), imu_by(setting, rotation, rotation))
 
 
