@@ -216,20 +216,13 @@ class AttitudeFilter:
         white = self._robot.white**2 * dt
         turn = Turn(float(self._sums.wheels[1]) - turned - float(self._sums.state[5]) * dt, white, dt)
         if self._downhill is not None and has_wheels:
-            self._add_curvature(self._downhill, 0.5 * self._robot.radius * float(dt_s @ rates.sum(axis=1)), turn, is_still=not rates.any())
+            way = 0.5 * self._robot.radius * float(dt_s @ rates.sum(axis=1))
+            error = self._ground.mount_error  # turns with the body, as no ground does
+            unknown = self.tilt_variances[1] * turn.angle**2
+            self._curvature.advance(self._downhill - error, self._slope() - error, (way, turn.angle), white + unknown)
         if self._sums.window[6] >= (_FIRST_WINDOW_S if self._downhill is None else _WINDOW_S):
             self._measure(has_wheels)
         return None if self._downhill is None else self._tilt(self._downhill, turn)
-
-    def _add_curvature(self, before: FloatArray, way: float, turn: Turn, *, is_still: bool) -> None:
-        """Add the change of the slope since ``before`` (2,), without the mount's error: that turns with the body, as no ground does."""
-        after, error = self._slope(), self._ground.mount_error
-        if is_still:
-            self._curvature.rest(after - before, turn.variance)
-            return
-        bias = 0.5 * float(self._sums.cov[3, 3] + self._sums.cov[4, 4]) * turn.duration**2
-        lasting = bias + self.tilt_variances[1] * turn.angle**2
-        self._curvature.advance(before - error, after - error, (way, turn.angle), turn.variance, lasting)
 
     def _restart(self, has_wheels: bool) -> None:
         """Begin a window, over which forces are summed, at the IMU's velocity where ``has_wheels``."""

@@ -28,8 +28,6 @@ _PRIOR = _SIGMA * _SIGMA / 3.0 * np.array([[3.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.
 """Covariance of h_xx, h_xy, h_yy of a surface that has no direction of its own: the same in all axes [1/m^2]."""
 _LASTING_M = 10.0 * _LENGTH_M
 """Way over which `GroundCurvature.root_mean_square` is taken: ten independent curvatures."""
-_MIN_RESTS = 10
-"""Steps at rest from which the gyro's noise is known: its variance to a third."""
 _BUMPS = 2e-3
 """Random walk of the tilt by ground that is not smooth [rad/sqrt(m)]."""
 
@@ -40,8 +38,6 @@ class GroundCurvature:
     def __init__(self) -> None:
         self._state, self._cov = np.zeros(3), _PRIOR.copy()
         self._weight, self._squares = 0.0, 0.0
-        self._rest: FloatArray | None = None
-        self._rests, self._noise = 0, 0.0
 
     @property
     def twist(self) -> tuple[float, float]:
@@ -50,29 +46,19 @@ class GroundCurvature:
 
     @property
     def root_mean_square(self) -> float:
-        """Root mean square of h_xx over the last way, beyond its own noise [1/m]; 0 before there is one."""
-        return math.sqrt(max(self._squares, 0.0) / self._weight) if self._weight > 0.0 else 0.0
+        """Root mean square of h_xx over the last way [1/m]; 0 before there is one."""
+        return math.sqrt(self._squares / self._weight) if self._weight > 0.0 else 0.0
 
-    def rest(self, change: FloatArray, variance: float) -> None:
-        """A robot at rest shows the gyro's noise: a ``change`` (2,) of its slope, of which a gyro as declared has the ``variance``."""
-        if self._rest is not None:  # differences of successive ones are free of the bias (von Neumann 1941)
-            self._rests += 1
-            self._noise += float(np.sum((change - self._rest) ** 2)) / (4.0 * variance)
-        self._rest = change
-
-    def advance(self, before: FloatArray, after: FloatArray, motion: tuple[float, float], white: float, lasting: float) -> None:
+    def advance(self, before: FloatArray, after: FloatArray, motion: tuple[float, float], variance: float) -> None:
         """Advance by a ``motion``: way ahead [m] and turn [rad] about the body's z axis.
 
         ``before`` and ``after`` (2,) are the ground's downhill slopes in the body's axes there (`motion_models.slope.Slope`), of whose
-        change a gyro as declared has an error of the variance ``white`` [rad^2], and its bias and mount one of ``lasting`` [rad^2]: the
-        same along all of the way over which curvature lasts.
+        change a gyro has an error of ``variance`` [rad^2].
         """
-        noise = self._noise / self._rests if self._rests >= _MIN_RESTS else 1.0
-        steps = max(1.0, _LENGTH_M / max(abs(motion[0]), 1e-9))
-        _advance(self._state, self._cov, before, after, motion, white * max(noise, 1.0) + lasting * steps)
+        _advance(self._state, self._cov, before, after, motion, variance)
         kept = math.exp(-abs(motion[0]) / _LASTING_M)
         self._weight = kept * self._weight + 1.0 - kept
-        self._squares = kept * self._squares + (1.0 - kept) * float(self._state[0] ** 2 - self._cov[0, 0])
+        self._squares = kept * self._squares + (1.0 - kept) * float(self._state[0]) ** 2
 
 
 @kernel

@@ -89,7 +89,7 @@ class InnovationWindow(NamedTuple):
     innovation: float
     """Their sum [rad, m]."""
     sigmas: float
-    """Of its size, by the noise of both sensors alone."""
+    """Size of the sum by the noise of both sensors alone."""
 
     def explain(self, pair: Pair, causes: Causes, usual: Mapping[int, float]) -> Explanation:
         """The most probable of ``causes`` of a ``pair``, where healthy sensors err by ``usual`` standard deviations per unit of what causes
