@@ -102,7 +102,8 @@ class InnovationWindow(NamedTuple):
         lasting = 0.5 + 0.5 * np.exp(-np.abs(end_s[:, None] - end_s) / _SLIP_S)
         for regressor, sigma in usual.items():
             C += sigma**2 * np.outer(X[:, regressor], X[:, regressor]) * lasting
-        found = [_explanation(cause, X[:, cause.regressor], innovation, C) for cause in causes]
+        weighted = np.linalg.solve(C, np.column_stack([X, innovation]))
+        found = [_explanation(cause, X[:, cause.regressor], weighted[:, [cause.regressor, -1]]) for cause in causes]
         best = max(found, key=operator.attrgetter("log_odds"))
         if np.allclose(X[:, [TURN, WAY]], 0.0):
             return best._replace(regressor=SECONDS, sentence=_STANDING[pair.quantity].format(first=pair.first))
@@ -116,10 +117,9 @@ _STANDING = {
 }
 
 
-def _explanation(cause: Cause, x: FloatArray, innovation: FloatArray, C: FloatArray) -> Explanation:
-    """How well a factor on ``x`` (n,) explains ``innovation`` (n,) of covariance ``C`` (n, n): its evidence against none, with the factor
-    integrated out over its prior (Bar-Shalom, Li, Kirubarajan 2001, 1.4; a Bayes factor of two Gaussians)."""
-    weighted = np.linalg.solve(C, np.column_stack([x, innovation]))
+def _explanation(cause: Cause, x: FloatArray, weighted: FloatArray) -> Explanation:
+    """How well a factor on ``x`` (n,) explains innovations of covariance C: its evidence against none, with the factor integrated out over
+    its prior (Bar-Shalom, Li, Kirubarajan 2001, 1.4; a Bayes factor of two Gaussians). ``weighted`` (n, 2): C^-1 x and C^-1 innovation."""
     power, product = (x @ weighted).tolist()
     gain = cause.sigma**2 * power
     chi_square = product**2 / power if power else 0.0

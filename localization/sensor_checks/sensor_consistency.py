@@ -42,7 +42,7 @@ _MAX_SIGMAS = 4.5
 """Largest sum of innovations over a window, in sigmas: 7e-6 by chance, one of 60 hours. Largest of healthy drives: gyro and wheels 4.0 (six
 simulated robots; Husky outdoors 1.0), LiDAR and gyro 3.3, ways by LiDAR and wheels 3.1 (ACES), turns by both 1.0 (ACES)."""
 _FAULT_ODDS, _CERTAIN_ODDS = math.log(1e-3), math.log(99.0)
-"""Logarithms of the odds that a sensor fails within a window, and from where on it is said to have failed."""
+"""Logarithms of the prior odds of a fault within a window, and of the posterior odds from which on it is reported."""
 _MIN_LEARNED_SIGMAS = 4.0
 """Distance of a learned parameter from the robot file's, in its own sigmas."""
 _MIN_PRIOR_SIGMAS = 3.0
@@ -162,7 +162,7 @@ class SensorConsistency:
         best = worst.explain(pair, CAUSES[pair], self._usual.get(pair, {}))
         regressor, cause = best.regressor, best.sentence
         if regressor == TURN:
-            unset = [p for p in learned() if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value]
+            unset = [p for p in learned() if p.name == _MULTIPLIER and not self._is_declared(p)]
             cause += "".join(_PLAIN_MODEL.format(model=p.owner) for p in unset)
         if is_clipped:
             regressor, cause = TURN, self._clipping.describe()
@@ -195,10 +195,10 @@ class SensorConsistency:
 
     def _is_declared(self, parameter: LearnedParameter) -> bool:
         """Whether the robot file has a value that what was learned contradicts. Without one, factors on turns are what is to be learned."""
-        name, value = parameter.name, parameter.file_value
-        if self._models is None or name not in _TURNING:
-            return True
-        return name in self._models.get(parameter.owner, []) if name != _MULTIPLIER else value != 1.0 or parameter.value < value
+        name = parameter.name
+        if name == _MULTIPLIER:  # 1 where nobody has set it, of a robot that slides as it turns
+            return not parameter.file_value == 1.0 < parameter.value
+        return self._models is None or name not in _TURNING or name in self._models.get(parameter.owner, [])
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""

@@ -9,7 +9,7 @@ from localization.core.state import State
 from localization.lidar import OUTLIER_SIGMAS
 
 _MIN_CLOCK_OFFSET_S = 0.05
-"""Smallest offset of the wheels' clock with a warning [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
+"""Smallest offset of the wheels' clock that counts [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
 _MAX_LATENCY_S = 0.2
 """Largest offset of the wheels' clock that is a driver's latency [s]: up to 0.18 on the way on fr079, MIT-CSAIL and the Husky outdoors."""
 
