@@ -24,7 +24,7 @@ from array import array
 from collections import deque
 from collections.abc import Mapping, Sequence
 from enum import Enum
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -188,9 +188,17 @@ def _state(value: Any) -> Any:
         return {}
     if isinstance(state, tuple):  # slots
         state = {**(state[0] or {}), **(state[1] or {})}
-    if type(state) is dict:  # what follows from the rest is computed again, so that what was asked of an object is no part of it
-        return {name: part for name, part in state.items() if not isinstance(getattr(type(value), name, None), cached_property)}
+    kind: Any = type(value)
+    derived = _cached_properties(kind)
+    if derived and type(state) is dict:  # computed again where they are needed: what was asked of an object is no part of its state
+        return {name: part for name, part in state.items() if name not in derived}
     return state
+
+
+@cache
+def _cached_properties(kind: type) -> frozenset[str]:
+    """Names of the cached properties of a class and its bases."""
+    return frozenset(name for base in kind.__mro__ for name, part in vars(base).items() if isinstance(part, cached_property))
 
 
 class _Reader:
