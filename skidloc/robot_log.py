@@ -125,13 +125,14 @@ class RobotLog:
 
         Needs the extra `twin`. Raises `SimulationError` for a file that cannot be simulated.
         """
-        from localization.commands.twin import Twin  # these import the simulator's engine
+        from localization.commands.twin import Twin, maneuvers_of  # these import the simulator's engine
         from localization.twin.twin import examine
 
         command = Twin((self.log.path,), self.robot.name, None if simulator is None else Path(simulator))
         opened, notes = command.open_simulator(self.robot)
-        found = examine(list(drive_of_log(self.log).maneuvers), self.robot, opened, command.config)
-        return of_twin(replace(found, notes=(*notes, *found.notes)))
+        maneuvers, of_commands = maneuvers_of(self.log, drive_of_log(self.log))
+        found = examine(maneuvers, self.robot, opened, command.config)
+        return of_twin(replace(found, notes=(*notes, *((of_commands,) if of_commands else ()), *found.notes)))
 
     def _reference(self, given: str | Path | ReferenceTrack | Relations | None) -> ReferenceTrack | Relations | None:
         if isinstance(given, ReferenceTrack | Relations):

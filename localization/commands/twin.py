@@ -14,12 +14,13 @@ from rich.console import Console
 from localization.calibration.calibrate import MotionReferenceName
 from localization.calibration.windows import WindowConfig
 from localization.commands.common import add_row, in_radians, new_folder, plain_table, print_line, print_table, write_json
-from localization.diagnosis.drive import drive_of_log, drive_of_table
+from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.errors import SimulationError
 from localization.evidence import open_log_as_declared
-from localization.logs import TopicOverrides
+from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
-from localization.report.twin_page import percent, write_twin_page
+from localization.report.twin_page import percent, slide, write_twin_page
+from localization.twin.log_drive import with_commands, with_slopes
 from localization.twin.other_names import usd_table
 from localization.twin.robot_mjcf import mjcf_of
 from localization.twin.robot_sdf import sdf_of
@@ -62,6 +63,9 @@ class Twin:
     """Noise of the reference's poses [m, deg], as 0.002 0.1."""
     window_s: float = 2.0
     """Length of the windows that logs are cut into [s]."""
+    commands: str | None = None
+    """Topic of the velocity commands by which the servos are judged (Twist, TwistStamped); without it the one that the wheels follow. An
+    empty name plays measured rates alone."""
     topic: TopicOverrides = field(default_factory=TopicOverrides)
     config: TwinConfig = field(default_factory=TwinConfig)
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -77,7 +81,9 @@ class Twin:
         robot = load_robot(self.robot)
         simulator, notes = self.open_simulator(robot)
         with console.status("reading"):
-            maneuvers = [m for path in self.source for m in self._maneuvers(path, robot)]
+            read = [self._maneuvers(path, robot) for path in self.source]
+            maneuvers = [m for of_path, _ in read for m in of_path]
+            notes = (*notes, *dict.fromkeys(note for _, note in read if note))
         with console.status("simulating"):
             result = examine(maneuvers, robot, simulator, self.config)
             result = dataclasses.replace(result, notes=(*notes, *result.notes))
@@ -114,17 +120,22 @@ class Twin:
             file, notes = mjcf_of_gazebo(file, robot)
         return read_simulator(file or mjcf_of(robot), robot, self.config.threads), notes
 
-    def _maneuvers(self, path: Path, robot: Robot) -> list[Maneuver]:
-        """Maneuvers of one log or table."""
+    def _maneuvers(self, path: Path, robot: Robot) -> tuple[list[Maneuver], str]:
+        """Maneuvers of one log or table, and a sentence on its commands."""
         if path.suffix.lower() != ".csv":
             log = open_log_as_declared(path, robot, self.topic.scored_against(self.reference))
             config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
-            return list(drive_of_log(log, self.motion_reference, self.reference, config, sigmas).maneuvers)
+            return maneuvers_of(log, drive_of_log(log, self.motion_reference, self.reference, config, sigmas), self.commands)
         if "rotation_ratio" in table_columns(path):
             maneuvers, kind = rotations_as_maneuvers(read_rotations(path, robot), robot), "rotations"
         else:
             maneuvers, kind = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)[0], "windows"
-        return list(drive_of_table(path.name, robot, maneuvers, kind).maneuvers)
+        return list(drive_of_table(path.name, robot, maneuvers, kind).maneuvers), ""
+
+
+def maneuvers_of(log: Log, drive: Drive, commands: str | None = None) -> tuple[list[Maneuver], str]:
+    """Maneuvers of a ``drive`` with the slopes of its ground and the log's ``commands`` (see `Twin.commands`), and a sentence on these."""
+    return with_commands(with_slopes(drive.maneuvers, drive.spans_ns, log), drive.spans_ns, log, commands)
 
 
 def _load(path: Path) -> XmlFile:
@@ -156,7 +167,7 @@ def print_twin(console: Console, result: TwinResult) -> None:
     print_line(console, result.sentence)
     for text in result.words[1:]:
         print_line(console, f"wrong: {text}.")
-    table = plain_table("held out", "windows", "turn", "way", "centre of rotation", "position", "heading", "wheels")
+    table = plain_table("held out", "windows", "turn", "way", "centre of rotation", "position", "heading", "wheels", "slide")
     for name, judged in (("", result.before), *((f"{m.name}: ", m.judged) for m in result.repaired)):
         for row in judged.rows:
             cor = "" if math.isnan(row.cor_error[0]) else f"{1e3 * row.cor_error[0]:+.0f}, {1e3 * row.cor_error[1]:+.0f} mm"
@@ -170,6 +181,7 @@ def print_twin(console: Console, result: TwinResult) -> None:
                 f"{row.position_rms_m:.3f} m" if math.isfinite(row.position_rms_m) else "",
                 f"{row.heading_rms_rad:.3f} rad",
                 percent(row.rate_error),
+                slide(row),
             )
     print_table(console, table)
     print_line(console, f"wheels: {result.before.touch}")
@@ -180,5 +192,7 @@ def print_twin(console: Console, result: TwinResult) -> None:
         print_line(console, f"{repair.name}: {gain}{'' if repair.is_better else '. ' + _NOT_BETTER}")
         for change in repair.changes:
             print_line(console, f"  {change.describe()}")
+    for end in result.ends:
+        print_line(console, f"whole stretch, {end.describe()}")
     for note in result.notes:
         print_line(console, f"! {note}")

@@ -420,7 +420,8 @@ def _pieces(m: Maneuver) -> Iterator[Maneuver]:
     for pose, end, cov in zip(m.measured, m.ends, covs, strict=True):
         both = cov if driven == 0 else 2.0 * cov  # two poses that err independently
         motion = se2.between(before, pose)[None]
-        yield dataclasses.replace(m, measured=motion, ends=np.array([end - driven]), cov=both, lead=m.lead + driven)
+        downhill = se2.rotation(-before[2]) @ m.downhill
+        yield dataclasses.replace(m, measured=motion, ends=np.array([end - driven]), cov=both, lead=m.lead + driven, downhill=downhill)
         before, driven = pose, int(end)
 
 

@@ -45,9 +45,14 @@ Sample = tuple[int, float, float]
 """Stamp [ns], angle [rad] and rate [rad/s] of one joint; NaN where absent."""
 
 
+def is_command(topic: str) -> bool:
+    """Whether a topic of velocities asks for them by its name."""
+    return bool(_COMMAND.search(topic))
+
+
 def is_measured_twist(topic: str) -> bool:
     """Whether a topic of velocities may be measured by its name, rather than a command or of another estimator."""
-    return bool(_MEASURED.search(topic)) and not _COMMAND.search(topic)
+    return bool(_MEASURED.search(topic)) and not is_command(topic)
 
 
 def angle_period_rad(units: Joints, message_type: str) -> float:

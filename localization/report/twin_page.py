@@ -17,7 +17,7 @@ from motion_models import se2
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-_HEADS = ("", "Windows", "Turn", "Way", "Centre of rotation", "Position", "Heading", "Wheels")
+_HEADS = ("", "Windows", "Turn", "Way", "Centre of rotation", "Position", "Heading", "Wheels", "Slide")
 _SECONDS = 4.0
 """Time that the animation takes [s]."""
 _FRAMES = 25
@@ -29,6 +29,7 @@ _TERMS = {
     "Centre of rotation": "Where it is in the simulator less where it was measured, ahead and to the left.",
     "Position, heading": "Root mean square error at the end of a window.",
     "Wheels": "Relative error of the wheels' rates against those that they had: what the servos do not reach.",
+    "Slide": "How much farther than the robot it slides downhill in a full turn, on slopes.",
     "Cause": "The number that explains most of what is wrong, by the probability of the motion with it (Laplace's approximation).",
     "Contact law": "Friction in proportion to the slip at first, by the friction model, in place of the engine's Coulomb friction.",
 }
@@ -54,6 +55,7 @@ def twin_page(result: TwinResult, robot: Robot, source: str) -> str:
             "Wheels on the ground",
             html.bullets([f"file: {result.before.touch}", *(f"{m.name}: {m.judged.touch}" for m in result.repaired)]),
         ),
+        html.Section("A whole stretch", html.bullets([end.describe() for end in result.ends])),
         html.Section("Remarks", html.bullets(result.notes)),
         html.glossary(_TERMS),
     ]
@@ -98,7 +100,13 @@ def _cells(row: Row) -> tuple[str, ...]:
         position,
         f"{row.heading_rms_rad:.3f} rad",
         percent(row.rate_error),
+        slide(row),
     )
+
+
+def slide(row: Row) -> str:
+    """How much farther it slides downhill in a turn as text; empty on level ground."""
+    return "" if math.isnan(row.slide_error_m) else f"{row.slide_error_m:+.2f} m"
 
 
 def percent(share: float) -> str:

@@ -18,8 +18,9 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.twin.engine import Played, Touch
 from localization.twin.gazebo_file import GazeboRobot, wheel_centre
-from localization.twin.windows import LEAD_S, Window
+from localization.twin.windows import LEAD_S, START_K, Window, down_at, lead_turn
 from motion_models.se2 import FloatArray, between
+from motion_models.slope import GRAVITY
 
 try:
     import dartpy as dart
@@ -29,8 +30,6 @@ except ImportError as error:
 STEP_COST = 3
 """Time steps of MuJoCo that take as long as one of DART: 65 to 95 us of a Husky's, of 30."""
 _SETTLE_S = 0.3
-_K = 0.55
-"""Turn over that of ideal wheels from which a window's lead starts."""
 _LOST_M = 0.5
 """Change of height beyond which a robot flies or falls [m]."""
 _GROUND_MU = 100.0
@@ -112,7 +111,7 @@ class _Run:
         com = b.com + np.append(shift, 0.0) * source.mass / b.mass
         self.world = dart.simulation.World()
         self.world.setTimeStep(source.time_step_s)
-        self.world.setGravity([0.0, 0.0, -9.81])
+        self.world.setGravity([0.0, 0.0, -GRAVITY])
         self.world.getConstraintSolver().setCollisionDetector(dart.collision.OdeCollisionDetector())
         self.world.addSkeleton(_ground())
         self._robot = dart.dynamics.Skeleton("robot")
@@ -155,7 +154,7 @@ class _Run:
         xy = self._engine.centres[:, :2]
         whole = (b.mass * com[:2] + wheels * xy.mean(axis=0)) / (b.mass + wheels)
         A = np.vstack([np.ones(len(xy)), xy.T])
-        loads = np.linalg.pinv(A) @ np.array([1.0, *whole]) * (b.mass + wheels) * 9.81
+        loads = np.linalg.pinv(A) @ np.array([1.0, *whole]) * (b.mass + wheels) * GRAVITY
         return np.asarray(np.maximum(loads, 1e-3))
 
     def settle(self) -> None:
@@ -173,6 +172,8 @@ class _Run:
         sides = window.rates[np.minimum(np.searchsorted(np.cumsum(window.dt), times, side="right"), len(window.dt) - 1)]
         wheels = self._b.source.wheels
         commands = np.repeat(sides, [len(wheels.left), len(wheels.right)], axis=1) * wheels.signs
+        heading = float(self._planar()[2]) + lead_turn(window, float(self._b.radii.mean()), wheels.track_m)
+        self.world.setGravity(GRAVITY * down_at(window, heading))
         self._set_off(window.rates[0])
         first, touched = self._planar(), []
         for i in range(steps):
@@ -188,7 +189,7 @@ class _Run:
     def _set_off(self, rates: FloatArray) -> None:
         """Start with the steady motion of the window's first rates."""
         wheels, radius = self._b.source.wheels, float(self._b.radii.mean())
-        speed, turn = 0.5 * radius * float(rates.sum()), _K * radius * float(rates[1] - rates[0]) / wheels.track_m
+        speed, turn = 0.5 * radius * float(rates.sum()), START_K * radius * float(rates[1] - rates[0]) / wheels.track_m
         ahead, middle = wheels.forward, wheels.origin
         velocity = speed * ahead - turn * np.array([-middle[1], middle[0]])
         state = self._robot.getVelocities()
@@ -218,7 +219,7 @@ class _Run:
             along, across = ux * fx + uy * fy - rim, -ux * fy + uy * fx
             load = float(self.loads[i])
             slope, limit = load / (b.compliance * max(abs(rim), _CREEP_M_S)), b.mu * load
-            share = 1.0 / (1.0 + slope * h * _LEVER * 9.81 / load)
+            share = 1.0 / (1.0 + slope * h * _LEVER * GRAVITY / load)
             f = self._forces[i]
             # the force that slip would have at the end of the step, by the mobility of the patch
             f[0] = min(max(f[0] + (-slope * along - f[0]) * share, -limit), limit)

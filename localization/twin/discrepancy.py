@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,12 @@ _FEWEST = 4
 _SHOWN_SIGMAS = 2.0
 _SHOWN_SHARE, _SHOWN_M = 0.02, 0.005
 """Differences below which nothing is said: how well radius and track of a robot are known."""
+_LEAST_SLOPE, _LEAST_TURN = 0.03, 0.1
+"""Slope (its tangent) and turn of a window [rad] from which on sliding downhill is compared: less is within an accelerometer's mount."""
+_STOPPED = 0.1
+"""Set point at the end of a window over its largest, below which the robot stops in it."""
+_CG_SPREAD_M = 0.02
+"""Distance between the centres of gravity of two halves of the windows from which on they are compared by themselves."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,13 @@ class Row:
     heading_rms_rad: float
     rate_error: float
     """Relative error of the wheels' rates against those that they had."""
+    slope: float = math.nan
+    """Mean slope of the ground under turns in place, its tangent; NaN where it is level."""
+    slide_error_m: float = math.nan
+    """How much farther it slides downhill in a full turn in place than the robot does [m]."""
+    slide_sigma_m: float = math.nan
+    slide_m: float = math.nan
+    """How far the robot slides downhill in such a turn [m]."""
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -53,19 +66,40 @@ class Row:
 def compare(windows: Sequence[Window], played: Played, robot: Robot, frame: FloatArray) -> list[Row]:
     """Rows by kind of motion, and by speed within a kind; the last is of all windows. ``frame`` (2,): the point that was measured [m]."""
     kinds = kinds_of(windows, robot)
-    rims = np.array([np.abs(w.mean_rates).max() for w in windows]) * robot.geometry.wheel_radius_m
     rows = []
     for kind in ("in place", "on arcs", "straight"):
-        chosen = kinds == kind
-        if not chosen.any():
-            continue
-        rows.append(_row(kind, chosen, windows, played, robot, frame))
-        middle = float(np.median(rims[chosen]))
-        slow, fast = chosen & (rims <= middle), chosen & (rims > middle)
-        if min(slow.sum(), fast.sum()) >= _FEWEST and rims[fast].mean() > 1.3 * rims[slow].mean():
-            for name, part in (("slow", slow), ("fast", fast)):
-                rows.append(_row(f"{kind}, {name} ({rims[part].mean():.2f} m/s at the rim)", part, windows, played, robot, frame))
+        if (kinds == kind).any():
+            parts = [(kind, kinds == kind), *_parts(kinds == kind, windows, robot)]
+            rows += [_row(kind if part == kind else f"{kind}, {part}", of, windows, played, robot, frame) for part, of in parts]
+    stopping = np.array([_is_stopping(w) for w in windows])
+    rows += [_row("stopping", stopping, windows, played, robot, frame)] if stopping.any() else []
     return [*rows, _row("all", np.ones(len(windows), dtype=bool), windows, played, robot, frame)]
+
+
+def _parts(chosen: NDArray[np.bool_], windows: Sequence[Window], robot: Robot) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Halves (W,) of the ``chosen`` windows by speed, and by the centre of gravity along each axis, where these differ, with names."""
+    rims = np.array([np.abs(w.mean_rates).max() for w in windows]) * robot.geometry.wheel_radius_m
+    slow, fast = _halves(chosen, rims)
+    if min(slow.sum(), fast.sum()) >= _FEWEST and rims[fast].mean() > 1.3 * rims[slow].mean():
+        yield from ((f"{name} ({rims[part].mean():.2f} m/s at the rim)", part) for name, part in (("slow", slow), ("fast", fast)))
+    for axis, names in enumerate((("back", "front"), ("right", "left"))):
+        at = np.array([w.cg[axis] for w in windows])
+        low, high = _halves(chosen, at)
+        if min(low.sum(), high.sum()) >= _FEWEST and at[high].mean() > at[low].mean() + _CG_SPREAD_M:
+            for name, part in zip(names, (low, high), strict=True):
+                yield f"load at the {name} ({'xy'[axis]} = {1e3 * at[part].mean():.0f} mm)", part
+
+
+def _halves(chosen: NDArray[np.bool_], values: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Those of the windows that are ``chosen`` (W,) with ``values`` (W,) up to their median, and above it."""
+    middle = float(np.median(values[chosen]))
+    return chosen & (values <= middle), chosen & (values > middle)
+
+
+def _is_stopping(window: Window) -> bool:
+    """Whether the wheels come to stand in the window."""
+    rates = np.abs(window.rates)
+    return bool(rates[-1].max() < _STOPPED * rates.max())
 
 
 def kinds_of(windows: Sequence[Window], robot: Robot) -> NDArray[np.str_]:
@@ -102,7 +136,7 @@ def _row(kind: str, chosen: NDArray[np.bool_], windows: Sequence[Window], played
         if len(error):
             cor, spread = _pair(np.median(error, axis=0)), error.std(axis=0) * 1.25 / math.sqrt(max(len(error), 2))
             cor_sigma = _pair(spread)
-    is_turning = kind != "straight"
+    is_turning = kind not in ("straight", "stopping")
     is_going = has_position.any() and not kind.startswith("in place")
     turn_error, turn_sigma = _relative(turn * np.sign(true_turn), np.abs(true_turn)) if is_turning else (math.nan, math.nan)
     way_error, way_sigma = _relative(way[has_position], true_way[has_position]) if is_going else (math.nan, math.nan)
@@ -118,7 +152,24 @@ def _row(kind: str, chosen: NDArray[np.bool_], windows: Sequence[Window], played
         float(np.sqrt((off[has_position, :2] ** 2).sum(axis=1).mean())) if has_position.any() else math.nan,
         float(np.sqrt((off[:, 2] ** 2).mean())),
         float(np.abs(played.rates[chosen]).sum() / max(np.abs(rates).sum(), 1e-9) - 1.0),
+        *(_slides(used, moved, measured, turn) if kind.startswith("in place") else ()),
     )
+
+
+def _slides(windows: Sequence[Window], moved: FloatArray, measured: FloatArray, turn: FloatArray) -> tuple[float, float, float, float]:
+    """`Row.slope` and the three on sliding, of those windows on slopes in which the robot turned in place."""
+    downhill = np.array([w.downhill for w in windows])
+    steep = np.hypot(*downhill.T)
+    used = (steep > _LEAST_SLOPE) & (np.abs(turn) > _LEAST_TURN) & np.isfinite(np.array([w.cov[0, 0] for w in windows]))
+    if used.sum() < 2:
+        return math.nan, math.nan, math.nan, math.nan
+    along, turned = downhill[used] / steep[used, None], np.abs(turn[used]) / math.tau
+    excess = ((moved - measured)[used, :2] * along).sum(axis=1)
+    error = float(excess @ turned) / float(turned @ turned)
+    left = excess - error * turned
+    sigma = math.sqrt(float(left @ left) / (len(left) - 1) / float(turned @ turned))
+    slid = float((measured[used, :2] * along).sum(axis=1) @ turned) / float(turned @ turned)
+    return float(steep[used].mean()), error, sigma, slid
 
 
 def _relative(found: FloatArray, true: FloatArray) -> tuple[float, float]:
@@ -150,6 +201,8 @@ def words(rows: Sequence[Row]) -> list[str]:
     >>> row = Row("in place", 68, -0.62, 0.01, math.nan, math.nan, (0.13, 0.0), (0.01, 0.01), 0.1, 0.4, -0.13)
     >>> words([row])
     ['in place it turns 62 % too little; its centre of rotation is 130 mm too far ahead; its wheels turn 13 % too slowly']
+    >>> words([Row("in place", 9, 0.0, 0.01, 0.0, 0.0, (0.0, 0.0), (0.01, 0.01), 0.1, 0.1, 0.0, 0.0875, -0.1, 0.01, 0.19)])
+    ['in place on slopes of 5 deg it slides 0.09 m a turn downhill where the robot slides 0.19 m']
     """
     found = []
     for row in rows:
@@ -163,6 +216,9 @@ def words(rows: Sequence[Row]) -> list[str]:
         for error, sigma, names in zip(row.cor_error, row.cor_sigma, (("ahead", "back"), ("to the left", "to the right")), strict=True):
             if abs(error) > max(_SHOWN_M, _SHOWN_SIGMAS * sigma):
                 parts.append(f"its centre of rotation is {1e3 * abs(error):.0f} mm too far {names[0] if error > 0.0 else names[1]}")
+        if abs(row.slide_error_m) > max(_SHOWN_M, _SHOWN_SIGMAS * row.slide_sigma_m):
+            slopes = f"on slopes of {math.degrees(math.atan(row.slope)):.0f} deg it slides"
+            parts.append(f"{slopes} {row.slide_m + row.slide_error_m:.2f} m a turn downhill where the robot slides {row.slide_m:.2f} m")
         if abs(row.rate_error) > _SHOWN_SHARE:
             parts.append(f"its wheels turn {100 * abs(row.rate_error):.0f} % too {'fast' if row.rate_error > 0.0 else 'slowly'}")
         if parts:

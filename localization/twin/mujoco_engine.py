@@ -17,11 +17,12 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.twin.engine import Played, Touch
 from localization.twin.wheels import Hinge, Wheels, find_wheels
-from localization.twin.windows import LEAD_S, Window
+from localization.twin.windows import LEAD_S, START_K, Window, down_at, lead_turn
 from localization.twin.xml_file import XmlFile
+from motion_models import se2
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.robot import Robot
-from motion_models.se2 import FloatArray, between
+from motion_models.se2 import FloatArray
 
 try:
     import mujoco
@@ -31,8 +32,6 @@ except ImportError as error:
 
 mujoco.set_mju_user_warning(lambda message: None)  # else MuJoCo writes MUJOCO_LOG.TXT into the working folder; states are checked here
 _SETTLE_S = 0.5
-_K = 0.55
-"""Turn over that of ideal wheels from which a window's lead starts: between the published Huskies' .43 and .67."""
 _LOST_M = 1.0
 """Change of height while the robot settles beyond which it flies or falls [m]."""
 _SERVO_GAIN = 20.0
@@ -288,7 +287,7 @@ class MujocoEngine:
     def _play_batch(self, windows: Sequence[Window], counts: IntArray) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
         model, r = self.robot.model, self.robot
         steps, lead = int(counts.max()), round(LEAD_S / model.opt.timestep)
-        models = [self.with_cg(w.cg, self.robot.model) for w in windows]
+        models = [self._on_slope(self.with_cg(w.cg, self.robot.model), w) for w in windows]
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         start = np.empty((len(windows), mujoco.mj_stateSize(model, spec)))
         control = np.empty((len(windows), steps, model.nu))
@@ -314,7 +313,7 @@ class MujocoEngine:
         rates = np.column_stack([speeds[:, :left].mean(axis=1), speeds[:, left:].mean(axis=1)])
         at = [int(model.sensor_adr[model.sensor(f"{_TOUCH}{i}").id]) for i in range(len(r.joints))]
         loads = [of_window[lead : end + 1, at] for of_window, end in zip(sensors, ends, strict=True)]
-        return between(self._planar(first), self._planar(last)), rates, loads
+        return se2.between(self._planar(first), self._planar(last)), rates, loads
 
     def _roll(self, models: Sequence[mujoco.MjModel], start: FloatArray, control: FloatArray) -> tuple[FloatArray, FloatArray]:
         """States and sensors (W, steps, ...) after each time step."""
@@ -343,12 +342,21 @@ class MujocoEngine:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 
+    def _on_slope(self, model: mujoco.MjModel, window: Window) -> mujoco.MjModel:
+        """The ``model`` with gravity as on the ground of ``window``: it lies downhill of the body where the measured motion starts."""
+        if not window.downhill.any():
+            return model
+        tilted = copy.copy(model)
+        heading = float(self._planar(self._data.qpos[None])[0, 2]) + lead_turn(window, self.robot.radius_m, self.robot.wheels.track_m)
+        tilted.opt.gravity[:] = np.linalg.norm(model.opt.gravity) * down_at(window, heading)
+        return tilted
+
     def _started(self, window: Window) -> mujoco.MjData:
         """The settled robot in the steady motion of the window's first rates."""
         r, model, data = self.robot, self.robot.model, copy.copy(self._data)
         left, right = window.rates[0]
         speed = 0.5 * r.radius_m * (left + right)
-        turn = _K * r.radius_m * (right - left) / r.wheels.track_m
+        turn = START_K * r.radius_m * (right - left) / r.wheels.track_m
         at = int(model.jnt_dofadr[model.body_jntadr[r.base]])
         heading = self._planar(data.qpos[None])[0, 2]
         rotation = data.xmat[r.base].reshape(3, 3)
@@ -366,7 +374,7 @@ class MujocoEngine:
         r, model = self.robot, self.robot.model
         times = (np.arange(steps) + 0.5) * model.opt.timestep
         index = np.minimum(np.searchsorted(np.cumsum(window.dt), times, side="right"), len(window.dt) - 1)
-        sides = window.rates[index]
+        sides = (window.set_points if r.has_servos else window.rates)[index]
         wheels = np.repeat(sides, [len(r.wheels.left), len(r.wheels.right)], axis=1)
         driven = (r.gears != 0.0).any(axis=1)
         return np.where(driven, wheels @ r.gears.T, self._data.ctrl)

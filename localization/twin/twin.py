@@ -11,10 +11,11 @@ import numpy as np
 
 from localization.twin import fit
 from localization.twin.discrepancy import Row, compare, words
-from localization.twin.engine import Played
+from localization.twin.engine import Engine, Played
 from localization.twin.naming import Finding, name_causes
 from localization.twin.parameters import hypotheses_of, law_hypotheses
 from localization.twin.simulator import NumberChange, Numbers, Simulator
+from localization.twin.stretch import Stretch, end_of, longest_stretch
 from localization.twin.windows import Window, halves, spread, windows_of
 from localization.twin.xml_file import XmlFile
 from motion_models.calibration.cross_validation import Interval, root_mean_gain
@@ -104,6 +105,8 @@ class TwinResult:
     steps: int
     """Time steps that the search took."""
     words: tuple[str, ...] = field(default=())
+    ends: tuple[Stretch, ...] = ()
+    """Where the longest stretch without a gap ends, in the file and with each repair; empty for tables. Half of it was fitted."""
 
     @property
     def repaired(self) -> tuple[Mended, ...]:
@@ -145,6 +148,7 @@ class TwinResult:
             "findings": [{**f.best.__dict__, "rivals": [r.__dict__ for r in f.rivals]} for f in self.findings],
             "before": {"rows": [r.to_dict() for r in self.before.rows], "touch": self.before.touch},
             "repairs": [m.to_dict() for m in self.repaired],
+            "stretch": [end.__dict__ for end in self.ends],
             "notes": list(self.notes),
         }
 
@@ -168,6 +172,7 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
     before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
     mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)
     extended = extend(problem, held, robot, before)
+    tried = [("file", simulator.numbers, before), *((m.name, m.numbers, m.judged) for m in (mended, extended) if m is not None)]
     return TwinResult(
         simulator,
         tuple(held),
@@ -179,7 +184,20 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
         simulator.notes,
         problem.steps,
         tuple(words(before.rows)),
+        tuple(_ends(simulator, tried, longest_stretch(windows))),
     )
+
+
+def _ends(simulator: Simulator, tried: Sequence[tuple[str, Numbers, Judged]], stretch: Sequence[Window]) -> list[Stretch]:
+    """Where a ``stretch`` ends with the numbers of each simulator that was ``tried``."""
+    found = []
+    for name, numbers, judged in tried if stretch else ():
+        found.append(end_of(name, stretch, _engine(simulator, numbers).play(stretch), judged.frame))
+    return found
+
+
+def _engine(simulator: Simulator, numbers: Numbers) -> Engine:
+    return simulator.engine if numbers == simulator.numbers else simulator.compiled(numbers)
 
 
 def _frame_alone(problem: fit.Problem, start: fit.Point) -> FloatArray:
@@ -199,9 +217,7 @@ def _occam(problem: fit.Problem, whole: fit.Point, sparse: fit.Point) -> float:
 
 def judge(simulator: Simulator, numbers: Numbers, windows: Sequence[Window], robot: Robot, frame: FloatArray) -> Judged:
     """The simulator with ``numbers`` on ``windows``."""
-    engine = simulator.engine if numbers == simulator.numbers else simulator.compiled(numbers)
-    played = engine.play(windows)
-    return judged(played, windows, robot, frame)
+    return judged(_engine(simulator, numbers).play(windows), windows, robot, frame)
 
 
 def judged(played: Played, windows: Sequence[Window], robot: Robot, frame: FloatArray) -> Judged:

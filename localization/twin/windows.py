@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +18,8 @@ LEAD_S = 0.6
 STEADY_S = 2.0
 """Time that is played of a window of constant rates, whose measured twist is constant as well [s]."""
 _LONGEST_S = 20.0
+START_K = 0.55
+"""Turn over that of ideal wheels from which a window's lead starts: between the published Huskies' .43 and .67."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,17 @@ class Window:
     """(2,) centre of gravity [m]."""
     group: str
     """Windows of one group share their errors."""
+    commands: FloatArray | None = None
+    """(n, 2) set points of the left and right servos in each interval [rad/s]; None where they are not known."""
+    downhill: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """(2,) slope of the ground at the start of the measured motion, in the body's axes (`motion_models.slope.Slope.downhill`)."""
+    start_s: float = 0.0
+    """When the measured motion starts, after the drive's first wheel message [s]."""
+
+    @property
+    def set_points(self) -> FloatArray:
+        """(n, 2) what the servos are given: commands, or the measured rates [rad/s]."""
+        return self.rates if self.commands is None else self.commands
 
     @property
     def duration_s(self) -> float:
@@ -68,28 +81,36 @@ def windows_of(maneuvers: Sequence[Maneuver], robot: Robot) -> list[Window]:
 def _window(m: Maneuver, robot: Robot) -> Window:
     """Window of one maneuver, its last measured pose; a long one of constant rates is shortened."""
     end = m.lead + int(m.ends[-1])
-    dt, rates = m.dt[m.lead : end], m.wheels[m.lead : end]
+    dt, rates, commands = m.dt[m.lead : end], m.wheels[m.lead : end], None if m.commands is None else m.commands[m.lead : end]
     duration = float(dt.sum())
     measured, cov = m.measured[-1], np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1]
-    if duration > STEADY_S and (rates == rates[0]).all():
+    if duration > STEADY_S and (rates == rates[0]).all() and (commands is None or (commands == commands[0]).all()):
         share = STEADY_S / duration
         measured, cov = se2.exp(se2.log(measured) * share), cov * share**2
         dt, rates, duration = np.array([STEADY_S]), rates[:1], STEADY_S
+        commands = None if commands is None else commands[:1]
     cov = cov + _slip(m, robot, duration, (dt[:, None] * rates).sum(axis=0))
     before = np.cumsum(m.dt[: m.lead][::-1])
     n = int(np.searchsorted(before, LEAD_S))  # whole intervals of the lead within it
     taken = m.lead - n
     led = float(m.dt[taken : m.lead].sum())
-    first = m.wheels[taken] if n else rates[0]
     cg = np.broadcast_to(m.cg, m.wheels.shape)[m.lead : end].mean(axis=0)
     return Window(
         np.concatenate([[LEAD_S - led], m.dt[taken : m.lead], dt]),
-        np.concatenate([first[None], m.wheels[taken : m.lead], rates]),
+        _led(m.wheels[taken : m.lead], rates),
         measured,
         cov,
         cg,
         m.group,
+        None if m.commands is None or commands is None else _led(m.commands[taken : m.lead], commands),
+        m.downhill,
+        m.start_s,
     )
+
+
+def _led(lead: FloatArray, values: FloatArray) -> FloatArray:
+    """``values`` (n, 2) after those of the ``lead`` (l, 2), the first of which begins earlier."""
+    return np.concatenate([lead[:1] if len(lead) else values[:1], lead, values])
 
 
 def _slip(m: Maneuver, robot: Robot, duration: float, angles: FloatArray) -> FloatArray:
@@ -102,6 +123,18 @@ def _slip(m: Maneuver, robot: Robot, duration: float, angles: FloatArray) -> Flo
     across = w.lateral_m2_per_m * way + w.lateral_m2_per_rad * turn + w.floor_m2_per_s * duration
     yaw = w.yaw_rad2_per_m * way + w.yaw_rad2_per_rad * turn + w.floor_rad2_per_s * duration
     return np.diag([along, across, yaw])
+
+
+def lead_turn(window: Window, radius_m: float, track_m: float) -> float:
+    """By how much a robot of these wheels turns in the lead of ``window`` [rad]."""
+    left, right = window.rates[0]
+    return START_K * radius_m * float(right - left) / track_m * LEAD_S
+
+
+def down_at(window: Window, heading: float) -> FloatArray:
+    """(3,) direction of gravity in the axes of a level world in which the measured motion of ``window`` starts with ``heading``."""
+    down = np.append(se2.rotation(heading) @ window.downhill, -1.0)
+    return np.asarray(down / np.linalg.norm(down))
 
 
 def spread(windows: Sequence[Window], robot: Robot, count: int) -> IntArray:

@@ -13,6 +13,8 @@ an interval of constant wheel rates, in order of time; lines that follow each ot
     x_m, y_m           optional: measured position of the body at the end of the line, relative to its pose at the start of the window
     yaw_rad            measured heading in the same way
     cg_x_m, cg_y_m     optional: centre of gravity in the interval
+    left_command_rad_per_s, right_command_rad_per_s   optional: set points of the wheels' servos in the interval
+    downhill_x, downhill_y   optional, in the first line of a window: slope of the ground in the body's axes there, as tangents
     sigma_x_m, sigma_y_m, sigma_yaw_rad   optional: standard deviations of what was measured (default 0.02 m, 0.02 m, 0.01 rad)
 
 Where nothing was measured at the end of a line, its x_m, y_m and yaw_rad are empty, all of them; no other cell may be.
@@ -41,6 +43,8 @@ IntArray = NDArray[np.int64]
 NEEDED = ("window", "dt_s", "left_rad_per_s", "right_rad_per_s", "yaw_rad")
 POSE = ("x_m", "y_m", "yaw_rad")
 CG = ("cg_x_m", "cg_y_m")
+COMMANDS = ("left_command_rad_per_s", "right_command_rad_per_s")
+DOWNHILL = ("downhill_x", "downhill_y")
 SIGMA = {"sigma_x_m": 0.02, "sigma_y_m": 0.02, "sigma_yaw_rad": 0.01}
 """Defaults of a table without standard deviations: scatter of motion capture and of LiDAR ICP (DRIVE)."""
 
@@ -86,6 +90,11 @@ class Maneuver:
     middle: int = 0
     """Intervals driven until the pose between start and end of a maneuver whose positions alone were measured: the one pose measured is
     that of the second chord relative to the first (`motion_models.calibration.chords`). 0 for measured poses."""
+
+    commands: FloatArray | None = None
+    """(n, 2) set points of the servos of the left and the right wheels in each interval [rad/s]; None where they are not known."""
+    downhill: FloatArray = field(default_factory=lambda: np.zeros(2))
+    """(2,) slope of the ground at the start, in the body's axes (`motion_models.slope.Slope.downhill`) [-]."""
 
 
 @dataclass(frozen=True)
@@ -212,8 +221,8 @@ def read_windows(path: str | Path) -> list[Maneuver]:
     missing = [name for name in NEEDED if name not in columns]
     if "x_m" in columns or "y_m" in columns:
         missing += [name for name in ("x_m", "y_m") if name not in columns]
-    if any(name in columns for name in CG):
-        missing += [name for name in CG if name not in columns]
+    for pair in (CG, COMMANDS, DOWNHILL):
+        missing += [name for name in pair if name not in columns] if set(pair) & set(columns) else []
     if missing:
         raise CalibrationError(f"table '{path}' has no column {', '.join(missing)}; it has {', '.join(columns)}.")
     if not rows:
@@ -293,7 +302,11 @@ def windows_text(maneuvers: Sequence[Maneuver]) -> str:
     sigmas = tuple(SIGMA) if measured else ("sigma_yaw_rad",)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["window", "group", "dt_s", "left_rad_per_s", "right_rad_per_s", *pose, *CG, *sigmas])
+    has_commands, is_tilted = any(m.commands is not None for m in maneuvers), any(m.downhill.any() for m in maneuvers)
+    if has_commands and any(m.commands is None for m in maneuvers):
+        raise CalibrationError("some windows have commands and others have none; a table has them for all. Write two tables.")
+    more = (*(COMMANDS if has_commands else ()), *(DOWNHILL if is_tilted else ()))
+    writer.writerow(["window", "group", "dt_s", "left_rad_per_s", "right_rad_per_s", *pose, *CG, *sigmas, *more])
     for number, m in enumerate(maneuvers):
         cg = np.broadcast_to(m.cg, m.wheels.shape)
         cov = np.broadcast_to(m.cov, (len(m.ends), 3, 3))
@@ -304,9 +317,9 @@ def windows_text(maneuvers: Sequence[Maneuver]) -> str:
             spread = np.sqrt(np.diagonal(cov[0 if found is None else found]))
             keep = slice(None) if measured else slice(2, None)
             row = [m.dt[i], *m.wheels[i]]
-            writer.writerow(
-                [number, m.group, *map(_cell, row), *values[keep], *map(_cell, cg[i]), *(_cell(s) for s in spread[keep])]
-            )  # fmt: skip
+            last = [*(() if m.commands is None else m.commands[i]), *(m.downhill if is_tilted else ())]
+            cells = [*map(_cell, row), *values[keep], *map(_cell, [*cg[i], *spread[keep], *last])]
+            writer.writerow([number, m.group, *cells])
     return text.getvalue()
 
 
@@ -356,6 +369,7 @@ def _maneuver(rows: list[Row], columns: Sequence[str], path: str | Path) -> Mane
     if not ends:
         raise CalibrationError(f"table '{path}', line {first}: window '{name}' has no measured pose in any of its {len(rows)} lines.")
     cg = np.array([[number(row, c) for c in CG] for row in rows]) if CG[0] in columns else np.zeros(2)
+    commands = np.array([[number(row, side) for side in COMMANDS] for row in rows]) if COMMANDS[0] in columns else None
     return Maneuver(
         dt=np.array([number(row, "dt_s") for row in rows]),
         wheels=np.array([[number(row, side) for side in ("left_rad_per_s", "right_rad_per_s")] for row in rows]),
@@ -364,6 +378,8 @@ def _maneuver(rows: list[Row], columns: Sequence[str], path: str | Path) -> Mane
         cg=cg,
         cov=np.array([np.diag(np.square(s)) for s in sigmas]),
         group=(rows[0][1]["group"] if "group" in columns else "") or f"window {name}",
+        commands=commands,
+        downhill=np.array([number(rows[0], axis) for axis in DOWNHILL]) if DOWNHILL[0] in columns else np.zeros(2),
     )
 
 
