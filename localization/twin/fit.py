@@ -40,6 +40,8 @@ _CONVERGED = 1.0
 """Gain of an iteration [nats] below which the search ends."""
 NOISE_BOUNDS = (0.01, 10.0)
 """Bounds of the factor of a component's covariance that residuals show."""
+MOTION_ALONE = np.array([1.0, 1.0, 1.0, 1.0, 1.0, np.inf])
+"""Noise of the components with which wheels in the air are no evidence: they guide the search, and name no number."""
 CHI_SQUARE_MEDIAN = 0.455
 """Median of chi squared with one degree of freedom."""
 
@@ -99,6 +101,16 @@ class Problem:
     def sigmas(self) -> FloatArray:
         """(W, 6) of the components; inf for what was not measured."""
         return sigmas_of(self.windows) * np.sqrt(self.noise)
+
+    def rescored(self, at: Point) -> Point:
+        """The point under the present noise."""
+        return self.scored(at.base, at.x, at.residuals)
+
+    def explains(self, at: Point) -> bool:
+        """Whether what is left ``at`` a point is within its noise in each component of the motion, and wheels keep to the ground."""
+        squares, known = self.whitened(at.residuals) ** 2, np.isfinite(self.sigmas())
+        known[1:, 5] = False  # the windows share the contacts: one measurement
+        return bool((squares.sum(axis=0) <= known.sum(axis=0)).all())
 
     @property
     def is_late(self) -> bool:
@@ -183,7 +195,7 @@ class Problem:
             noise = np.append(np.clip(factors, *NOISE_BOUNDS), 1.0)
             J *= np.tile(np.sqrt(self.noise / noise), len(self.windows))[:, None]
             self.noise = noise
-        return self.scored(at.base, at.x, at.residuals)
+        return self.rescored(at)
 
 
 def residuals_of(windows: Sequence[Window], played: Played, frame: FloatArray) -> FloatArray:
@@ -222,13 +234,12 @@ def start(problem: Problem) -> Point:
     return problem.scored(numbers, x, residuals_of(problem.windows, played, problem.frame(x)))
 
 
-def fit_all(problem: Problem, iterations: int = 12) -> Point:
-    """All numbers together, from the file as it is, with the robot file's robot, with each switch and on grounded contacts; then again
-    under the noise that is left."""
+def fit_all(problem: Problem, first: Point, near: Sequence[Point] = (), iterations: int = 12) -> Point:
+    """All numbers together, from the file as it is (``first``), with the robot file's robot, with each switch, on grounded contacts and
+    from points that are ``near``; then again under the noise that is left."""
     columns = list(range(len(problem.hypotheses.parameters)))
-    first = start(problem)
     switched = [replace(first.base, **{s.field: s.value}) for s in problem.hypotheses.switches]
-    starts = [first, *(p for base in switched if (p := problem.point(base, first.x)) is not None)]
+    starts = [first, *near, *(p for base in switched if (p := problem.point(base, first.x)) is not None)]
     for base in (first.base, *switched) if problem.hypotheses.has_grounded else ():
         at = problem.point(base, problem.hypotheses.grounded(base))
         starts += [] if at is None else [at]

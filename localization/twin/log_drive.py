@@ -38,7 +38,7 @@ def with_commands(maneuvers: Sequence[Maneuver], spans_ns: IntArray, log: Log, t
     commands counts by which most windows have one that its wheels follow. Raises `CalibrationError` for a ``topic`` without commands.
     """
     topics = command_topics(log) if topic is None else [topic]
-    if topic is not None and topic not in log.types:
+    if topic and topic not in log.types:
         raise CalibrationError(f"{log.path.name} has no topic {topic}. Topics of commands: {', '.join(command_topics(log)) or 'none'}.")
     if topic == "" or not topics:
         return list(maneuvers), ""

@@ -12,7 +12,7 @@ import numpy as np
 from localization.twin import fit
 from localization.twin.discrepancy import Row, compare, words
 from localization.twin.engine import Engine, Played
-from localization.twin.naming import Finding, name_causes
+from localization.twin.naming import Finding, name_causes, pursue
 from localization.twin.parameters import hypotheses_of, law_hypotheses
 from localization.twin.simulator import NumberChange, Numbers, Simulator
 from localization.twin.stretch import Stretch, end_of, longest_stretch
@@ -164,10 +164,18 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
     fitted = [windows[i] for i in first[spread([windows[i] for i in first], robot, config.windows)]]
     held = [windows[i] for i in second[spread([windows[i] for i in second], robot, config.held_windows)]]
     hypotheses = hypotheses_of(simulator, robot)
-    problem = fit.Problem(simulator, hypotheses, fitted, config.budget_steps)
-    whole = fit.fit_all(problem)
-    start = fit.start(problem)
-    findings, sparse = name_causes(problem, start, whole)
+    motion = fit.Problem(simulator, hypotheses, fitted, config.budget_steps, fit.MOTION_ALONE)
+    start = fit.start(motion)
+    pursued = pursue(motion, start)
+    problem = fit.Problem(simulator, hypotheses, fitted, config.budget_steps, steps=motion.steps)
+    start, pursued = problem.rescored(start), problem.rescored(pursued)
+    is_explained = problem.explains(pursued)
+    whole = problem.estimate_noise(pursued) if is_explained else fit.fit_all(problem, start, [pursued])
+    motion.noise, motion.steps = problem.noise * fit.MOTION_ALONE, problem.steps
+    findings, sparse = name_causes(
+        motion, motion.rescored(start), [motion.rescored(p) for p in ([] if is_explained else [whole]) + [pursued]]
+    )
+    problem.steps, sparse = motion.steps, problem.rescored(sparse)
     best = whole if whole.cost < sparse.cost - _occam(problem, whole, sparse) else sparse
     before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
     mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)

@@ -372,6 +372,16 @@ def test_windows_text_is_read_back(tmp_path: Path) -> None:
         assert a.group == b.group
 
 
+def test_windows_with_commands_and_slopes_are_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "w.csv"
+    made = [dataclasses.replace(m, commands=1.1 * m.wheels, downhill=np.array([0.05, -0.02])) for m in made_windows("skid_steer")]
+    path.write_text(windows_text(made))
+    for a, b in zip(made, read_windows(path), strict=True):
+        assert b.commands is not None
+        np.testing.assert_array_equal(a.commands, b.commands)
+        np.testing.assert_array_equal(a.downhill, b.downhill)
+
+
 def test_calibrate_of_several_tables_lists_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two floors: one on which the robot turns 20 % less."""
     paths = []

@@ -145,7 +145,8 @@ def study_spoiled(console: Console, seed: int, only: Sequence[str], config: Twin
     for name in only:
         result = examine(maneuvers, robot, spoiled(true, **changes[name]), config)
         named = "; ".join(f"{f.best.field} ({', '.join(r.field for r in f.rivals) or 'alone'})" for f in result.findings) or "nothing"
-        console.print(f"{name}: {named}; better: {', '.join(m.name for m in result.repaired if m.is_better) or 'none'}", soft_wrap=True)
+        better = ", ".join(m.name for m in result.repaired if m.is_better) or "none"
+        console.print(f"{name}: {named}; better: {better}; {result.steps / 1e6:.1f} million time steps", soft_wrap=True)
 
 
 if __name__ == "__main__":
