@@ -24,7 +24,7 @@ from motion_models.se2 import FloatArray
 _PLUGIN = "gz::sim::systems::WheelSlip"
 _ABSENT = frozenset(
     {"time_constant_s", "damping_ratio", "softness", "impratio", "torsional_m", "servo_gain", "rotor_inertia"}
-    | {"track_scale", "wheelbase_scale", "radius_difference"}
+    | {"track_scale", "wheelbase_scale", "radius_difference", "mu_ratio"}
 )
 """Numbers of MuJoCo's contacts and servos; places of wheels, which several elements of an SDF share."""
 _WHEEL_NUMBERS = ("radius_scale", "width_scale")

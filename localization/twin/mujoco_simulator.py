@@ -121,8 +121,8 @@ def read_simulator(mjcf: XmlFile, robot: Robot, threads: int = 2) -> MujocoSimul
         raise SimulationError(f"simulator '{mjcf.path}': the body with the free joint is not in the file's own text.")
     numbers = _read_numbers(engine, contact, servos)
     if law is not None:
-        mu, stiffness = (float(v) for v in model.numeric(NAME).data[:2])
-        numbers = replace(numbers, mu=mu, slip_stiffness=stiffness)
+        mu, stiffness, ratio = (float(v) for v in model.numeric(NAME).data[:3])
+        numbers = replace(numbers, mu=mu, slip_stiffness=stiffness, mu_ratio=ratio)
     if contact["solref"][0] <= 0.0:
         missing.append("solref has stiffness and damping: time constant and damping ratio are not searched")
     if int(model.opt.enableflags) & _OVERRIDE:
@@ -258,8 +258,8 @@ def _law(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """Wheels without friction of the engine's, and what the module of the contact law reads."""
     old = simulator.file.named("numeric", NAME)
     if old is not None:
-        rest = simulator.engine.robot.model.numeric(NAME).data[2:4]
-        return [Change(old, {"data": " ".join(map(_n, (new.mu, new.slip_stiffness, *rest)))})]
+        creep = float(simulator.engine.robot.model.numeric(NAME).data[3])
+        return [Change(old, {"data": " ".join(map(_n, (new.mu, new.slip_stiffness, new.mu_ratio, creep)))})]
     changes = _contact(simulator, replace(new, condim=1.0))
     sensors = ""
     for i, (joint, of_wheel) in enumerate(zip(simulator.joints, simulator.geoms, strict=True)):
@@ -271,7 +271,7 @@ def _law(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
             site = f'<site name="{SITE}{i}{suffix}" type="sphere" pos="{place}" size="{_n(size)}" group="4"/>'
             changes.append(Change(joint.parent, {}, text=site))
         sensors += f'<touch name="{SITE}{i}" site="{SITE}{i}_zone"/>'
-    law = " ".join(map(_n, (new.mu, new.slip_stiffness, 1.0, CREEP_M_S)))
+    law = " ".join(map(_n, (new.mu, new.slip_stiffness, new.mu_ratio, CREEP_M_S)))
     text = f'<custom><numeric name="{NAME}" data="{law}"/></custom><sensor>{sensors}</sensor>'
     return [*changes, Change(simulator.file.root, {}, text=text)]
 

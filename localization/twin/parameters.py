@@ -53,6 +53,10 @@ _ENGINE = (
 """Prior sigmas: published files of skid-steer robots have mu .3 to 1.5, solref .004 to .1 s, impratio 1 to 100, kv over m g r .1 to 20."""
 SLIP = Parameter("slip_stiffness", "stiffness of the contact law", "", "contact", 0.5, True, 0.5, 100.0, "numeric skidloc_contact[1]")
 """Prior sigma: between published robots' 5 and 13 (`docs/theory/contact.md`)."""
+MU_RATIO = Parameter(
+    "mu_ratio", "friction across the wheels over that along them", "", "contact", 0.3, True, 0.3, 3.0, "numeric skidloc_contact[2]"
+)
+"""Prior sigma: that of the friction model's own (`motion_models.friction.model`)."""
 LAW_FIELDS = ("mu", "slip_stiffness", "servo_gain", "cg_x_m", "cg_y_m", "radius_scale", "radius_difference", "frame_x_m", "frame_y_m")
 """What is fitted with the contact law: the engine's contacts carry loads alone."""
 _ROBOT = (
@@ -157,7 +161,7 @@ def hypotheses_of(simulator: Simulator, robot: Robot) -> Hypotheses:
         "track_scale": (n.track_m, g.track_width_m),
         "wheelbase_scale": (n.wheelbase_m, g.wheelbase_m),
     }
-    slip = () if math.isnan(n.slip_stiffness) else (SLIP,)
+    slip = () if math.isnan(n.slip_stiffness) else (SLIP, MU_RATIO)
     parameters = tuple(p for p in (*_ENGINE, *slip, *_ROBOT, *_REFERENCE) if p.field not in simulator.absent)
     parameters = tuple(_named_for(simulator, p) for p in parameters)
     return _hypotheses(parameters, known, n)
@@ -171,8 +175,9 @@ def _named_for(simulator: Simulator, p: Parameter) -> Parameter:
 def law_hypotheses(simulator: Simulator, hypotheses: Hypotheses) -> Hypotheses:
     """Those of a simulator with friction in proportion to slip."""
     kept = [i for i, p in enumerate(hypotheses.parameters) if p.field in LAW_FIELDS]
-    parameters = (_named_for(simulator, SLIP), *(hypotheses.parameters[i] for i in kept))
-    return Hypotheses(parameters, np.append(0.0, hypotheses.priors[kept]), ())
+    of_law = [_named_for(simulator, p) for p in (SLIP, MU_RATIO) if p.field not in simulator.absent]
+    priors = np.concatenate([np.zeros(len(of_law)), hypotheses.priors[kept]])
+    return Hypotheses((*of_law, *(hypotheses.parameters[i] for i in kept)), priors, ())
 
 
 def _hypotheses(parameters: tuple[Parameter, ...], known: Mapping[str, tuple[float, float]], n: Numbers) -> Hypotheses:

@@ -47,6 +47,8 @@ class Numbers:
     wheelbase_m: float
     slip_stiffness: float = math.nan
     """K of the contact law that takes the place of the engine's friction [-]; NaN where friction is the engine's own."""
+    mu_ratio: float = 1.0
+    """Friction across the wheels over that along them, by the contact law [-]."""
     inertia_scale: float = 1.0
     """Factor of the body's moments of inertia."""
     radius_scale: float = 1.0

@@ -124,7 +124,10 @@ def study_husky(console: Console, steps: int = 100) -> None:
     fitted = fit(make_model("friction", robot), [m for m in maneuvers if m.group not in held], FRICTION)
     residuals = fitted.residuals([m for m in maneuvers if m.group in held])
     friction = math.sqrt(float((residuals[:, :2] ** 2).sum(axis=1).mean()))
-    console.print(f"friction, calibrated: position {friction:.3f} m, heading {np.sqrt((residuals[:, 2] ** 2).mean()):.3f} rad")
+    measured = turns(result.windows, np.array([w.measured for w in result.windows]), robot)
+    turn = float(residuals[:, 2] @ np.sign(measured) / np.abs(measured).sum())
+    heading = math.sqrt(float((residuals[:, 2] ** 2).mean()))
+    console.print(f"friction, calibrated: position {friction:.3f} m, heading {heading:.3f} rad, turn {100 * turn:+.1f} %")
     for m in result.repaired:
         console.print(f"{m.name}: position over that of friction {m.judged.rows[-1].position_rms_m / friction:.2f}")
 

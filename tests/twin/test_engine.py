@@ -123,6 +123,18 @@ def test_contact_law_turns_as_the_friction_model_on_all_wheels() -> None:
     assert played.touch.all_wheels > 0.95
 
 
+def test_contact_law_is_read_again_with_its_ratio_and_turns_less_by_more_friction_across() -> None:
+    stock = read_simulator(mjcf_of(ROBOT), ROBOT)
+    numbers = replace(stock.numbers, mu=0.6, slip_stiffness=10.0, mu_ratio=1.5, servo_gain=20.0 * stock.numbers.servo_gain)
+    lawful = read_simulator(stock.with_numbers(numbers), ROBOT)
+    found = lawful.numbers
+    assert (found.mu, found.slip_stiffness, found.mu_ratio) == pytest.approx((0.6, 10.0, 1.5))
+    again = read_simulator(lawful.with_numbers(replace(found, mu_ratio=0.8)), ROBOT)
+    assert again.numbers.mu_ratio == pytest.approx(0.8)
+    more, less = (s.engine.play([window(-2.0, 2.0)]).poses[0, 2] for s in (lawful, again))
+    assert more < 0.9 * less
+
+
 def test_contact_law_holds_a_robot_that_stands() -> None:
     simulator = read_simulator(mjcf_of(ROBOT), ROBOT)
     played = simulator.compiled(replace(simulator.numbers, slip_stiffness=10.0)).play([window(0.0, 0.0)])
