@@ -46,7 +46,7 @@ demo: .venv/installed
 	cat $(DEMO)/load.txt; \
 	echo "4. The same 68 rotations in MuJoCo with its default contacts: what that simulator gets wrong, and the file that is better."; \
 	$(BIN)/skidloc twin $(DATA)/vaultbot/rotation_grid.csv --robot vaultbot --config.windows 4 --config.held-windows 8 \
-		--config.budget-steps 40000 --out $(DEMO)/twin; mended=$$?; \
+		--config.budget-steps 100000 --out $(DEMO)/twin; mended=$$?; \
 	exit $$((studied + replayed + weighed + diagnosed + mended))
 	@echo "Open $(DEMO)/laps/report.html, $(DEMO)/weigh.html, $(DEMO)/load/diagnosis.html and $(DEMO)/twin/report.html in a browser. Long real logs: make demo-buildings."
 

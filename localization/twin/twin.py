@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ from motion_models.calibration.maneuvers import IntArray, Maneuver
 from motion_models.friction.model import FrictionModel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
+
+_CUT = "the time steps of --config.budget-steps were spent before wrong numbers could be told from others: none is named."
 
 
 @dataclass(frozen=True)
@@ -163,20 +165,8 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
     first, second = halves(windows)
     fitted = [windows[i] for i in first[spread([windows[i] for i in first], robot, config.windows)]]
     held = [windows[i] for i in second[spread([windows[i] for i in second], robot, config.held_windows)]]
-    hypotheses = hypotheses_of(simulator, robot)
-    motion = fit.Problem(simulator, hypotheses, fitted, config.budget_steps, fit.MOTION_ALONE)
-    start = fit.start(motion)
-    pursued = pursue(motion, start)
-    problem = fit.Problem(simulator, hypotheses, fitted, config.budget_steps, steps=motion.steps)
-    start, pursued = problem.rescored(start), problem.rescored(pursued)
-    is_explained = problem.explains(pursued)
-    whole = problem.estimate_noise(pursued) if is_explained else fit.fit_all(problem, start, [pursued])
-    motion.noise, motion.steps = problem.noise * fit.MOTION_ALONE, problem.steps
-    findings, sparse = name_causes(
-        motion, motion.rescored(start), [motion.rescored(p) for p in ([] if is_explained else [whole]) + [pursued]]
-    )
-    problem.steps, sparse = motion.steps, problem.rescored(sparse)
-    best = whole if whole.cost < sparse.cost - _occam(problem, whole, sparse) else sparse
+    problem = fit.Problem(simulator, hypotheses_of(simulator, robot), fitted, config.budget_steps)
+    start, findings, best = _search(problem)
     before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
     mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)
     extended = extend(problem, held, robot, before)
@@ -186,14 +176,33 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
         tuple(held),
         len(fitted),
         before,
-        tuple(findings),
+        tuple(findings or ()),
         mended,
         extended,
-        simulator.notes,
+        (*simulator.notes, *((_CUT,) if findings is None else ())),
         problem.steps,
         tuple(words(before.rows)),
         tuple(_ends(simulator, tried, longest_stretch(windows))),
     )
+
+
+def _search(problem: fit.Problem) -> tuple[fit.Point, list[Finding] | None, fit.Point]:
+    """The file, the numbers that are wrong (None where the budget was spent before they were searched) and the best point found."""
+    motion = replace(problem, noise=fit.MOTION_ALONE)
+    start = fit.start(motion)
+    pursued = pursue(motion, start)
+    is_cut = motion.is_late
+    problem.steps = motion.steps
+    start, pursued = problem.rescored(start), problem.rescored(pursued)
+    is_explained = not is_cut and problem.explains(pursued)
+    whole = problem.estimate_noise(pursued) if is_explained else fit.fit_all(problem, start, [pursued])
+    if is_cut:
+        return start, None, whole
+    motion = replace(problem, noise=problem.noise * fit.MOTION_ALONE)
+    tried = [motion.rescored(p) for p in ((pursued,) if is_explained else (whole, pursued))]
+    findings, sparse = name_causes(motion, motion.rescored(start), tried)
+    problem.steps, sparse = motion.steps, problem.rescored(sparse)
+    return start, findings, whole if whole.cost < sparse.cost - _occam(problem, whole, sparse) else sparse
 
 
 def _ends(simulator: Simulator, tried: Sequence[tuple[str, Numbers, Judged]], stretch: Sequence[Window]) -> list[Stretch]:
