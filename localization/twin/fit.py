@@ -106,6 +106,13 @@ class Problem:
         """The point under the present noise."""
         return self.scored(at.base, at.x, at.residuals)
 
+    def likelihood(self, at: Point) -> float:
+        """Logarithm of the probability of these windows by a point that was fitted to others, without constants [nats]."""
+        if not self.windows:
+            return 0.0
+        found = self.point(at.base, at.x)
+        return -np.inf if found is None else -0.5 * float((self.whitened(found.residuals) ** 2).sum())
+
     def explains(self, at: Point) -> bool:
         """Whether what is left ``at`` a point is within its noise in each component of the motion, and wheels keep to the ground."""
         squares, known = self.whitened(at.residuals) ** 2, np.isfinite(self.sigmas())

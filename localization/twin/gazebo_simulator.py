@@ -24,9 +24,9 @@ from motion_models.se2 import FloatArray
 _PLUGIN = "gz::sim::systems::WheelSlip"
 _ABSENT = frozenset(
     {"time_constant_s", "damping_ratio", "softness", "impratio", "torsional_m", "servo_gain", "rotor_inertia"}
-    | {"track_scale", "wheelbase_scale", "radius_difference", "mu_ratio"}
+    | {"track_scale", "wheelbase_scale", "radius_difference", "mu_ratio", "time_step_s"}
 )
-"""Numbers of MuJoCo's contacts and servos; places of wheels, which several elements of an SDF share."""
+"""Numbers of MuJoCo's contacts, servos and integration; places of wheels, which several elements of an SDF share."""
 _WHEEL_NUMBERS = ("radius_scale", "width_scale")
 _INERTIAL = ("mass_kg", "inertia_scale", "cg_x_m", "cg_y_m", "cg_z_m")
 _GUESSED_STIFFNESS = 2.0

@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -175,17 +175,20 @@ class Linear:
         return -fit.cost - 0.5 * float(np.linalg.slogdet(M)[1]) - SEPARATED_NATS * wrong
 
 
-def name_causes(problem: Problem, start: Point, tried: Sequence[Point]) -> tuple[list[Finding], Point]:
+def name_causes(problem: Problem, start: Point, tried: Sequence[Point], other: Problem) -> tuple[list[Finding], Point]:
     """Findings, strongest first, and the simulator with their numbers alone. ``start`` is the file; about each point that was ``tried`` a
     set of wrong numbers is chosen and fitted, and that of the highest posterior counts, without what it can do without.
 
-    A number is named where its odds to be wrong are above 20 to 1.
+    A number is named where its odds to be wrong are above 20 to 1, by these windows and by what the fits predict of the ``other`` ones:
+
+        ln p(y, y' | S) = ln p(y | S) + ln p(y' | y, S)
     """
     sets = [_sparse(problem, at) for at in tried]
     about, chosen, sparse = max(sets, key=lambda of: of[0].posterior(of[2], of[1]))
-    chosen, sparse = _without_needless(problem, about, chosen, sparse)
+    chosen, sparse = _without_needless(problem, about, chosen, sparse, other)
     findings = [_finding(problem, about.selection, chosen, i, about.at.base) for i in chosen]
     findings += [Finding(c, ()) for s in problem.hypotheses.switches if (c := _switched(problem, start, sparse, s)) is not None]
+    findings += [Finding(c, ()) for c in (_coarse_step(problem, sparse),) if c is not None]
     findings = _together(findings, start, about.at)
     return sorted(findings, key=lambda finding: -finding.best.evidence), sparse
 
@@ -202,18 +205,24 @@ def _sparse(problem: Problem, at: Point) -> tuple[Linear, tuple[int, ...], Point
     return about, chosen, problem.minimize(min(starts, key=lambda p: p.cost), columns, _ITERATIONS) if starts else at
 
 
-def _without_needless(problem: Problem, about: Linear, chosen: tuple[int, ...], fit: Point) -> tuple[tuple[int, ...], Point]:
+def _without_needless(
+    problem: Problem, about: Linear, chosen: tuple[int, ...], fit: Point, other: Problem
+) -> tuple[tuple[int, ...], Point]:
     """The set without each number whose odds, by a fit of the others, are less than 20 to 1, weakest first."""
+
+    def posterior(of: Point, numbers: Sequence[int]) -> float:
+        return about.posterior(of, numbers) + other.likelihood(of)
+
     while chosen:
         tried = []
         for i in chosen:
             rest = tuple(j for j in chosen if j != i)
             first = problem.point(fit.base, np.where(np.arange(len(fit.x)) == i, 0.0, fit.x))
             if first is not None:
-                other = problem.minimize(first, [*about.selection.free, *rest], _TRIED_ITERATIONS)
-                tried.append((about.posterior(other, rest), rest, other))
+                without = problem.minimize(first, [*about.selection.free, *rest], _TRIED_ITERATIONS)
+                tried.append((posterior(without, rest), rest, without))
         best = max(tried, key=lambda of: of[0], default=None)
-        if best is None or best[0] < about.posterior(fit, chosen) - SEPARATED_NATS:
+        if best is None or best[0] < posterior(fit, chosen) - SEPARATED_NATS:
             break
         _, chosen, fit = best
     return chosen, fit
@@ -244,6 +253,18 @@ def _switched(problem: Problem, start: Point, whole: Point, switch: Switch) -> C
     if kept is None or kept.cost - whole.cost < SEPARATED_NATS:
         return None
     return Candidate(switch.field, switch.meaning, "", switch.attribute, "contact", old, new, kept.cost - whole.cost - SEPARATED_NATS)
+
+
+def _coarse_step(problem: Problem, at: Point) -> Candidate | None:
+    """The engine's time step, where half of it brings the motion nearer to the measured one by odds of 20 to 1."""
+    old = at.base.time_step_s
+    if "time_step_s" in problem.simulator.absent:
+        return None
+    halved = problem.point(replace(at.base, time_step_s=0.5 * old), at.x)
+    evidence = -math.inf if halved is None else at.cost - halved.cost - SEPARATED_NATS
+    if evidence < SEPARATED_NATS:
+        return None
+    return Candidate("time_step_s", "time step", "s", "option timestep", "engine", old, 0.5 * old, evidence)
 
 
 def _together(findings: list[Finding], start: Point, whole: Point) -> list[Finding]:

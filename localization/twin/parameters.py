@@ -84,6 +84,10 @@ GROUNDED: Mapping[str, float] = {"time_constant_s": 0.1, "softness": 0.9, "impra
 MuJoCo's defaults), and its k is .58 without a fit (.25; measured .61)."""
 
 
+_TWISTING = 4.0
+"""condim from which on a contact has torsional friction."""
+
+
 @dataclass(frozen=True)
 class Switch:
     """A choice of the file that is searched beside its numbers."""
@@ -186,8 +190,10 @@ def _hypotheses(parameters: tuple[Parameter, ...], known: Mapping[str, tuple[flo
     for p in parameters:
         file, true = known.get(p.field, (0.0, 0.0))
         priors.append(0.0 if p.field not in known else _log_ratio(true, file) if p.is_log else true - file)
-    other = Switch("is_elliptic", 1.0 - n.is_elliptic, f"{'pyramidal' if n.is_elliptic else 'elliptic'} cones", "option cone")
-    return Hypotheses(parameters, np.array(priors), () if math.isnan(n.is_elliptic) else (other,))
+    cone = Switch("is_elliptic", 1.0 - n.is_elliptic, f"{'pyramidal' if n.is_elliptic else 'elliptic'} cones", "option cone")
+    twists = n.condim >= _TWISTING
+    torsion = Switch("condim", 3.0 if twists else _TWISTING, f"contacts with{'out' if twists else ''} torsional friction", "geom condim")
+    return Hypotheses(parameters, np.array(priors), tuple(s for s in (cone, torsion) if not math.isnan(getattr(n, s.field))))
 
 
 def _log_ratio(value: float, base: float) -> float:

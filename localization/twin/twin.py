@@ -163,10 +163,11 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
     config = config or TwinConfig()
     windows = windows_of(maneuvers, robot)
     first, second = halves(windows)
-    fitted = [windows[i] for i in first[spread([windows[i] for i in first], robot, config.windows)]]
+    chosen = first[spread([windows[i] for i in first], robot, config.windows)]
+    fitted, rest = [windows[i] for i in chosen], [windows[i] for i in first if i not in chosen]
     held = [windows[i] for i in second[spread([windows[i] for i in second], robot, config.held_windows)]]
     problem = fit.Problem(simulator, hypotheses_of(simulator, robot), fitted, config.budget_steps)
-    start, findings, best = _search(problem)
+    start, findings, best = _search(problem, [rest[i] for i in spread(rest, robot, config.windows)] if rest else [])
     before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
     mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)
     extended = extend(problem, held, robot, before)
@@ -186,8 +187,11 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
     )
 
 
-def _search(problem: fit.Problem) -> tuple[fit.Point, list[Finding] | None, fit.Point]:
-    """The file, the numbers that are wrong (None where the budget was spent before they were searched) and the best point found."""
+def _search(problem: fit.Problem, other: Sequence[Window]) -> tuple[fit.Point, list[Finding] | None, fit.Point]:
+    """The file, the numbers that are wrong (None where the budget was spent before they were searched) and the best point found.
+
+    ``other`` windows are predicted: nothing is fitted to them, and nothing judged by them.
+    """
     motion = replace(problem, noise=fit.MOTION_ALONE)
     start = fit.start(motion)
     pursued = pursue(motion, start)
@@ -200,7 +204,7 @@ def _search(problem: fit.Problem) -> tuple[fit.Point, list[Finding] | None, fit.
         return start, None, whole
     motion = replace(problem, noise=problem.noise * fit.MOTION_ALONE)
     tried = [motion.rescored(p) for p in ((pursued,) if is_explained else (whole, pursued))]
-    findings, sparse = name_causes(motion, motion.rescored(start), tried)
+    findings, sparse = name_causes(motion, motion.rescored(start), tried, replace(motion, windows=other))
     problem.steps, sparse = motion.steps, problem.rescored(sparse)
     return start, findings, whole if whole.cost < sparse.cost - _occam(problem, whole, sparse) else sparse
 

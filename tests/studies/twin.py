@@ -136,7 +136,7 @@ def study_spoiled(console: Console, seed: int, only: Sequence[str], config: Twin
     """Print what is named of each spoiled simulator."""
     robot = load_robot("husky_a200")
     true = true_simulator(robot)
-    maneuvers, n = drive(true, robot, seed), true.numbers
+    maneuvers, n = drive(true, robot, seed, 96), true.numbers
     changes = {
         "healthy": {},
         "mu": {"mu": 0.5 * n.mu},
