@@ -27,14 +27,18 @@ from motion_models.se2 import FloatArray
 _CUT = "the time steps of --config.budget-steps were spent before wrong numbers could be told from others: none is named."
 
 
+_FEWEST_WINDOWS, _CHANGES = 4, 10
+"""Windows that are fitted at least, and times that a search changes each number: 8 to 12 in MuJoCo."""
+
+
 @dataclass(frozen=True)
 class TwinConfig:
     """Settings of the search."""
 
     windows: int = 20
-    """Windows that numbers are fitted to, those that differ most among one half of the drive."""
+    """Windows that numbers are fitted to, those that differ most among one half of the drive; fewer, where the budget does not suffice."""
     budget_steps: int = 6_000_000
-    """Time steps of the engine that the search may take: 3 to 4 minutes on two cores."""
+    """Time steps that the search may take, and half of them again for the law: 4 minutes on two cores. Those of DART count 3 times."""
     held_windows: int = 150
     """Windows of the other half on which the simulator is judged, those that differ most."""
     threads: int = 2
@@ -161,12 +165,13 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
     Raises `SimulationError` for a file without a robot on wheels, `CalibrationError` for a drive that shows nothing.
     """
     config = config or TwinConfig()
-    windows = windows_of(maneuvers, robot)
+    windows, hypotheses = windows_of(maneuvers, robot), hypotheses_of(simulator, robot)
     first, second = halves(windows)
-    chosen = first[spread([windows[i] for i in first], robot, config.windows)]
+    count = _affordable(simulator, windows[first[0]], len(hypotheses.parameters), config)
+    chosen = first[spread([windows[i] for i in first], robot, count)]
     fitted, rest = [windows[i] for i in chosen], [windows[i] for i in first if i not in chosen]
     held = [windows[i] for i in second[spread([windows[i] for i in second], robot, config.held_windows)]]
-    problem = fit.Problem(simulator, hypotheses_of(simulator, robot), fitted, config.budget_steps)
+    problem = fit.Problem(simulator, hypotheses, fitted, config.budget_steps)
     start, findings, best = _search(problem, [rest[i] for i in spread(rest, robot, config.windows)] if rest else [])
     before = judge(simulator, simulator.numbers, held, robot, _frame_alone(problem, start))
     mended = mend("numbers", problem, fit.pruned(problem, best), held, robot, before)
@@ -185,6 +190,12 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
         tuple(words(before.rows)),
         tuple(_ends(simulator, tried, longest_stretch(windows))),
     )
+
+
+def _affordable(simulator: Simulator, window: Window, numbers: int, config: TwinConfig) -> int:
+    """As many windows as the budget can play with each of the ``numbers`` changed ten times, by the time steps of one ``window``."""
+    steps = simulator.engine.play([window]).steps
+    return min(config.windows, max(_FEWEST_WINDOWS, config.budget_steps // (_CHANGES * numbers * steps)))
 
 
 def _search(problem: fit.Problem, other: Sequence[Window]) -> tuple[fit.Point, list[Finding] | None, fit.Point]:
@@ -255,7 +266,7 @@ def extend(problem: fit.Problem, windows: Sequence[Window], robot: Robot, before
     if not math.isnan(simulator.numbers.slip_stiffness):
         return None
     mu, stiffness = (float(model.nominal[model.param_names.index(name)]) for name in ("mu", "slip_stiffness"))
-    of_law = fit.Problem(simulator, law_hypotheses(simulator, problem.hypotheses), problem.windows, problem.budget_steps)
+    of_law = fit.Problem(simulator, law_hypotheses(simulator, problem.hypotheses), problem.windows, problem.budget_steps // 2)
     of_law.noise = problem.noise
     at = fit.fit_law(of_law, simulator.with_law(mu, stiffness))
     problem.steps += of_law.steps
