@@ -42,8 +42,6 @@ NOISE_BOUNDS = (0.01, 10.0)
 """Bounds of the factor of a component's covariance that residuals show."""
 MOTION_ALONE = np.array([1.0, 1.0, 1.0, 1.0, 1.0, np.inf])
 """Noise of the components with which wheels in the air are no evidence: they guide the search, and name no number."""
-CHI_SQUARE_MEDIAN = 0.455
-"""Median of chi squared with one degree of freedom."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,7 @@ class Problem:
         for _ in range(_NOISE_PASSES):
             leverage = np.einsum("ij,ji->i", J, np.linalg.solve(J.T @ J + np.eye(J.shape[1]), J.T)).reshape(squares.shape)
             left = squares / (1.0 - np.minimum(leverage, _MAX_LEVERAGE))
-            factors = [float(np.median(left[known[:, c], c])) / CHI_SQUARE_MEDIAN if known[:, c].any() else 1.0 for c in range(5)]
+            factors = [float(np.mean(left[known[:, c], c])) if known[:, c].any() else 1.0 for c in range(5)]
             noise = np.append(np.clip(factors, *NOISE_BOUNDS), 1.0)
             J *= np.tile(np.sqrt(self.noise / noise), len(self.windows))[:, None]
             self.noise = noise
