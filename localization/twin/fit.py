@@ -239,12 +239,12 @@ def start(problem: Problem) -> Point:
     return problem.scored(numbers, x, residuals_of(problem.windows, played, problem.frame(x)))
 
 
-def fit_all(problem: Problem, first: Point, near: Sequence[Point] = (), iterations: int = 12) -> Point:
-    """All numbers together, from the file as it is (``first``), with the robot file's robot, with each switch, on grounded contacts and
-    from points that are ``near``; then again under the noise that is left."""
+def fit_all(problem: Problem, first: Point, iterations: int = 12) -> Point:
+    """All numbers together, from the file as it is (``first``), with the robot file's robot, with each switch and on grounded contacts;
+    then again under the noise that is left."""
     columns = list(range(len(problem.hypotheses.parameters)))
     switched = [replace(first.base, **{s.field: s.value}) for s in problem.hypotheses.switches]
-    starts = [first, *near, *(p for base in switched if (p := problem.point(base, first.x)) is not None)]
+    starts = [first, *(p for base in switched if (p := problem.point(base, first.x)) is not None)]
     for base in (first.base, *switched) if problem.hypotheses.has_grounded else ():
         at = problem.point(base, problem.hypotheses.grounded(base))
         starts += [] if at is None else [at]

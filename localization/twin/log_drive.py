@@ -28,7 +28,7 @@ _FEWEST = 5
 _STRAIGHT_GAIN = (0.9, 1.1)
 """Speed over the commanded one: servos reach it within this on straight ways, which take little torque."""
 _TURN_GAIN = (0.4, 1.1)
-"""The same for the difference of the sides, at which skidding wheels may take all of a weak servo's torque."""
+"""Difference of the sides over the commanded one: skidding wheels may take all of a weak servo's torque."""
 
 
 def with_commands(maneuvers: Sequence[Maneuver], spans_ns: IntArray, log: Log, topic: str | None = None) -> tuple[list[Maneuver], str]:

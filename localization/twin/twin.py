@@ -193,7 +193,7 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
 
 
 def _affordable(simulator: Simulator, window: Window, numbers: int, config: TwinConfig) -> int:
-    """As many windows as the budget can play with each of the ``numbers`` changed ten times, by the time steps of one ``window``."""
+    """Windows that the budget can play with each of the ``numbers`` changed ten times, by the time steps of one ``window``."""
     steps = simulator.engine.play([window]).steps
     return min(config.windows, max(_FEWEST_WINDOWS, config.budget_steps // (_CHANGES * numbers * steps)))
 
@@ -210,9 +210,12 @@ def _search(problem: fit.Problem, other: Sequence[Window]) -> tuple[fit.Point, l
     problem.steps = motion.steps
     start, pursued = problem.rescored(start), problem.rescored(pursued)
     is_explained = not is_cut and problem.explains(pursued)
-    whole = problem.estimate_noise(pursued) if is_explained else fit.fit_all(problem, start, [pursued])
+    whole = pursued if is_explained else fit.fit_all(problem, start)
     if is_cut:
         return start, None, whole
+    if problem.rescored(pursued).cost <= whole.cost:
+        problem.estimate_noise(pursued)
+        whole = problem.rescored(whole)
     motion = replace(problem, noise=problem.noise * fit.MOTION_ALONE)
     tried = [motion.rescored(p) for p in ((pursued,) if is_explained else (whole, pursued))]
     findings, sparse = name_causes(motion, motion.rescored(start), tried, replace(motion, windows=other))

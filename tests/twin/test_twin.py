@@ -38,7 +38,7 @@ def test_spoiled_number_is_named_first_or_among_its_rivals(name: str) -> None:
     problem = fit.Problem(file, hypotheses_of(file, robot), fitted, 3_000_000)
     start = fit.start(problem)
     pursued = pursue(problem, start)
-    findings, _ = name_causes(problem, start, [fit.fit_all(problem, start, [pursued]), pursued], replace(problem, windows=rest))
+    findings, _ = name_causes(problem, start, [fit.fit_all(problem, start), pursued], replace(problem, windows=rest))
     assert field in [findings[0].best.field, *(rival.field for rival in findings[0].rivals)]
 
 
