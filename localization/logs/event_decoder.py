@@ -61,10 +61,8 @@ _ENCODER_STEPS = 3.0
 """Scale of the changes over the smallest one that was seen: speeds by encoders are multiples of one step per message."""
 _RESOLUTION = 1e-3
 """Least scale of changes: less is rounding [m, m/s, rad/s]."""
-_FORGET = 0.1
-"""Step of the logarithm of a scale by each reading."""
-_FOLLOW = 0.3
-"""Share of a new reading in the mean of readings, which follows a speed that changes within a second."""
+_FORGET = 0.05
+"""Share by which the mean size of changes is renewed by each reading."""
 _MORE = 1.2
 """Travelled by a second publisher over that of the one in use, from where on the second is used: equal ones do not take turns."""
 _FROZEN_AFTER_RAD = 0.5
@@ -267,10 +265,9 @@ class _Publisher:
 class PublisherSeparator:
     """Separates two publishers that share a topic, of velocities and poses, by the evidence for two.
 
-    Each of two goes on from its own last reading; a single one goes on from the last reading or, where readings are noise about a speed,
-    from their mean. The odds of two grow by the densities of both, less the price of a label. Densities are Cauchy's, with
-    scales by maximum likelihood. Speeds of coarse encoders, which jump by one step and back, are no second publisher's. The one whose
-    wheels travel more is used, of equal ones one.
+    Each goes on from its own last reading, so that its changes are smaller than those from reading to reading, by more than it costs to
+    label each. Changes have Cauchy densities with the scale of their mean size. Speeds of coarse encoders, which jump by one step and
+    back, are no second publisher's. The one whose wheels travel more is used, of equal ones one.
     """
 
     def __init__(self) -> None:
@@ -281,9 +278,6 @@ class PublisherSeparator:
         self._largest = 0.0  # cost of the jump that made the other one
         self._sizes: list[float] = []
         self._steps: list[float] = []
-        self._mean: list[float] = []
-        self._sizes_of_one: tuple[list[float], list[float]] = [], []
-        """Scales of changes since the last reading, and from the mean."""
 
     def admit(self, stamp_ns: int, values: Sequence[float], speed: float) -> bool:
         """Whether a reading of ``values`` (velocities, pose; NaN where absent) at ``speed`` [m/s] is to be used."""
@@ -291,7 +285,6 @@ class PublisherSeparator:
         if current is None:
             self._current = _Publisher(stamp_ns, list(values))
             self._sizes, self._steps = [0.0] * len(values), [math.inf] * len(values)
-            self._mean, self._sizes_of_one = list(values), ([0.0] * len(values), [0.0] * len(values))
             return True
         if self._other is not None and stamp_ns - self._other.stamp_ns > _MAX_PUBLISHER_GAP_NS:
             self._other, self._log_odds, self._largest = None, _ARE_TWO, 0.0
@@ -310,11 +303,10 @@ class PublisherSeparator:
         """The publisher of a reading; the one before, where it is another, is the other one."""
         changes, other = self._changes(values, current), self._other
         back = changes if other is None else self._changes(values, other)
-        cost, of_one = self._cost(changes), self._cost_of_one(values, changes)
+        cost = self._cost(changes)
         if other is not None:
             cost_of_other = self._cost(back)
-            of_two = min(cost, cost_of_other) + sum(map(math.log, self._scales(self._sizes)))
-            self._log_odds = min(max(self._log_odds + of_one - of_two + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
+            self._log_odds = min(max(self._log_odds + cost - min(cost, cost_of_other) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
             if cost_of_other < cost:
                 self._learn(back)
                 self._other = current
@@ -335,47 +327,14 @@ class PublisherSeparator:
 
     def _cost(self, changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``changes``, up to a constant; 0 where nothing is known."""
-        return _cauchy(changes, self._scales(self._sizes))
-
-    def _cost_of_one(self, values: Sequence[float], changes: Sequence[float]) -> float:
-        """Minus the logarithm of the density of ``values`` by a single publisher, of whose two predictions the better one so far counts."""
-        off = [abs(value - mean) for value, mean in zip(values, self._mean, strict=True)]
-        last, mean = self._sizes_of_one
-        pairs = zip(last, changes, mean, off, strict=True)
-        found = [(size, change) if size <= other else (other, from_mean) for size, change, other, from_mean in pairs]
-        scales = self._scales([size for size, _ in found])
-        self._sizes_of_one = _fitted(last, changes), _fitted(mean, off)
-        self._mean = [m + _FOLLOW * (v - m) if v == v else m for m, v in zip(self._mean, values, strict=True)]
-        return _cauchy([change for _, change in found], scales) + sum(map(math.log, scales))
-
-    def _scales(self, sizes: Sequence[float]) -> list[float]:
-        """Scales of the densities of changes whose mean ``sizes`` these are; 1 where nothing is known."""
-        found = [max(size, _ENCODER_STEPS * step, _RESOLUTION) for size, step in zip(sizes, self._steps, strict=True)]
-        return [scale if scale < math.inf else 1.0 for scale in found]
+        scales = [max(size, _ENCODER_STEPS * step, _RESOLUTION) for size, step in zip(self._sizes, self._steps, strict=True)]
+        known = [(change, scale) for change, scale in zip(changes, scales, strict=True) if change == change and scale < math.inf]
+        return sum(2.0 * math.log(math.hypot(1.0, change / scale)) for change, scale in known)
 
     def _learn(self, changes: Sequence[float]) -> None:
-        self._sizes = _fitted(self._sizes, changes)
-
-
-def _cauchy(changes: Sequence[float], scales: Sequence[float]) -> float:
-    """Minus the logarithm of Cauchy's density of ``changes``, without that of its ``scales``; NaN changes are unknown."""
-    known = [change / scale for change, scale in zip(changes, scales, strict=True) if change == change]
-    return sum(2.0 * math.log(math.hypot(1.0, change)) for change in known)
-
-
-def _fitted(sizes: Sequence[float], changes: Sequence[float]) -> list[float]:
-    """Scales ``sizes`` of Cauchy's density, a step up its likelihood by new ``changes``; NaN changes move none.
-
-    d ln p / d ln s = (c^2 - s^2) / (c^2 + s^2): no change counts more than another of another order of size.
-    """
-    found = []
-    for size, change in zip(sizes, changes, strict=True):
-        square, own = change * change, size * size
-        if size == 0.0:
-            found.append(change if change == change else 0.0)
-        else:
-            found.append(size * math.exp(_FORGET * (square - own) / (square + own)) if change == change else size)
-    return found
+        self._sizes = [
+            size + _FORGET * (change - size) if change == change else size for size, change in zip(self._sizes, changes, strict=True)
+        ]
 
 
 class JointsToWheels:

@@ -13,7 +13,6 @@ import pytest
 from localization.evaluation.references import reference_track
 from localization.events import Scan, WheelSample
 from localization.logs import Log, open_log
-from localization.logs.event_decoder import PublisherSeparator
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
 from tests.helpers import bags
@@ -155,22 +154,6 @@ def test_second_publisher_of_zeros_loses_no_distance(tmp_path: Path, offset_ms: 
     found = wheels_of(log)
     np.testing.assert_allclose(found[-1].position, single[-1].position, atol=2.0)  # of 40 to 60 rad; the first 0.25 m cannot be separated
     assert "of a second publisher whose wheels turn no more, left out" in warnings_of(log)
-
-
-@pytest.mark.parametrize("jitter", [0.1, 0.3])
-def test_velocities_that_jitter_are_no_second_publishers(jitter: float) -> None:
-    """Speed and turn rate with noise from message to message, of which 1 % was left out and of some drives a seventh."""
-    left_out, n, hz = [], 1500, 50
-    for seed in range(12):
-        rng = np.random.default_rng([91, seed])
-        smooth = np.array([np.interp(np.arange(n) / 100, np.arange(17), rng.normal(0.3, 0.5, 17)) for _ in range(2)])
-        twists = np.vstack([smooth[0], np.zeros(n), smooth[1], np.full((2, n), np.nan)]).T
-        twists[:, [0, 2]] += rng.normal(0.0, [0.2 * jitter, jitter], (n, 2))
-        separator = PublisherSeparator()
-        admitted = [separator.admit(S + i * S // hz, values, abs(values[0])) for i, values in enumerate(twists.tolist())]
-        left_out.append(1.0 - np.mean(admitted))
-    assert max(left_out) < 0.01
-    assert np.mean(left_out) < 0.001
 
 
 def test_encoder_reset_is_no_second_publisher(tmp_path: Path) -> None:
