@@ -182,7 +182,7 @@ def examine(maneuvers: Sequence[Maneuver], robot: Robot, simulator: Simulator, c
         tuple(held),
         len(fitted),
         before,
-        tuple(findings or ()),
+        tuple(findings or ()) if mended.is_better else (),  # no cause that the windows held out contradict
         mended,
         extended,
         (*simulator.notes, *((_CUT,) if findings is None else ())),
