@@ -18,7 +18,7 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.twin.engine import Played, Touch
 from localization.twin.gazebo_file import GazeboRobot, wheel_centre
-from localization.twin.windows import LEAD_S, START_K, Window, down_at, lead_turn
+from localization.twin.windows import LEAD_S, Window, down_at, start_turn_rate
 from motion_models.se2 import FloatArray, between
 from motion_models.slope import GRAVITY
 
@@ -172,9 +172,9 @@ class _Run:
         sides = window.rates[np.minimum(np.searchsorted(np.cumsum(window.dt), times, side="right"), len(window.dt) - 1)]
         wheels = self._b.source.wheels
         commands = np.repeat(sides, [len(wheels.left), len(wheels.right)], axis=1) * wheels.signs
-        heading = float(self._planar()[2]) + lead_turn(window, float(self._b.radii.mean()), wheels.track_m)
-        self.world.setGravity(GRAVITY * down_at(window, heading))
-        self._set_off(window.rates[0])
+        turn = start_turn_rate(window, float(self._b.radii.mean()), wheels.track_m)
+        self.world.setGravity(GRAVITY * down_at(window, float(self._planar()[2]) + LEAD_S * turn))
+        self._set_off(window.rates[0], turn)
         first, touched = self._planar(), []
         for i in range(steps):
             if i == lead:
@@ -186,10 +186,9 @@ class _Run:
         self._check(steps)
         return np.asarray(between(first, self._planar())), np.array(touched), steps
 
-    def _set_off(self, rates: FloatArray) -> None:
-        """Start with the steady motion of the window's first rates."""
-        wheels, radius = self._b.source.wheels, float(self._b.radii.mean())
-        speed, turn = 0.5 * radius * float(rates.sum()), START_K * radius * float(rates[1] - rates[0]) / wheels.track_m
+    def _set_off(self, rates: FloatArray, turn: float) -> None:
+        """Start with the steady motion of the window's first rates, at this turn rate [rad/s]."""
+        wheels, speed = self._b.source.wheels, 0.5 * float(self._b.radii.mean()) * float(rates.sum())
         ahead, middle = wheels.forward, wheels.origin
         velocity = speed * ahead - turn * np.array([-middle[1], middle[0]])
         state = self._robot.getVelocities()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.twin.engine import Played
-from localization.twin.windows import Window
+from localization.twin.windows import Window, motion_of_point
 from motion_models import se2
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -120,8 +120,7 @@ def turns(windows: Sequence[Window], poses: FloatArray, robot: Robot) -> FloatAr
 
 def _row(kind: str, chosen: NDArray[np.bool_], windows: Sequence[Window], played: Played, robot: Robot, frame: FloatArray) -> Row:
     used = [w for w, is_chosen in zip(windows, chosen, strict=True) if is_chosen]
-    body_T_point = np.array([*frame, 0.0])
-    moved = se2.compose(se2.compose(se2.inverse(body_T_point), played.poses[chosen]), body_T_point)
+    moved = motion_of_point(played.poses[chosen], frame)
     measured = np.array([w.measured for w in used])
     known = np.isfinite(np.array([np.diagonal(w.cov) for w in used]))
     turn, true_turn = turns(used, moved, robot), turns(used, measured, robot)

@@ -19,7 +19,7 @@ from localization.errors import SimulationError
 from localization.twin.engine import Played
 from localization.twin.parameters import Hypotheses
 from localization.twin.simulator import Numbers, Simulator
-from localization.twin.windows import Window
+from localization.twin.windows import Window, motion_of_point
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -85,7 +85,7 @@ class Problem:
 
     def frame(self, x: FloatArray) -> FloatArray:
         """(2,) point of the body whose motion was measured [m]."""
-        return np.array([x[i] for i, p in enumerate(self.hypotheses.parameters) if p.area == "reference"])
+        return x[list(self.hypotheses.of_reference)]
 
     def scored(self, base: Numbers, x: FloatArray, residuals: FloatArray) -> Point:
         """A `Point` of these residuals under the present noise."""
@@ -206,8 +206,7 @@ class Problem:
 def residuals_of(windows: Sequence[Window], played: Played, frame: FloatArray) -> FloatArray:
     """(W, 6) motion of the point ``frame`` (2,) of the body relative to the measured one, rates less the measured ones, and air."""
     measured = np.array([w.measured for w in windows])
-    body_T_point = np.array([*frame, 0.0])
-    moved = se2.compose(se2.compose(se2.inverse(body_T_point), played.poses), body_T_point)
+    moved = motion_of_point(played.poses, frame)
     return np.column_stack([se2.between(measured, moved), played.rates - np.array([w.mean_rates for w in windows]), played.touch.airborne])
 
 
@@ -215,8 +214,7 @@ def residuals_moved(windows: Sequence[Window], residuals: FloatArray, old: Float
     """``residuals`` (W, 6) by the point ``old`` as they are by the point ``new`` of the body."""
     measured = np.array([w.measured for w in windows])
     moved = se2.compose(measured, residuals[:, :3])
-    old_T_new = np.array([*(new - old), 0.0])
-    moved = se2.compose(se2.compose(se2.inverse(old_T_new), moved), old_T_new)
+    moved = motion_of_point(moved, new - old)
     return np.column_stack([se2.between(measured, moved), residuals[:, 3:]])
 
 

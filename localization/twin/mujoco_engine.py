@@ -17,7 +17,7 @@ import numpy as np
 from localization.errors import SimulationError
 from localization.twin.engine import Played, Touch
 from localization.twin.wheels import Hinge, Wheels, find_wheels
-from localization.twin.windows import LEAD_S, START_K, Window, down_at, lead_turn
+from localization.twin.windows import LEAD_S, Window, down_at, start_turn_rate
 from localization.twin.xml_file import XmlFile
 from motion_models import se2
 from motion_models.calibration.maneuvers import IntArray
@@ -347,7 +347,8 @@ class MujocoEngine:
         if not window.downhill.any():
             return model
         tilted = copy.copy(model)
-        heading = float(self._planar(self._data.qpos[None])[0, 2]) + lead_turn(window, self.robot.radius_m, self.robot.wheels.track_m)
+        turned = LEAD_S * start_turn_rate(window, self.robot.radius_m, self.robot.wheels.track_m)
+        heading = float(self._planar(self._data.qpos[None])[0, 2]) + turned
         tilted.opt.gravity[:] = np.linalg.norm(model.opt.gravity) * down_at(window, heading)
         return tilted
 
@@ -356,7 +357,7 @@ class MujocoEngine:
         r, model, data = self.robot, self.robot.model, copy.copy(self._data)
         left, right = window.rates[0]
         speed = 0.5 * r.radius_m * (left + right)
-        turn = START_K * r.radius_m * (right - left) / r.wheels.track_m
+        turn = start_turn_rate(window, r.radius_m, r.wheels.track_m)
         at = int(model.jnt_dofadr[model.body_jntadr[r.base]])
         heading = self._planar(data.qpos[None])[0, 2]
         rotation = data.xmat[r.base].reshape(3, 3)

@@ -136,7 +136,7 @@ def pursue(problem: Problem, start: Point) -> Point:
     model about the file foresees.
     """
     h = problem.hypotheses
-    free = tuple(i for i, p in enumerate(h.parameters) if p.area == "reference")
+    free = h.of_reference
     chosen: tuple[int, ...] = ()
     at = problem.minimize(start, free, 2)
     while len(chosen) < _MOST_PURSUED and not problem.is_late:
@@ -165,8 +165,8 @@ class Linear:
         h = problem.hypotheses
         J = (problem.jacobian(at, range(len(h.parameters))) * h.sigmas).reshape(-1, len(h.parameters))
         y = J @ (at.x / h.sigmas) - problem.whitened(at.residuals).ravel()
-        free = tuple(i for i, p in enumerate(h.parameters) if p.area == "reference")
-        return cls(at, Selection(J.T @ J, J.T @ y, float(y @ y), h.priors / h.sigmas, free), problem.simulator.numbers)
+        selection = Selection(J.T @ J, J.T @ y, float(y @ y), h.priors / h.sigmas, h.of_reference)
+        return cls(at, selection, problem.simulator.numbers)
 
     def posterior(self, fit: Point, chosen: Sequence[int]) -> float:
         """Logarithm of the posterior of the set ``chosen`` by its own ``fit``, without constants [nats]."""

@@ -82,8 +82,6 @@ _REFERENCE = (
 GROUNDED: Mapping[str, float] = {"time_constant_s": 0.1, "softness": 0.9, "impratio": 10.0}
 """Contacts at which wheels that scrub stay on the ground: of a stock VaultBot all four touch in 84 to 94 % of the time steps (21 % by
 MuJoCo's defaults), and its k is .58 without a fit (.25; measured .61)."""
-
-
 _TWISTING = 4.0
 """condim from which on a contact has torsional friction."""
 
@@ -110,6 +108,11 @@ class Hypotheses:
     def index(self, field: str) -> int:
         """Index of the parameter of ``field``."""
         return next(i for i, p in enumerate(self.parameters) if p.field == field)
+
+    @property
+    def of_reference(self) -> tuple[int, ...]:
+        """Indices of the parameters of the measurement: never the simulator's fault."""
+        return tuple(i for i, p in enumerate(self.parameters) if p.area == "reference")
 
     @property
     def sigmas(self) -> FloatArray:

@@ -10,14 +10,14 @@ from functools import reduce
 import numpy as np
 
 from localization.twin.engine import Played
-from localization.twin.windows import Window
+from localization.twin.windows import Window, motion_of_point
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
 _GAP_S = 0.3
 """Time between two windows beyond which the drive has a gap: scans end a window up to this late."""
 _MOST, _FEWEST = 40, 5
-"""Windows that are played [80 s], and from which on a stretch says more than its windows."""
+"""Most windows that are played [80 s], and fewest that make a stretch."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ def longest_stretch(windows: Sequence[Window]) -> list[Window]:
 
 def end_of(name: str, windows: Sequence[Window], played: Played, frame: FloatArray) -> Stretch:
     """Where ``windows``, as ``played``, end; ``frame`` (2,) is the point of the body that was measured [m]."""
-    body_T_point = np.array([*frame, 0.0])
-    moved = se2.compose(se2.compose(se2.inverse(body_T_point), played.poses), body_T_point)
+    moved = motion_of_point(played.poses, frame)
     measured = np.array([w.measured for w in windows])
     off = se2.between(reduce(se2.compose, measured), reduce(se2.compose, moved))
     way = float(np.hypot(*measured[:, :2].T).sum())

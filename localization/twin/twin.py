@@ -24,9 +24,7 @@ from motion_models.friction.model import FrictionModel
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
-_CUT = "the time steps of --config.budget-steps were spent before wrong numbers could be told from others: none is named."
-
-
+_CUT = "the time steps of --config.budget-steps were spent before the search for wrong numbers ended: none is named."
 _FEWEST_WINDOWS, _CHANGES = 4, 10
 """Windows that are fitted at least, and times that a search changes each number: 8 to 12 in MuJoCo."""
 
@@ -237,8 +235,7 @@ def _engine(simulator: Simulator, numbers: Numbers) -> Engine:
 
 def _frame_alone(problem: fit.Problem, start: fit.Point) -> FloatArray:
     """The point that was measured, by the file's own numbers: errors of the reference's frame are no errors of the simulator."""
-    columns = [i for i, p in enumerate(problem.hypotheses.parameters) if p.area == "reference"]
-    return problem.frame(problem.minimize(start, columns, 3).x)
+    return problem.frame(problem.minimize(start, problem.hypotheses.of_reference, 3).x)
 
 
 def _occam(problem: fit.Problem, whole: fit.Point, sparse: fit.Point) -> float:

@@ -18,7 +18,7 @@ LEAD_S = 0.6
 STEADY_S = 2.0
 """Time that is played of a window of constant rates, whose measured twist is constant as well [s]."""
 _LONGEST_S = 20.0
-START_K = 0.55
+_START_K = 0.55
 """Turn over that of ideal wheels from which a window's lead starts: between the published Huskies' .43 and .67."""
 
 
@@ -125,10 +125,16 @@ def _slip(m: Maneuver, robot: Robot, duration: float, angles: FloatArray) -> Flo
     return np.diag([along, across, yaw])
 
 
-def lead_turn(window: Window, radius_m: float, track_m: float) -> float:
-    """By how much a robot of these wheels turns in the lead of ``window`` [rad]."""
+def motion_of_point(poses: FloatArray, point: FloatArray) -> FloatArray:
+    """(..., 3) motion of the frame at ``point`` (2,) of a body that moved by ``poses`` (..., 3)."""
+    body_T_point = np.array([*point, 0.0])
+    return se2.compose(se2.compose(se2.inverse(body_T_point), poses), body_T_point)
+
+
+def start_turn_rate(window: Window, radius_m: float, track_m: float) -> float:
+    """Turn rate with which a robot of these wheels starts ``window`` [rad/s]."""
     left, right = window.rates[0]
-    return START_K * radius_m * float(right - left) / track_m * LEAD_S
+    return _START_K * radius_m * float(right - left) / track_m
 
 
 def down_at(window: Window, heading: float) -> FloatArray:

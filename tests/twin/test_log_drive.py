@@ -96,7 +96,7 @@ def test_commands_that_are_missing_are_named_or_silent(tmp_path: Path) -> None:
 
 
 def test_weak_servo_shows_where_commands_are_played_and_not_by_measured_rates() -> None:
-    """Of set points of 2 rad/s a servo lacks torque over gain: three times as much with a third of the gain."""
+    """The error of a servo at 2 rad/s is its torque over its gain: three times as large with a third of the gain."""
     robot = load_robot("husky_a200")
     file = read_simulator(mjcf_of(robot), robot)
     weak = file.compiled(replace(file.numbers, servo_gain=file.numbers.servo_gain / 3.0))
