@@ -97,6 +97,11 @@ class Driver:
     """Fastest speed that the robot drives [m/s], as its controller's linear.x.max_velocity: rates of the wheels that are 1.5 times as fast
     have another unit."""
 
+    @property
+    def half_track_m(self) -> float:
+        """Speed of the right side over the turn rate, by the driver, where the robot turns in place [m]."""
+        return 0.5 * self.wheel_separation_multiplier * self.track_width_m
+
 
 @dataclass(frozen=True)
 class Topics:

@@ -203,7 +203,7 @@ def _turning(about: TurningInPlace) -> dict[str, list[float]]:
 def rotation_errors(model: MotionModel, params: FloatArray, table: RotationTable, robot: Robot) -> FloatArray:
     """(3,) RMS errors of rotation ratio [-], x_CR and y_CR [m] of a model over a table of rotations."""
     driver = robot.driver
-    half = driver.wheel_separation_multiplier * driver.track_width_m * COMMANDED_RAD_PER_S / (2.0 * driver.wheel_radius_m)
+    half = driver.half_track_m * COMMANDED_RAD_PER_S / driver.wheel_radius_m
     vx, vy, wz = np.moveaxis(model.twist(np.array([-half, half]), table.cg, params).value, -1, 0)
     predicted = np.stack([wz / COMMANDED_RAD_PER_S, -vy / wz, vx / wz], axis=-1)
     return np.asarray(np.sqrt(np.mean((predicted - np.column_stack([table.ratio, table.cor])) ** 2, axis=0)))

@@ -553,7 +553,7 @@ class OdometryToWheels:
         """``is_whole``: messages have a pose and a twist by their type; where they do not, its absence is not counted."""
         self._is_whole = is_whole
         self._radius = driver.wheel_radius_m
-        self._half_track = 0.5 * driver.wheel_separation_multiplier * driver.track_width_m
+        self._half_track = driver.half_track_m
         self._topic, self._stats = topic, stats
         self._previous: OdometryReading | None = None
         self._angle = np.zeros(2)
@@ -607,7 +607,14 @@ class OdometryToWheels:
         yield WheelSample(reading.stamp_ns, rate, self._angle)
 
     def _wheels(self, forward: float, turn: float) -> FloatArray:
-        return np.array([forward - turn * self._half_track, forward + turn * self._half_track]) / self._radius
+        return driven_wheels(np.array([forward, turn]), self._half_track, self._radius)
+
+
+def driven_wheels(motion: FloatArray, half_track_m: float, wheel_radius_m: float) -> FloatArray:
+    """(..., 2) left and right wheel by a driver that moves the robot ahead and turns it by ``motion`` (..., 2): rates of its speeds, angles
+    of its ways. The inverse of Ebersole 2016, eq. 1.4-1.8."""
+    forward, turn = motion[..., 0], motion[..., 1]
+    return np.stack([forward - turn * half_track_m, forward + turn * half_track_m], axis=-1) / wheel_radius_m
 
 
 def arc(world_T_a: FloatArray, world_T_b: FloatArray) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from localization.log_replay import replay
 from localization.logs.commands import command_topics, read_commands
+from localization.logs.event_decoder import driven_wheels
 from localization.logs.reader import Log
 from localization.pipeline import Trial
 from localization.trajectory import IntArray
@@ -16,7 +17,6 @@ from localization.twin.fit import RATE_SIGMA
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.errors import CalibrationError
 from motion_models.registry import make_model
-from motion_models.robot import Driver
 from motion_models.se2 import FloatArray
 from motion_models.slope import Slope
 
@@ -49,7 +49,8 @@ def with_commands(maneuvers: Sequence[Maneuver], spans_ns: IntArray, log: Log, t
 def _commanded(maneuvers: Sequence[Maneuver], spans_ns: IntArray, log: Log, topic: str) -> tuple[list[Maneuver], str]:
     """With the commands of one ``topic``."""
     stamps, twists = read_commands(log, topic)
-    set_points = wheel_set_points(twists, log.robot.driver)
+    driver = log.robot.driver
+    set_points = driven_wheels(twists[:, [0, 2]], driver.half_track_m, driver.wheel_radius_m)
     tried = [_constant(m, span, stamps, set_points) for m, span in zip(maneuvers, spans_ns, strict=True)]
     constant = {i: command for i, command in enumerate(tried) if command is not None}
     if len(constant) < _FEWEST:
@@ -63,12 +64,6 @@ def _commanded(maneuvers: Sequence[Maneuver], spans_ns: IntArray, log: Log, topi
     for i, command in constant.items():
         changed[i] = replace(maneuvers[i], commands=np.tile(command, (len(maneuvers[i].dt), 1)))
     return changed, f"commands of {topic} are played in {len(constant)} windows in which they are constant: servos are judged there."
-
-
-def wheel_set_points(twists: FloatArray, driver: Driver) -> FloatArray:
-    """(n, 2) rates of the left and right wheels that a ``driver`` makes of commands vx, vy, wz (n, 3) [rad/s]."""
-    half = 0.5 * driver.wheel_separation_multiplier * driver.track_width_m * twists[:, 2]
-    return np.column_stack([twists[:, 0] - half, twists[:, 0] + half]) / driver.wheel_radius_m
 
 
 def _constant(m: Maneuver, span_ns: IntArray, stamps: IntArray, set_points: FloatArray) -> FloatArray | None:

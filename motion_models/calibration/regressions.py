@@ -282,7 +282,7 @@ def rotations_as_maneuvers(
     Rows of one x_G are one group.
     """
     driver = robot.driver
-    half = driver.wheel_separation_multiplier * driver.track_width_m * rate / (2.0 * driver.wheel_radius_m)
+    half = driver.half_track_m * rate / driver.wheel_radius_m
     maneuvers = []
     for cg, ratio, cor in zip(table.cg, table.ratio, table.cor, strict=True):
         turned = ratio * rate * seconds

@@ -13,7 +13,8 @@ pytest.importorskip("mujoco", reason="needs the extra 'twin'")
 
 from localization.cli import main
 from localization.logs import Log, open_log
-from localization.twin.log_drive import wheel_set_points, with_commands, with_slopes
+from localization.logs.event_decoder import driven_wheels
+from localization.twin.log_drive import with_commands, with_slopes
 from localization.twin.mujoco_simulator import read_simulator
 from localization.twin.robot_mjcf import mjcf_of
 from localization.twin.stretch import end_of, longest_stretch
@@ -37,7 +38,7 @@ TURN = 1.2
 
 def set_points() -> FloatArray:
     """(2,) what the driver makes of the command."""
-    return wheel_set_points(np.array([[0.3, 0.0, TURN]]), ROBOT.driver)[0]
+    return driven_wheels(np.array([0.3, TURN]), ROBOT.driver.half_track_m, ROBOT.driver.wheel_radius_m)
 
 
 def drive(share: float, straight: float = 1.0) -> tuple[list[Maneuver], np.ndarray]:
