@@ -37,14 +37,18 @@ class MujocoSimulation(Simulation):
         name = simulator.file.path.name
         if experiment.has_hills or self.world.patches.size:
             raise SimulationError(f"experiment {experiment.name} needs a ground that '{name}' does not have. Use --engine skidloc.")
-        if not _same_but_slope(self.reality.body, Body.from_robot(robot)) or self.reality.payload_kg > 0.0:
-            raise SimulationError(
-                f"the robot is that of '{name}': leave out effects of its body ({', '.join(effects or {})}), or change that file."
-            )
+        self._check_body(name, effects or {})
         self._drive_in_mujoco = MujocoDrive(simulator.engine, np.array(experiment.start), self.reality.body.slope)
         self._substeps = round(self.config.vehicle.step_s / simulator.numbers.time_step_s)
         self._set_points, self._commands = np.zeros(2), np.zeros(2)
         self._heading = float(experiment.start[2])
+
+    def _check_body(self, name: str, effects: Mapping[str, float]) -> None:
+        """Raise `SimulationError` where ``effects`` change the robot's body, which is that of the file ``name``."""
+        if not _same_but_slope(self.reality.body, Body.from_robot(self.robot)) or self.reality.payload_kg > 0.0:
+            raise SimulationError(
+                f"the robot is that of '{name}': leave out effects of its body ({', '.join(effects)}), or change that file."
+            )
 
     def _move(self, times: FloatArray, wheels: FloatArray) -> FloatArray:
         config, rows = self.config.vehicle, np.empty((len(wheels), COLUMNS))

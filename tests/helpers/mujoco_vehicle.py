@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from localization.errors import SimulationError
 from localization.simulation.experiments import Experiment
-from localization.simulation.injected_faults import TrueRobot
-from localization.simulation.simulator import Simulation, SimulationConfig
-from localization.simulation.vehicle import ANGLES, CG, COLUMNS, POSE, RATES, TWIST
-from motion_models.robot import Robot
+from localization.simulation.injected_faults import TrueRobot, apply_faults
+from localization.simulation.simulator import SimulationConfig
+from localization.simulation.vehicle import CG, Body
+from localization.twin import simulated_drive as twin
+from localization.twin.mujoco_engine import MujocoDrive, MujocoEngine
+from localization.twin.mujoco_simulator import read_simulator
+from localization.twin.xml_file import parse
+from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
 _STEP_S = 0.00125
@@ -56,8 +61,8 @@ EFFECTS = _PHYSICAL | _OF_SENSORS
 """Ids of the faults that can be hidden in it."""
 
 
-class MujocoSimulation(Simulation):
-    """`Simulation` of a robot without arms that MuJoCo moves."""
+class MujocoSimulation(twin.MujocoSimulation):
+    """`Simulation` of a robot without arms that MuJoCo moves, by a file of the robot as it truly is."""
 
     friction_time_s = FRICTION_TIME_S
 
@@ -67,67 +72,56 @@ class MujocoSimulation(Simulation):
         unknown = sorted(set(effects) - EFFECTS)
         if unknown or robot.arms is not None:
             raise SimulationError(f"MuJoCo's vehicle has no {', '.join(unknown) or 'arms'}.")
-        super().__init__(experiment, robot, seed, effects, config)
-        self._model = mujoco.MjModel.from_xml_string(_xml(self.reality, robot, self.friction_time_s))
-        self._data = mujoco.MjData(self._model)
-        x, y, yaw = experiment.start
-        self._data.qpos[:7] = (x, y, self._data.qpos[2], math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
-        self._heading = yaw
-        self._set_points = np.zeros(2)
-        self._hinges = [self._model.joint(name).id for name, _, _ in _WHEELS]
-        self._angles_at = [self._model.jnt_qposadr[j] for j in self._hinges]
-        self._rates_at = [self._model.jnt_dofadr[j] for j in self._hinges]
-        self._geoms = [self._model.geom(name).id for name, _, _ in _WHEELS]
-        self._bodies = [self._model.body(name).id for name, _, _ in _WHEELS]
+        true = apply_faults(TrueRobot(Body.from_robot(robot), Mount()), effects)
+        text = _xml(true, robot, self.friction_time_s)
+        file = read_simulator(parse({"vehicle.xml": text.encode()}, Path("vehicle.xml")), robot)
+        super().__init__(experiment, robot, seed, file, effects, config)
+        self._drive_in_mujoco = _ResistedDrive(file.engine, np.array(experiment.start), self)
+
+    def _check_body(self, name: str, effects: Mapping[str, float]) -> None:
+        """The file has the body with its effects."""
 
     def _move(self, times: FloatArray, wheels: FloatArray) -> FloatArray:
-        config, rows = self.config.vehicle, np.empty((len(wheels), COLUMNS))
-        substeps = round(config.step_s / _STEP_S)
-        radii = np.array([self._body.radius_left, self._body.radius_right] * 2) * (1.0 + FLATTENING)
-        self._model.geom_size[self._geoms, 0] = self._model.geom_size[self._geoms, 2] = radii
-        self._model.geom_rbound[self._geoms] = radii  # else a wheel that has grown loses its contact
-        ramp = config.acceleration_m_s2 / float(radii.mean()) * config.step_s
-        for row, target in zip(rows, wheels, strict=True):
-            self._set_points += np.clip(target - self._set_points, -ramp, ramp)
-            keep = math.exp(-config.step_s / config.motor_lag_s)
-            self._data.ctrl[:] = keep * self._data.ctrl + (1.0 - keep) * np.tile(self._set_points, 2)
-            self._oppose_motion()
-            for _ in range(substeps):
-                mujoco.mj_step(self._model, self._data)
-            self._record(row)
-        self._state.numbers[:3] = rows[-1, POSE]
-        self._state.steps += len(rows)
+        rows = super()._move(times, wheels)
+        rows[:, CG] += self._body.cg_offset
         return rows
 
-    def _oppose_motion(self) -> None:
+
+class _ResistedDrive(MujocoDrive):
+    """`MujocoDrive` whose wheels have the radii, rolling resistance and scrub of a simulation's body."""
+
+    def __init__(self, engine: MujocoEngine, start: FloatArray, simulation: MujocoSimulation) -> None:
+        super().__init__(engine, start, simulation.reality.body.slope)
+        self._simulation = simulation
+        self._geoms = [geom for of_wheel in self._robot.geoms for geom in of_wheel]
+        self._bodies = [int(self._model.geom_bodyid[geom]) for geom in self._geoms]
+
+    def advance(self, rates: FloatArray, steps: int, cg: FloatArray) -> None:
+        body = self._simulation._body  # changes from phase to phase
+        sides = [body.radius_left, body.radius_right]
+        radii = np.repeat(sides, [len(self._robot.wheels.left), len(self._robot.wheels.right)]) * (1.0 + FLATTENING)
+        self._model.geom_size[self._geoms, 0] = self._model.geom_size[self._geoms, 2] = radii
+        self._model.geom_rbound[self._geoms] = radii  # else a wheel that has grown loses its contact
+        self._oppose_motion(body)
+        super().advance(rates, steps, self._cg)  # the file has the load
+
+    def _oppose_motion(self, body: Body) -> None:
         """Rolling resistance, a force f_r N along the wheel's rolling direction (Ebersole 2016, 3.17), and scrub, a moment of each contact.
 
         MuJoCo's own twisting friction is not used: a contact that slides twists with 7 to 20 % of the moment that its cone allows.
         """
-        share, data = self._body.param("rolling_resistance"), self._data
-        loads, force = np.zeros(4), np.zeros(6)
+        share, data = body.param("rolling_resistance"), self._data
+        loads, force = np.zeros(len(self._geoms)), np.zeros(6)
         for i in range(data.ncon):
             mujoco.mj_contactForce(self._model, data, i, force)
             for geom in data.contact[i].geom:
                 if geom in self._geoms:
                     loads[self._geoms.index(geom)] += force[0]
-        speeds = data.qvel[self._rates_at] * self._model.geom_size[self._geoms, 0]
-        ahead = np.array([math.cos(self._heading), math.sin(self._heading)])
+        speeds = data.qvel[self._rates] * self._model.geom_size[self._geoms, 0]
+        heading = float(self.pose()[2])
+        ahead = np.array([math.cos(heading), math.sin(heading)])
         data.xfrc_applied[self._bodies, :2] = -(share * loads * np.tanh(speeds / 0.02))[:, None] * ahead
-        data.xfrc_applied[self._bodies, 5] = -self._body.param("mu") * self._body.param("scrub") * loads * math.tanh(data.qvel[5] / 0.02)
-
-    def _record(self, row: FloatArray) -> None:
-        data = self._data
-        w, _, _, z = data.qpos[3:7]
-        turned = 2.0 * math.atan2(z, w) - self._heading
-        self._heading += math.remainder(turned, 2.0 * math.pi)
-        c, s = math.cos(self._heading), math.sin(self._heading)
-        vx, vy = data.qvel[:2]
-        rates, angles = data.qvel[self._rates_at], data.qpos[self._angles_at]
-        row[POSE] = (*data.qpos[:2], self._heading)
-        row[TWIST] = (c * vx + s * vy, -s * vx + c * vy, data.qvel[5])
-        row[RATES], row[ANGLES] = (rates[:2] + rates[2:]) / 2.0, (angles[:2] + angles[2:]) / 2.0
-        row[CG], row[-1] = self._masses.cg(np.zeros(1))[0, :2] + np.array(self._body.cg_offset), 1.0
+        data.xfrc_applied[self._bodies, 5] = -body.param("mu") * body.param("scrub") * loads * math.tanh(data.qvel[5] / 0.02)
 
 
 class CreepingMujocoSimulation(MujocoSimulation):
@@ -161,10 +155,9 @@ def _xml(true: TrueRobot, robot: Robot, friction_time_s: float) -> str:
         servos.append(f'<velocity joint="{name}" kv="{SERVO_GAIN * mass * 9.81 * radius}"/>')
     edge = f"{0.5 * g.wheelbase_m} 0 {height}"
     load = f'<body pos="{edge}"><inertial pos="0 0 0" mass="{true.payload_kg}" diaginertia="1e-3 1e-3 1e-3"/></body>'
-    gravity = f"{-9.81 * math.sin(body.slope)} 0 {-9.81 * math.cos(body.slope)}"
     return f"""
 <mujoco>
- <option timestep="{_STEP_S}" integrator="Euler" {CONE} gravity="{gravity}"/>
+ <option timestep="{_STEP_S}" integrator="Euler" {CONE}/>
  <worldbody>
   <geom name="floor" type="plane" size="100 100 1" contype="0"/>
   <body name="base" pos="0 0 {radius}">
