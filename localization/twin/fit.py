@@ -24,7 +24,8 @@ from motion_models import se2
 from motion_models.se2 import FloatArray
 
 SECANT = 0.7
-"""Least length of a secant over the prior's sigma. At 0.15 the chaos of a Husky's contacts is 5 times the effect of its radius."""
+"""Least length of a secant over the prior's sigma. At 0.15 the chaos of a Husky's contacts is 5 times the effect of its radius. A secant
+reaches to the prior's centre where that is farther: chaos along a shorter one, extrapolated, would weigh against that value."""
 RATE_SIGMA = (0.02, 0.02)
 """Sigma of a wheel's mean rate in a window: absolute [rad/s], the smallest step of encoders and servos, and relative, that of a servo."""
 AIRBORNE_SIGMA = 0.1
@@ -36,6 +37,8 @@ _SMALL = 0.3
 """Change over the prior's sigma that is small."""
 _STARTS = 2
 _MAX_LEVERAGE, _NOISE_PASSES = 0.9, 3
+_CHAOS = 0.01
+"""Change of a number over its prior's sigma that an engine shows by its chaos alone."""
 _CONVERGED = 1.0
 """Gain of an iteration [nats] below which the search ends."""
 NOISE_BOUNDS = (0.01, 10.0)
@@ -92,6 +95,10 @@ class Problem:
         z = (x - self.hypotheses.priors) / self.hypotheses.sigmas
         return Point(x, base, residuals, 0.5 * float((self.whitened(residuals) ** 2).sum() + (z**2).sum()))
 
+    def misfit(self, at: Point) -> float:
+        """Negative logarithm of the likelihood of these windows, without constants [nats]."""
+        return 0.5 * float((self.whitened(at.residuals) ** 2).sum())
+
     def whitened(self, residuals: FloatArray) -> FloatArray:
         """Residuals (..., W, 6) over their sigmas; 0 where nothing was measured."""
         return np.asarray(residuals / self.sigmas())
@@ -104,12 +111,14 @@ class Problem:
         """The point under the present noise."""
         return self.scored(at.base, at.x, at.residuals)
 
-    def likelihood(self, at: Point) -> float:
-        """Logarithm of the probability of these windows by a point that was fitted to others, without constants [nats]."""
-        if not self.windows:
-            return 0.0
-        found = self.point(at.base, at.x)
-        return -np.inf if found is None else -0.5 * float((self.whitened(found.residuals) ** 2).sum())
+    def misfits(self, at: Point, count: int) -> FloatArray:
+        """(count,) misfits of these windows by a point whose numbers are changed by too little for anything but chaos; 0 without any."""
+        rng, found = np.random.default_rng(0), np.zeros(count)
+        for i in range(count if self.windows else 0):
+            x = at.x + _CHAOS * self.hypotheses.sigmas * rng.normal(size=len(at.x))
+            tried = self.point(at.base, np.clip(x, *self.hypotheses.bounds(at.base)))
+            found[i] = np.inf if tried is None else self.misfit(tried)
+        return found
 
     def explains(self, at: Point) -> bool:
         """Whether what is left ``at`` a point is within its noise in each component of the motion, and wheels keep to the ground."""
@@ -127,8 +136,8 @@ class Problem:
         J = np.zeros((*at.residuals.shape, len(columns)))
         low, high = self.hypotheses.bounds(at.base)
         for c, i in enumerate(columns):
-            step = SECANT * self.hypotheses.sigmas[i]
-            step = -step if at.x[i] + step > high[i] else step
+            step, toward = SECANT * self.hypotheses.sigmas[i], self.hypotheses.priors[i] - at.x[i]
+            step = toward if abs(toward) > step else -step if at.x[i] + step > high[i] else step
             x = at.x.copy()
             x[i] += step
             if self.hypotheses.parameters[i].area == "reference":

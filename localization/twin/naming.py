@@ -28,6 +28,9 @@ SEPARATED_NATS = math.log(20.0)
 _ITERATIONS = 6
 _MOST_PURSUED, _TRIED, _TRIED_ITERATIONS = 3, 3, 3
 """Numbers that are added one after another, how many are tried for each by their own fits, and the iterations of these."""
+_REPLICATES, _SCATTERS = 6, 2.0
+"""How often an engine that may be chaotic plays each of two fits whose odds are compared, and how many standard errors of their difference
+these must exceed."""
 CONTACTS = "contacts"
 _HOP = "contacts at which the wheels hop, time that a wheel is on the ground"
 _HOPS = 0.1
@@ -185,8 +188,9 @@ def name_causes(problem: Problem, start: Point, tried: Sequence[Point], other: P
     """
     sets = [_sparse(problem, at) for at in tried]
     about, chosen, sparse = max(sets, key=lambda of: of[0].posterior(of[2], of[1]))
-    chosen, sparse = _without_needless(problem, about, chosen, sparse, other)
-    findings = [_finding(problem, about.selection, chosen, i, about.at.base) for i in chosen]
+    chosen, sparse, scatter = _without_needless(problem, about, chosen, sparse, other)
+    margin = SEPARATED_NATS + _SCATTERS * scatter
+    findings = [_finding(problem, about.selection, chosen, i, about.at.base, margin) for i in chosen]
     findings += [Finding(c, ()) for s in problem.hypotheses.switches if (c := _switched(problem, start, sparse, s)) is not None]
     findings += [Finding(c, ()) for c in (_coarse_step(problem, sparse),) if c is not None]
     findings = _together(findings, start, about.at)
@@ -207,34 +211,44 @@ def _sparse(problem: Problem, at: Point) -> tuple[Linear, tuple[int, ...], Point
 
 def _without_needless(
     problem: Problem, about: Linear, chosen: tuple[int, ...], fit: Point, other: Problem
-) -> tuple[tuple[int, ...], Point]:
-    """The set without each number whose odds, by a fit of the others, are less than 20 to 1, weakest first."""
+) -> tuple[tuple[int, ...], Point, float]:
+    """The set without each number whose odds, by a fit of the others, are less than 20 to 1 beyond the engine's scatter; its fit; and that
+    scatter [nats]."""
 
-    def posterior(of: Point, numbers: Sequence[int]) -> float:
-        return about.posterior(of, numbers) + other.likelihood(of)
+    def posteriors(of: Point, numbers: Sequence[int]) -> FloatArray:
+        played = problem.misfits(of, _REPLICATES) + other.misfits(of, _REPLICATES)
+        return about.posterior(of, numbers) + problem.misfit(of) - played
 
-    while chosen:
-        tried = []
-        for i in chosen:
-            rest = tuple(j for j in chosen if j != i)
-            first = problem.point(fit.base, np.where(np.arange(len(fit.x)) == i, 0.0, fit.x))
-            if first is not None:
-                without = problem.minimize(first, [*about.selection.free, *rest], _TRIED_ITERATIONS)
-                tried.append((posterior(without, rest), rest, without))
-        best = max(tried, key=lambda of: of[0], default=None)
-        if best is None or best[0] < posterior(fit, chosen) - SEPARATED_NATS:
-            break
-        _, chosen, fit = best
-    return chosen, fit
+    whole, is_smaller = posteriors(fit, chosen), True
+    while is_smaller:
+        is_smaller = False
+        for rest, without in _left_out(problem, about, chosen, fit):
+            of_rest = posteriors(without, rest)
+            scatter = math.sqrt(float(whole.var(ddof=1) + of_rest.var(ddof=1)) / _REPLICATES)
+            if float(whole.mean() - of_rest.mean()) - _SCATTERS * scatter < SEPARATED_NATS:
+                chosen, fit, whole, is_smaller = rest, without, of_rest, True
+                break
+    return chosen, fit, float(whole.std(ddof=1))
 
 
-def _finding(problem: Problem, selection: Selection, chosen: Sequence[int], index: int, file: Numbers) -> Finding:
-    """The number ``index`` of those that are ``chosen``, with those that may take its place."""
+def _left_out(problem: Problem, about: Linear, chosen: tuple[int, ...], fit: Point) -> list[tuple[tuple[int, ...], Point]]:
+    """Fits of the ``chosen`` numbers without one of them, that of the weakest first."""
+    found = []
+    for i in chosen:
+        rest = tuple(j for j in chosen if j != i)
+        first = problem.point(fit.base, np.where(np.arange(len(fit.x)) == i, 0.0, fit.x))
+        if first is not None:
+            found.append((rest, problem.minimize(first, [*about.selection.free, *rest], _TRIED_ITERATIONS)))
+    return sorted(found, key=lambda of: -about.posterior(of[1], of[0]))
+
+
+def _finding(problem: Problem, selection: Selection, chosen: Sequence[int], index: int, file: Numbers, margin: float) -> Finding:
+    """The number ``index`` of those that are ``chosen``, with those that may take its place within a ``margin`` of evidence [nats]."""
     rest = tuple(i for i in chosen if i != index)
     alone, whole = selection.evidence(rest), selection.evidence(chosen)
     rivals = []
     for j in range(len(selection.priors)):
-        if j not in selection.free and j not in chosen and (other := selection.evidence((*rest, j))) > whole - SEPARATED_NATS:
+        if j not in selection.free and j not in chosen and (other := selection.evidence((*rest, j))) > whole - margin:
             rivals.append(_candidate(problem, selection, (*rest, j), j, file, other - alone))
     best = _candidate(problem, selection, chosen, index, file, whole - alone)
     return Finding(best, tuple(sorted(rivals, key=lambda c: -c.evidence)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from localization.twin.mujoco_simulator import MujocoSimulator, read_simulator
 from localization.twin.robot_mjcf import mjcf_of
-from localization.twin.simulator import Numbers
+from localization.twin.simulator import Numbers, Simulator
 from localization.twin.windows import windows_of
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver
@@ -28,7 +28,7 @@ def true_simulator(robot: Robot, **numbers: float) -> MujocoSimulator:
     return read_simulator(stock.with_numbers(true), robot)
 
 
-def drive(true: MujocoSimulator, robot: Robot, seed: int, count: int = 48) -> list[Maneuver]:
+def drive(true: Simulator, robot: Robot, seed: int, count: int = 48) -> list[Maneuver]:
     """Windows of two seconds with ramps: turns in place, arcs and straight ways to both sides at several speeds, with noise."""
     rng = np.random.default_rng(seed)
     maneuvers = []
