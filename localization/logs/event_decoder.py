@@ -57,12 +57,14 @@ _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its readin
 
 _ARE_TWO, _IS_ONE, _CERTAIN = math.log(1e-6), math.log(0.5), math.log(100.0)
 """Logarithms: prior odds that two publishers share a topic; price of labelling a reading; odds from where on one is left out."""
-_ENCODER_STEPS = 3.0
-"""Scale of the changes over the smallest one that was seen: speeds by encoders are multiples of one step per message."""
+_WILD = math.log(1000.0)
+"""Logarithm of the odds that a reading of a single publisher is not wild: the most that one reading says for two [nats]."""
 _RESOLUTION = 1e-3
 """Least scale of changes: less is rounding [m, m/s, rad/s]."""
-_FORGET = 0.05
-"""Share by which the mean size of changes is renewed by each reading."""
+_FORGET = 0.1
+"""Step of the logarithm of a scale by each reading."""
+_FOLLOW = 0.3
+"""Share of a new reading in the mean of readings, which follows a speed that changes within a second."""
 _MORE = 1.2
 """Travelled by a second publisher over that of the one in use, from where on the second is used: equal ones do not take turns."""
 _FROZEN_AFTER_RAD = 0.5
@@ -265,9 +267,10 @@ class _Publisher:
 class PublisherSeparator:
     """Separates two publishers that share a topic, of velocities and poses, by the evidence for two.
 
-    Each goes on from its own last reading, so that its changes are smaller than those from reading to reading, by more than it costs to
-    label each. Changes have Cauchy densities with the scale of their mean size. Speeds of coarse encoders, which jump by one step and
-    back, are no second publisher's. The one whose wheels travel more is used, of equal ones one.
+    Each of two goes on from its own last reading; a single one goes on from the last reading or, where readings are noise about a speed,
+    from their mean. The odds of two grow by the density of a reading by two, less the price of a label, over that by one, which has
+    either's scales: of one publisher the scales are as free as of two. Densities are Cauchy's, with scales by maximum likelihood. The
+    publisher whose wheels travel more is used, of equal ones one.
     """
 
     def __init__(self) -> None:
@@ -277,14 +280,17 @@ class PublisherSeparator:
         self._log_odds = _ARE_TWO
         self._largest = 0.0  # cost of the jump that made the other one
         self._sizes: list[float] = []
-        self._steps: list[float] = []
+        self._mean: list[float] = []
+        self._sizes_of_one: tuple[list[float], list[float]] = [], []
+        """Scales of changes since the last reading, and from the mean."""
 
     def admit(self, stamp_ns: int, values: Sequence[float], speed: float) -> bool:
-        """Whether a reading of ``values`` (velocities, pose; NaN where absent) at ``speed`` [m/s] is to be used."""
+        """Whether a reading of ``values`` (velocities, place; NaN where absent) at ``speed`` [m/s] is to be used."""
         current = self._current
         if current is None:
             self._current = _Publisher(stamp_ns, list(values))
-            self._sizes, self._steps = [0.0] * len(values), [math.inf] * len(values)
+            self._sizes = [0.0] * len(values)
+            self._mean, self._sizes_of_one = list(values), ([0.0] * len(values), [0.0] * len(values))
             return True
         if self._other is not None and stamp_ns - self._other.stamp_ns > _MAX_PUBLISHER_GAP_NS:
             self._other, self._log_odds, self._largest = None, _ARE_TWO, 0.0
@@ -301,12 +307,14 @@ class PublisherSeparator:
 
     def _chosen(self, current: _Publisher, stamp_ns: int, values: Sequence[float]) -> _Publisher:
         """The publisher of a reading; the one before, where it is another, is the other one."""
-        changes, other = self._changes(values, current), self._other
-        back = changes if other is None else self._changes(values, other)
-        cost = self._cost(changes)
+        changes, other = _changes(values, current.values), self._other
+        back = changes if other is None else _changes(values, other.values)
+        cost, of_one = self._cost(changes), self._cost_of_one(values, changes)
         if other is not None:
             cost_of_other = self._cost(back)
-            self._log_odds = min(max(self._log_odds + cost - min(cost, cost_of_other) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
+            of_scales = _log_scales(changes, _scales(self._sizes))
+            gained = min(of_one, cost + of_scales) - min(cost, cost_of_other) - of_scales
+            self._log_odds = min(max(self._log_odds + min(_WILD, gained) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
             if cost_of_other < cost:
                 self._learn(back)
                 self._other = current
@@ -319,22 +327,64 @@ class PublisherSeparator:
             self._learn(changes)
         return current
 
-    def _changes(self, values: Sequence[float], publisher: _Publisher) -> list[float]:
-        """Sizes of the changes since the last reading of a ``publisher``; the smallest are kept."""
-        found = [abs(a - b) for a, b in zip(values, publisher.values, strict=True)]
-        self._steps = [min(step, change) if change > _RESOLUTION else step for step, change in zip(self._steps, found, strict=True)]
-        return found
-
     def _cost(self, changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``changes``, up to a constant; 0 where nothing is known."""
-        scales = [max(size, _ENCODER_STEPS * step, _RESOLUTION) for size, step in zip(self._sizes, self._steps, strict=True)]
-        known = [(change, scale) for change, scale in zip(changes, scales, strict=True) if change == change and scale < math.inf]
-        return sum(2.0 * math.log(math.hypot(1.0, change / scale)) for change, scale in known)
+        return _cauchy(changes, _scales(self._sizes))
+
+    def _cost_of_one(self, values: Sequence[float], changes: Sequence[float]) -> float:
+        """Minus the logarithm of the density of ``values`` by a single publisher, of whose two predictions the better one so far counts."""
+        off = _changes(values, self._mean)
+        last, mean = self._sizes_of_one
+        pairs = zip(last, changes, mean, off, strict=True)
+        found = [(size, change) if size <= other else (other, from_mean) for size, change, other, from_mean in pairs]
+        scales = _scales([size for size, _ in found])
+        self._sizes_of_one = _fitted(last, changes), _fitted(mean, off)
+        self._mean = [
+            m if not math.isfinite(v) else v if math.isnan(m) else m + _FOLLOW * (v - m) for m, v in zip(self._mean, values, strict=True)
+        ]
+        of_one = [change for _, change in found]
+        return _cauchy(of_one, scales) + _log_scales(of_one, scales)
 
     def _learn(self, changes: Sequence[float]) -> None:
-        self._sizes = [
-            size + _FORGET * (change - size) if change == change else size for size, change in zip(self._sizes, changes, strict=True)
-        ]
+        self._sizes = _fitted(self._sizes, changes)
+
+
+def _changes(values: Sequence[float], before: Sequence[float]) -> list[float]:
+    """Sizes of the changes of ``values`` from those ``before``; NaN where they are not known."""
+    changes = [abs(a - b) for a, b in zip(values, before, strict=True)]
+    return [change if change < math.inf else math.nan for change in changes]
+
+
+def _scales(sizes: Sequence[float]) -> list[float]:
+    """Scales of the densities of changes of such ``sizes``."""
+    return [max(size, _RESOLUTION) for size in sizes]
+
+
+def _cauchy(changes: Sequence[float], scales: Sequence[float]) -> float:
+    """Minus the logarithm of Cauchy's density of ``changes``, without that of its ``scales``; NaN changes are unknown."""
+    known = [change / scale for change, scale in zip(changes, scales, strict=True) if change == change]
+    return sum(2.0 * math.log(math.hypot(1.0, change)) for change in known)
+
+
+def _log_scales(changes: Sequence[float], scales: Sequence[float]) -> float:
+    """What `_cauchy` leaves out."""
+    return sum(math.log(scale) for change, scale in zip(changes, scales, strict=True) if change == change)
+
+
+def _fitted(sizes: Sequence[float], changes: Sequence[float]) -> list[float]:
+    """Scales ``sizes`` of Cauchy's density, a step up its likelihood by new ``changes``; NaN ones, and those of a robot at rest, move none.
+
+    d ln p / d ln s = (c^2 - s^2) / (c^2 + s^2): no change counts more than another of another order of size.
+    """
+    found = []
+    for size, change in zip(sizes, changes, strict=True):
+        if not change > _RESOLUTION:
+            found.append(size)
+        elif size == 0.0:
+            found.append(change)
+        else:
+            found.append(size * math.exp(_FORGET * (1.0 - 2.0 / (1.0 + (change / size) * (change / size)))))
+    return found
 
 
 class JointsToWheels:
