@@ -264,10 +264,15 @@ def fit_all(problem: Problem, first: Point, iterations: int = 12) -> Point:
     return problem.minimize(best, columns, iterations)
 
 
-def fit_law(problem: Problem, base: Numbers, iterations: int = 6) -> Point | None:
-    """The few numbers of a simulator with the contact law, from ``base``; None where the robot does not stand with it."""
-    first = problem.point(base, np.zeros(len(problem.hypotheses.parameters)))
-    return None if first is None else problem.minimize(first, list(range(len(first.x))), iterations)
+def fit_law(problem: Problem, base: Numbers, iterations: int = 4) -> Point | None:
+    """The few numbers of a simulator with the contact law, from ``base``, under the noise that they leave; None where the robot does not
+    stand with it."""
+    columns = list(range(len(problem.hypotheses.parameters)))
+    first = problem.point(base, np.zeros(len(columns)))
+    if first is None:
+        return None
+    at = problem.estimate_noise(problem.minimize(first, columns, iterations - 1))
+    return problem.minimize(at, columns, iterations)
 
 
 def pruned(problem: Problem, at: Point) -> Point:

@@ -267,7 +267,6 @@ def extend(problem: fit.Problem, windows: Sequence[Window], robot: Robot, before
         return None
     mu, stiffness = (float(model.nominal[model.param_names.index(name)]) for name in ("mu", "slip_stiffness"))
     of_law = fit.Problem(simulator, law_hypotheses(simulator, problem.hypotheses), problem.windows, problem.budget_steps // 2)
-    of_law.noise = problem.noise
     at = fit.fit_law(of_law, simulator.with_law(mu, stiffness))
     problem.steps += of_law.steps
     return None if at is None else mend(simulator.law_name, of_law, fit.pruned(of_law, at), windows, robot, before)

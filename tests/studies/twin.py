@@ -3,6 +3,7 @@
 python -m tests.studies.twin rotations      VaultBot's 68 rotations against MuJoCo's default contacts
 python -m tests.studies.twin husky          DRIVE's Husky windows, beside the friction model calibrated on the same windows
 python -m tests.studies.twin spoiled [--seed 1] [--only mu,servo]     five spoiled copies of a true simulator, and an untouched one
+python -m tests.studies.twin draws [--seed 1] [--count 60]      none, one or two wrong numbers of a quasi-static simulator, smooth and chaotic
 python -m tests.studies.twin dart           VaultBot's rotations in DART with Gazebo's default friction
 python -m tests.studies.twin own            the project's own simulator beside MuJoCo with the contact law, on the same commands
 
@@ -36,12 +37,16 @@ from motion_models.calibration.regressions import rotations_as_maneuvers
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
+from tests.helpers.quasi_static_simulator import drawn_numbers, spoiled_quasi_static, true_quasi_static
 from tests.helpers.twin_drives import drive, spoiled, true_simulator
 from tests.studies import drive_husky
 from tests.studies.thesis_regressions import grid
 
 FRICTION = ("wheel_radius", "mu_ratio", "tracked_x")
 """Parameters that the friction model is calibrated in by logs."""
+DRAWN = ("husky_a200", "jackal", "warthog")
+HOPPING = (0.003, 0.003, 0.012)
+"""Scatter of a window's motion by any change of a Husky's numbers in MuJoCo [m, m, rad]."""
 SPOILS = ("healthy", "mu", "servo", "radius", "cg", "mass")
 
 
@@ -152,15 +157,34 @@ def study_spoiled(console: Console, seed: int, only: Sequence[str], config: Twin
         console.print(f"{name}: {named}; better: {better}; {result.steps / 1e6:.1f} million time steps", soft_wrap=True)
 
 
+def study_draws(console: Console, seed: int, count: int) -> None:
+    """Print what is named of ``count`` drives, a third of which have nothing wrong, a third one number, a third two."""
+    for chaos in ((0.0, 0.0, 0.0), HOPPING):
+        wrong, missed, accused = [], [], []
+        for number in range(seed * 1000, seed * 1000 + count):
+            true = replace(true_quasi_static(load_robot(DRAWN[number % len(DRAWN)])), chaos=chaos)
+            numbers = drawn_numbers(true, np.random.default_rng(number), number // len(DRAWN) % 3)
+            findings = examine(drive(true, true.robot, number, 96), true.robot, spoiled_quasi_static(true, **numbers)).findings
+            named = [{f.best.field, *(rival.field for rival in f.rivals)} for f in findings]
+            wrong += [number] if any(not of & set(numbers) for of in named) else []
+            accused += [number] if findings and not numbers else []
+            missed += [number] if set(numbers) - set().union(*named) else []
+        what = f"{len(wrong)} have another number named {wrong}, {len(accused)} of them with nothing wrong; {len(missed)} miss one"
+        console.print(f"chaos {chaos}: of {count} drives {what}", soft_wrap=True)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("rotations", "husky", "spoiled", "dart", "own"))
+    parser.add_argument("what", choices=("rotations", "husky", "spoiled", "draws", "dart", "own"))
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--only", default=",".join(SPOILS))
     given = parser.parse_args()
     terminal = Console(width=200, highlight=False)
     studies = {"rotations": study_rotations, "husky": study_husky, "dart": study_dart, "own": study_own}
     if given.what in studies:
         studies[given.what](terminal)
+    elif given.what == "draws":
+        study_draws(terminal, given.seed, given.count)
     else:
         study_spoiled(terminal, given.seed, given.only.split(","))
