@@ -271,8 +271,8 @@ def fit_law(problem: Problem, base: Numbers, iterations: int = 4) -> Point | Non
     first = problem.point(base, np.zeros(len(columns)))
     if first is None:
         return None
-    at = problem.estimate_noise(problem.minimize(first, columns, iterations - 1))
-    return problem.minimize(at, columns, iterations)
+    at = problem.minimize(first, columns, iterations - 1)
+    return at if problem.is_late else problem.minimize(problem.estimate_noise(at), columns, iterations)
 
 
 def pruned(problem: Problem, at: Point) -> Point:

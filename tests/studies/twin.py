@@ -3,7 +3,7 @@
 python -m tests.studies.twin rotations      VaultBot's 68 rotations against MuJoCo's default contacts
 python -m tests.studies.twin husky          DRIVE's Husky windows, beside the friction model calibrated on the same windows
 python -m tests.studies.twin spoiled [--seed 1] [--only mu,servo]     five spoiled copies of a true simulator, and an untouched one
-python -m tests.studies.twin draws [--seed 1] [--count 60]      none, one or two wrong numbers of a quasi-static simulator, smooth and chaotic
+python -m tests.studies.twin draws [--seed 1] [--count 60]     none to two wrong numbers of a quasi-static simulator, smooth and chaotic
 python -m tests.studies.twin dart           VaultBot's rotations in DART with Gazebo's default friction
 python -m tests.studies.twin own            the project's own simulator beside MuJoCo with the contact law, on the same commands
 
