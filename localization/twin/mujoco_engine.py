@@ -422,6 +422,13 @@ class MujocoEngine:
         wheels = {g for geoms in self.robot.geoms for g in geoms}
         return max((int(p) for g, p in enumerate(self.robot.model.geom_priority) if g not in wheels), default=0)
 
+    def radius_difference(self) -> float:
+        """Radius of the left wheels less that of the right ones over their mean."""
+        radii = [max(self.radius(geom) for geom in of_wheel) for of_wheel in self.robot.geoms]
+        count = len(self.robot.wheels.left)
+        left, right = np.mean(radii[:count]), np.mean(radii[count:])
+        return 2.0 * float((left - right) / (left + right))
+
     def radius(self, geom: int) -> float:
         """Radius of a wheel's geom [m]."""
         return _radius(self.robot.model, geom)

@@ -188,6 +188,7 @@ def _read_numbers(engine: MujocoEngine, contact: Any, servos: Sequence[tuple[Ele
         cg_y_m=y,
         cg_z_m=z,
         radius_m=r.radius_m,
+        radius_difference=engine.radius_difference(),
         track_m=r.wheels.track_m,
         wheelbase_m=r.wheels.wheelbase_m,
     )
@@ -263,8 +264,7 @@ def _law(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     changes = _contact(simulator, replace(new, condim=1.0))
     sensors = ""
     for i, (joint, of_wheel) in enumerate(zip(simulator.joints, simulator.geoms, strict=True)):
-        side = 0.5 if i < len(simulator.engine.robot.wheels.left) else -0.5
-        radius = simulator.engine.radius(of_wheel[0][1]) * new.radius_scale * (1.0 + side * new.radius_difference)
+        radius = simulator.engine.radius(of_wheel[0][1]) * _growth(simulator, new, i)
         place = " ".join(map(_n, simulator.engine.robot.model.geom_pos[of_wheel[0][1]]))
         assert joint.parent is not None
         for suffix, size in (("", radius), ("_zone", 2.0 * radius)):  # the touch sensor's sphere reaches beyond the contact
@@ -310,12 +310,17 @@ def _inertial(simulator: MujocoSimulator, new: Numbers) -> Change:
     return Change(inertials[0], attributes) if inertials else Change(simulator.base, attributes, "inertial")
 
 
+def _growth(simulator: MujocoSimulator, new: Numbers, wheel: int) -> float:
+    """Radius of a wheel over that in the file."""
+    side = 0.5 if wheel < len(simulator.engine.robot.wheels.left) else -0.5
+    return new.radius_scale * (1.0 + side * new.radius_difference) / (1.0 + side * simulator.numbers.radius_difference)
+
+
 def _sizes(simulator: MujocoSimulator, new: Numbers) -> list[Change]:
     """Radii and widths of the wheels' geoms."""
     changes, model = [], simulator.engine.robot.model
-    left = len(simulator.engine.robot.wheels.left)
     for wheel, of_wheel in enumerate(simulator.geoms):
-        scale = new.radius_scale * (1.0 + (0.5 if wheel < left else -0.5) * new.radius_difference)
+        scale = _growth(simulator, new, wheel)
         for element, g in of_wheel:
             size = np.array(model.geom_size[g])
             kind = simulator.engine.geom_kind(g)

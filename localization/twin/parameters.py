@@ -165,6 +165,7 @@ def hypotheses_of(simulator: Simulator, robot: Robot) -> Hypotheses:
         "cg_y_m": (n.cg_y_m, g.cg_y_m),
         "cg_z_m": (n.cg_z_m, g.cg_height_m),
         "radius_scale": (n.radius_m, g.wheel_radius_m),
+        "radius_difference": (n.radius_difference, 0.0),  # rates of the drive are times the wheels' multipliers
         "track_scale": (n.track_m, g.track_width_m),
         "wheelbase_scale": (n.wheelbase_m, g.wheelbase_m),
     }

@@ -53,7 +53,7 @@ class Numbers:
     """Factor of the body's moments of inertia."""
     radius_scale: float = 1.0
     radius_difference: float = 0.0
-    """Radius of the left wheels over that of the right ones, less 1."""
+    """Radius of the left wheels less that of the right ones over their mean."""
     width_scale: float = 1.0
     """Factor of the width of cylinders."""
     track_scale: float = 1.0

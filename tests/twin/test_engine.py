@@ -14,6 +14,7 @@ pytest.importorskip("mujoco", reason="needs the extra 'twin'")
 from localization.errors import SimulationError
 from localization.twin.mujoco_engine import compile_robot
 from localization.twin.mujoco_simulator import read_simulator
+from localization.twin.parameters import hypotheses_of
 from localization.twin.robot_mjcf import mjcf_of
 from localization.twin.windows import LEAD_S, Window, windows_of
 from localization.twin.xml_file import parse
@@ -191,3 +192,14 @@ def test_drive_without_turns_is_refused() -> None:
     straight = Maneuver(np.full(10, 0.1), np.full((10, 2), 2.0), np.array([[0.6, 0.0, 0.0]]), np.array([10]))
     with pytest.raises(CalibrationError, match="never turn"):
         windows_of([straight], ROBOT)
+
+
+def test_unequal_wheels_of_a_file_are_read_and_mended() -> None:
+    stock = read_simulator(mjcf_of(ROBOT), ROBOT)
+    unequal = read_simulator(stock.with_numbers(replace(stock.numbers, radius_difference=0.03)), ROBOT)
+    assert unequal.numbers.radius_difference == pytest.approx(0.03, abs=1e-4)
+    parameters = hypotheses_of(unequal, ROBOT)
+    assert parameters.priors[parameters.index("radius_difference")] == pytest.approx(-0.03, abs=1e-4)
+    mended = read_simulator(unequal.with_numbers(replace(unequal.numbers, radius_difference=0.0)), ROBOT)
+    assert mended.numbers.radius_difference == pytest.approx(0.0, abs=1e-4)
+    assert mended.numbers.radius_m == pytest.approx(stock.numbers.radius_m, rel=1e-5)
