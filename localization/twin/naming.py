@@ -6,7 +6,8 @@ file's own value. A set S of wrong numbers has the evidence (MacKay 2003, ch. 28
     ln p(y | S) = -(c - b' M^-1 b) / 2 - ln det M / 2,    M = I + J_S' J_S,  b = J_S' (y - J_S m),  c = |y - J_S m|^2
 
 with m the robot file's value, and a prior: each number is right with odds of 20 to 1, times its likelihood by the robot file.
-Numbers that may take another's place in S within odds of 20 to 1 cannot be separated from it by these data.
+Numbers that may take another's place in S within odds of 20 to 1 cannot be separated from it by these data. Where wheels hop, the best of
+many plays is better by chance: sets are compared by further plays of each, and odds count beyond the scatter of their means.
 """
 
 from __future__ import annotations
@@ -224,11 +225,16 @@ def _without_needless(
         is_smaller = False
         for rest, without in _left_out(problem, about, chosen, fit):
             of_rest = posteriors(without, rest)
-            scatter = math.sqrt(float(whole.var(ddof=1) + of_rest.var(ddof=1)) / _REPLICATES)
-            if float(whole.mean() - of_rest.mean()) - _SCATTERS * scatter < SEPARATED_NATS:
+            if _odds(whole, of_rest) < SEPARATED_NATS:
                 chosen, fit, whole, is_smaller = rest, without, of_rest, True
                 break
     return chosen, fit, float(whole.std(ddof=1))
+
+
+def _odds(of: FloatArray, against: FloatArray) -> float:
+    """How much the posteriors ``of`` (n,) a set exceed those ``against`` it (n,) at least, by the scatter of their means [nats]."""
+    error = math.sqrt(float(of.var(ddof=1) + against.var(ddof=1)) / len(of))
+    return float(of.mean() - against.mean()) - _SCATTERS * error
 
 
 def _left_out(problem: Problem, about: Linear, chosen: tuple[int, ...], fit: Point) -> list[tuple[tuple[int, ...], Point]]:
@@ -264,9 +270,12 @@ def _switched(problem: Problem, start: Point, whole: Point, switch: Switch) -> C
     """A choice of the file that ``whole`` has changed, with its evidence there."""
     old, new = (float(getattr(of.base, switch.field)) for of in (start, whole))
     kept = None if old == new else problem.point(start.base, whole.x)
-    if kept is None or kept.cost - whole.cost < SEPARATED_NATS:
+    if kept is None:
         return None
-    return Candidate(switch.field, switch.meaning, "", switch.attribute, "contact", old, new, kept.cost - whole.cost - SEPARATED_NATS)
+    evidence = _odds(-problem.misfits(whole, _REPLICATES), -problem.misfits(kept, _REPLICATES)) - SEPARATED_NATS
+    if evidence < 0.0:
+        return None
+    return Candidate(switch.field, switch.meaning, "", switch.attribute, "contact", old, new, evidence)
 
 
 def _coarse_step(problem: Problem, at: Point) -> Candidate | None:
