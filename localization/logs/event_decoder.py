@@ -73,6 +73,8 @@ _SAME_CG_NS = 1_000_000_000
 """A centre of gravity that stays is an event no more often than this [ns]; drivers of arms publish at 50 to 500 Hz."""
 _NO_POSE_AFTER = 0.1
 """Way [m] or turn [rad] by the twist alone, from where on a pose that never moved is none."""
+_SIGMAS = 4.0
+"""How far a twist must go beyond what its noise would at rest: a speed's way grows with the messages, that of noise with their root."""
 _NO_ANGLES_AFTER_RAD = 0.1
 """Turned by the rates alone, from where on angles that never changed are none: above encoders' steps and the rates' noise at standstill."""
 
@@ -609,6 +611,7 @@ class OdometryToWheels:
         self._angle = np.zeros(2)
         self._pose_has_moved = self._twist_has_moved = False
         self._by_twist = np.zeros(2)  # way and turn while the pose has not moved [m, rad]
+        self._jitter = np.zeros(2)  # their variance, were the twist noise alone
         self._publishers = PublisherSeparator()
 
     def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
@@ -644,7 +647,8 @@ class OdometryToWheels:
                 self._pose_has_moved = True
             elif not self._pose_has_moved and self._twist_has_moved:
                 self._by_twist += from_twist
-                if np.abs(self._by_twist).max() > _NO_POSE_AFTER:  # a twist that jitters at rest goes nowhere
+                self._jitter += np.square(from_twist)
+                if (np.abs(self._by_twist) > np.maximum(_NO_POSE_AFTER, _SIGMAS * np.sqrt(self._jitter))).any():
                     self._stats.count(self._topic, Oddity.NO_POSE)
                 forward, turn = from_twist
             increment = self._wheels(forward, turn)

@@ -489,6 +489,16 @@ def test_odometry_without_pose_uses_its_twists(tmp_path: Path) -> None:
     assert any("pose that never moves" in note for note in log.warnings())
 
 
+def test_odometry_whose_twist_jitters_at_rest_has_a_pose(tmp_path: Path) -> None:
+    """The sum of its yaw rates is a random walk: beyond 0.1 rad within seconds, which is no turn."""
+    rng = np.random.default_rng(5)
+    twists = np.column_stack([np.zeros(300), rng.normal(0.0, 0.5, 300)])
+    log = odometry_log(tmp_path, np.zeros((301, 3)), twists, dt=0.02)
+    list(log.events())
+    assert np.abs(np.cumsum(twists[:, 1]) / 50.0).max() > 0.15
+    assert log.warnings() == []
+
+
 def test_odometry_reset_loses_one_increment(tmp_path: Path) -> None:
     rates = np.tile([4.0, 5.0], (60, 1))
     poses, twists = drive(rates, 0.1, ROBOT.driver)
