@@ -1,7 +1,7 @@
 """A second vehicle for blind tests: four wheels in MuJoCo, whose rigid bodies and contacts share nothing with our friction model.
 
-World, drives and sensors are the simulator's. MuJoCo moves the robot: a chassis on a free joint, four wheels in hinges
-with velocity servos, and elliptic friction cones at their soft contacts with a plane.
+World, sensors and the drive are those of `skidloc simulate --engine mujoco`. The file is of its own: a chassis on a free joint, four
+wheels in hinges with velocity servos, and elliptic friction cones at their soft contacts with a plane.
 """
 
 from __future__ import annotations
