@@ -57,11 +57,11 @@ _MAX_PUBLISHER_GAP_NS = 1_000_000_000  # of a second publisher, after its readin
 
 _ARE_TWO, _IS_ONE, _CERTAIN = math.log(1e-6), math.log(0.5), math.log(100.0)
 """Logarithms: prior odds that two publishers share a topic; price of labelling a reading; odds from where on one is left out."""
-_WILD = math.log(1000.0)
-"""Logarithm of the odds that a reading of a single publisher is not wild: the most that one reading says for two [nats]."""
+_OUTLIER = math.log(1000.0)
+"""Logarithm of the odds that a reading of a single publisher is no outlier: the most that one reading says for two [nats]."""
 _RESOLUTION = 1e-3
 """Least scale of changes: less is rounding [m, m/s, rad/s]."""
-_FORGET = 0.1
+_SCALE_STEP = 0.1
 """Step of the logarithm of a scale by each reading."""
 _FOLLOW = 0.3
 """Share of a new reading in the mean of readings, which follows a speed that changes within a second."""
@@ -316,7 +316,7 @@ class PublisherSeparator:
             cost_of_other = self._cost(back)
             of_scales = _log_scales(changes, _scales(self._sizes))
             gained = min(of_one, cost + of_scales) - min(cost, cost_of_other) - of_scales
-            self._log_odds = min(max(self._log_odds + min(_WILD, gained) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
+            self._log_odds = min(max(self._log_odds + min(_OUTLIER, gained) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
             if cost_of_other < cost:
                 self._learn(back)
                 self._other = current
@@ -330,7 +330,7 @@ class PublisherSeparator:
         return current
 
     def _cost(self, changes: Sequence[float]) -> float:
-        """Minus the logarithm of the density of ``changes``, up to a constant; 0 where nothing is known."""
+        """Minus the logarithm of the density of ``changes`` by either of two publishers, without that of the scales."""
         return _cauchy(changes, _scales(self._sizes))
 
     def _cost_of_one(self, values: Sequence[float], changes: Sequence[float]) -> float:
@@ -369,7 +369,7 @@ def _cauchy(changes: Sequence[float], scales: Sequence[float]) -> float:
 
 
 def _log_scales(changes: Sequence[float], scales: Sequence[float]) -> float:
-    """What `_cauchy` leaves out."""
+    """Logarithm of the ``scales`` of known ``changes``, which `_cauchy` leaves out."""
     return sum(math.log(scale) for change, scale in zip(changes, scales, strict=True) if change == change)
 
 
@@ -385,7 +385,7 @@ def _fitted(sizes: Sequence[float], changes: Sequence[float]) -> list[float]:
         elif size == 0.0:
             found.append(change)
         else:
-            found.append(size * math.exp(_FORGET * (1.0 - 2.0 / (1.0 + (change / size) * (change / size)))))
+            found.append(size * math.exp(_SCALE_STEP * (1.0 - 2.0 / (1.0 + (change / size) * (change / size)))))
     return found
 
 

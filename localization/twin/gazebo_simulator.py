@@ -149,19 +149,9 @@ def read_gazebo_simulator(file: XmlFile, robot: Robot) -> GazeboSimulator:
     mu = float(np.mean([w.shape.mu for w in source.driven]))
     plugin = _wheel_slip(source.model)
     compliances = [float(file.content(e)) for e in plugin.walk() if e.tag == "slip_compliance_lateral"] if plugin is not None else []
-    nan = math.nan
     numbers = Numbers(
         mu=mu,
-        torsional_m=nan,
-        time_constant_s=nan,
-        damping_ratio=nan,
-        softness=nan,
-        condim=nan,
-        impratio=nan,
-        is_elliptic=nan,
         time_step_s=source.time_step_s,
-        servo_gain=nan,
-        rotor_inertia=nan,
         mass_kg=source.mass,
         cg_x_m=x,
         cg_y_m=y,
@@ -169,7 +159,7 @@ def read_gazebo_simulator(file: XmlFile, robot: Robot) -> GazeboSimulator:
         radius_m=float(np.mean([w.shape.radius for w in source.driven])),
         track_m=source.wheels.track_m,
         wheelbase_m=source.wheels.wheelbase_m,
-        slip_stiffness=1.0 / (mu * compliances[0]) if compliances and min(mu * compliances[0], mu) > 0.0 else nan,
+        slip_stiffness=1.0 / (mu * compliances[0]) if compliances and min(mu * compliances[0], mu) > 0.0 else math.nan,
     )
     return GazeboSimulator(source, numbers, DartEngine(_body(source, numbers, numbers), robot.center_of_gravity), robot.center_of_gravity)
 

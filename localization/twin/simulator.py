@@ -11,28 +11,28 @@ from localization.twin.engine import Engine
 from localization.twin.xml_file import XmlFile
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Numbers:
     """Numbers of an engine and of the robot in it. NaN for those that the file does not have."""
 
     mu: float
     """Friction of a wheel's contact [-]."""
-    torsional_m: float
+    torsional_m: float = math.nan
     """Torsional friction, which acts from condim 4 on [m]."""
-    time_constant_s: float
+    time_constant_s: float = math.nan
     """solref's time constant [s]."""
-    damping_ratio: float
+    damping_ratio: float = math.nan
     """solref's damping ratio [-]."""
-    softness: float
+    softness: float = math.nan
     """1 - solimp's impedance under load [-]."""
-    condim: float
-    impratio: float
-    is_elliptic: float
+    condim: float = math.nan
+    impratio: float = math.nan
+    is_elliptic: float = math.nan
     """Friction cones: 1 elliptic, 0 pyramidal."""
     time_step_s: float
-    servo_gain: float
+    servo_gain: float = math.nan
     """kv, mean over the wheels' servos [N m s/rad]."""
-    rotor_inertia: float
+    rotor_inertia: float = math.nan
     """Inertia of a wheel about its axle with its motor's armature, mean over the wheels [kg m^2]."""
     mass_kg: float
     """Mass of the whole robot."""

@@ -14,17 +14,23 @@ import numpy as np
 from localization.twin.engine import Played, Touch
 from localization.twin.parameters import hypotheses_of
 from localization.twin.simulator import Numbers
+from localization.twin.twin import examine
 from localization.twin.windows import LEAD_S, Window
 from localization.twin.xml_file import XmlFile, parse
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import Robot
+from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
+from tests.helpers.twin_drives import drive
 
 SEARCHED = frozenset(
     {"slip_stiffness", "mu_ratio", "servo_gain", "cg_x_m", "cg_y_m", "radius_scale", "radius_difference", "track_scale", "wheelbase_scale"}
 )
 """Numbers that move this robot."""
+DRAWN = ("husky_a200", "jackal", "warthog")
+HOPPING = (0.003, 0.003, 0.012)
+"""Scatter of a window's motion by any change of a Husky's numbers in MuJoCo [m, m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -127,19 +133,11 @@ def spoiled_quasi_static(true: QuasiStaticSimulator, **numbers: float) -> QuasiS
 
 def true_quasi_static(robot: Robot) -> QuasiStaticSimulator:
     """The robot as its file describes it, on servos that reach their set points."""
-    g, nan = robot.geometry, math.nan
+    g = robot.geometry
     numbers = Numbers(
         mu=0.7,
-        torsional_m=nan,
-        time_constant_s=nan,
-        damping_ratio=nan,
-        softness=nan,
-        condim=nan,
-        impratio=nan,
-        is_elliptic=nan,
         time_step_s=0.1,
         servo_gain=100.0,
-        rotor_inertia=nan,
         mass_kg=g.mass_kg,
         cg_x_m=g.cg_x_m,
         cg_y_m=g.cg_y_m,
@@ -163,3 +161,11 @@ def drawn_numbers(true: QuasiStaticSimulator, rng: np.random.Generator, count: i
         old = float(getattr(true.numbers, p.field))
         found[p.field] = float(old * math.exp(off * p.sigma) if p.is_log else old + off * p.sigma)
     return found
+
+
+def named_of_draw(number: int, chaos: tuple[float, float, float]) -> tuple[dict[str, float], list[set[str]]]:
+    """Values of none, one or two wrong numbers of a drawn file, and the fields that each finding has, with its rivals."""
+    true = replace(true_quasi_static(load_robot(DRAWN[number % len(DRAWN)])), chaos=chaos)
+    numbers = drawn_numbers(true, np.random.default_rng(number), number // len(DRAWN) % 3)
+    findings = examine(drive(true, true.robot, number, 96), true.robot, spoiled_quasi_static(true, **numbers)).findings
+    return numbers, [{f.best.field, *(rival.field for rival in f.rivals)} for f in findings]

@@ -1,4 +1,4 @@
-"""Two publishers of one topic are told from one whose speeds are noise, steps of coarse encoders, or now and then wild."""
+"""Two publishers of one topic are distinguished from one whose speeds are noise, steps of coarse encoders, or now and then outliers."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def topic(seed: int, kind: str) -> tuple[FloatArray, float]:
         "noisy turn rates": np.column_stack([speed, turn + rng.normal(0.0, noise, count)]),
         "noisy wheels": sides + rng.normal(0.0, 0.3 * noise, (count, 2)),
         "coarse encoders": np.round(100.0 * sides * hz + rng.uniform(0.0, 1.0, (count, 2))) / (100.0 * hz),
-        "wild readings": np.column_stack([speed, turn + 0.1 * rng.standard_t(1.5, count)]),
+        "outliers": np.column_stack([speed, turn + 0.1 * rng.standard_t(1.5, count)]),
         "places alone": np.cumsum(speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0) / hz,
     }[kind], hz
 
 
-@pytest.mark.parametrize("kind", ["noisy turn rates", "noisy wheels", "coarse encoders", "wild readings", "places alone"])
+@pytest.mark.parametrize("kind", ["noisy turn rates", "noisy wheels", "coarse encoders", "outliers", "places alone"])
 def test_single_publisher_loses_no_reading(kind: str) -> None:
     assert [left_out(*topic(seed, kind)) for seed in SEEDS] == [0.0] * len(SEEDS)
 
@@ -57,7 +57,7 @@ def test_publisher_of_zeros_between_is_left_out(kind: str) -> None:
         assert 0.25 < left_out(both, 2.0 * hz) <= 0.55
 
 
-def test_wild_reading_of_constant_speeds_makes_no_second_publisher() -> None:
+def test_outlier_among_constant_speeds_makes_no_second_publisher() -> None:
     values = np.tile([0.4, 0.1], (200, 1))
     values[[50, 120]] = 1e5, -1e300
     values[160] = np.inf, np.nan

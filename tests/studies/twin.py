@@ -30,6 +30,7 @@ from localization.twin.robot_mjcf import mjcf_of
 from localization.twin.robot_sdf import sdf_of
 from localization.twin.simulated_drive import simulate_in_mujoco
 from localization.twin.twin import Judged, TwinConfig, TwinResult, examine
+from localization.twin.windows import motion_of_point
 from motion_models import se2
 from motion_models.calibration.fit import fit
 from motion_models.calibration.maneuvers import Maneuver
@@ -37,16 +38,13 @@ from motion_models.calibration.regressions import rotations_as_maneuvers
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
-from tests.helpers.quasi_static_simulator import drawn_numbers, spoiled_quasi_static, true_quasi_static
+from tests.helpers.quasi_static_simulator import HOPPING, named_of_draw
 from tests.helpers.twin_drives import drive, spoiled, true_simulator
 from tests.studies import drive_husky
 from tests.studies.thesis_regressions import grid
 
 FRICTION = ("wheel_radius", "mu_ratio", "tracked_x")
 """Parameters that the friction model is calibrated in by logs."""
-DRAWN = ("husky_a200", "jackal", "warthog")
-HOPPING = (0.003, 0.003, 0.012)
-"""Scatter of a window's motion by any change of a Husky's numbers in MuJoCo [m, m, rad]."""
 SPOILS = ("healthy", "mu", "servo", "radius", "cg", "mass")
 
 
@@ -55,8 +53,7 @@ def k_and_centre(result: TwinResult, judged: Judged, robot: Robot) -> tuple[floa
     windows = result.windows
     wheels = np.array([(w.mean_rates[1] - w.mean_rates[0]) * w.duration_s for w in windows])
     per_turn = robot.geometry.track_width_m / (wheels * robot.geometry.wheel_radius_m)
-    T = np.array([*judged.frame, 0.0])
-    moved = se2.compose(se2.compose(se2.inverse(T), judged.played.poses), T)
+    moved = motion_of_point(judged.played.poses, judged.frame)
     measured = np.array([w.measured for w in windows])
     k, true = turns(windows, moved, robot) * per_turn, turns(windows, measured, robot) * per_turn
     off = centres(moved, turns(windows, moved, robot)) - centres(measured, turns(windows, measured, robot))
@@ -162,12 +159,9 @@ def study_draws(console: Console, seed: int, count: int) -> None:
     for chaos in ((0.0, 0.0, 0.0), HOPPING):
         wrong, missed, accused = [], [], []
         for number in range(seed * 1000, seed * 1000 + count):
-            true = replace(true_quasi_static(load_robot(DRAWN[number % len(DRAWN)])), chaos=chaos)
-            numbers = drawn_numbers(true, np.random.default_rng(number), number // len(DRAWN) % 3)
-            findings = examine(drive(true, true.robot, number, 96), true.robot, spoiled_quasi_static(true, **numbers)).findings
-            named = [{f.best.field, *(rival.field for rival in f.rivals)} for f in findings]
+            numbers, named = named_of_draw(number, chaos)
             wrong += [number] if any(not of & set(numbers) for of in named) else []
-            accused += [number] if findings and not numbers else []
+            accused += [number] if named and not numbers else []
             missed += [number] if set(numbers) - set().union(*named) else []
         what = f"{len(wrong)} have another number named {wrong}, {len(accused)} of them with nothing wrong; {len(missed)} miss one"
         console.print(f"chaos {chaos}: of {count} drives {what}", soft_wrap=True)
