@@ -15,6 +15,7 @@ import numpy as np
 
 from localization.evidence.alternatives import Alternative, Row
 from localization.evidence.alternatives.alternative import LEVELS
+from localization.evidence.angles import BoolArray
 from localization.evidence.likelihood import Choice, Stack, evidence_by_bin, log_posterior, varied
 from motion_models.se2 import FloatArray
 
@@ -84,7 +85,6 @@ def _joined(stack: Stack, of_base: int, k: int, row: Row, m: int, is_since: bool
     text = f"{row.text} {'since' if is_since else 'until'} t = {at:.0f} s"
     odds = row.log_odds + _ODDS - math.log(len(stack.t))
     changed = replace(row, text=text, log_odds=odds, correct=None, remedy=_REMEDY, since_s=since_s, until_s=until_s)
-    share = float(is_other.mean())
     rows = (*base.rows, changed)
     return replace(
         base,
@@ -92,8 +92,15 @@ def _joined(stack: Stack, of_base: int, k: int, row: Row, m: int, is_since: bool
         way=_spliced(base.way, other.way, is_other),
         turn=_spliced(base.turn, other.turn, is_other),
         units=(np.where(is_other, other.units[0], base.units[0]), np.where(is_other, other.units[1], base.units[1])),
-        own=(1.0 - share) * base.own + share * other.own,
+        own=base.own + _own_of(is_other, base, other),
     )
+
+
+def _own_of(is_other: BoolArray, base: Alternative, other: Alternative) -> float:
+    """What the evidence of the source itself changes where the bins ``is_other`` (n,) are the ``other`` alternative's."""
+    if base.own_by_bin is None or other.own_by_bin is None:
+        return float(is_other.mean()) * (other.own - base.own)
+    return float((other.own_by_bin - base.own_by_bin)[is_other].sum())
 
 
 def _spliced(base: FloatArray | None, other: FloatArray | None, is_other: FloatArray) -> FloatArray | None:

@@ -1,7 +1,8 @@
 """Evidence of what several sources measured of one channel of the robot's motion, with the motion integrated out.
 
-In each bin the robot has a rate x ~ N(0, S^2), its forward speed or its yaw rate. Source i measures z_i = a_i x + b_i + n_i, with a scale
-a_i = exp(c_i), c_i ~ N(0, tau_i^2), a bias b_i of gyros, and n_i ~ N(0, V_i), V_i = floor_i^2 + (rel_i a_i x)^2. With x integrated out,
+In each bin the robot has a rate x ~ N(0, S^2), its forward speed or its yaw rate, where S is that of the drive, or that of a robot that
+stands, by the share of the bins in which it moves. Source i measures z_i = a_i x + b_i + n_i, with a scale a_i = exp(c_i),
+c_i ~ N(0, tau_i^2), a bias b_i of gyros, and n_i ~ N(0, V_i), V_i = floor_i^2 + (rel_i a_i x)^2. With x integrated out,
 
     log p(z) = -1/2 [z' V^-1 z - (a' V^-1 z)^2 / C + log|V| + log(C S^2) + k log 2 pi],    C = a' V^-1 a + S^-2,
 
@@ -33,13 +34,21 @@ def log_size_prior(log_size: FloatArray) -> FloatArray:
 
 @kernel
 def channel_evidence(
-    z: FloatArray, floor: FloatArray, relative: FloatArray, tau: FloatArray, bias_sigma: FloatArray, size: float, least: FloatArray
+    z: FloatArray,
+    floor: FloatArray,
+    relative: FloatArray,
+    tau: FloatArray,
+    bias_sigma: FloatArray,
+    size: float,
+    least: FloatArray,
+    still: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Tempered evidence by bin (A, n); that of the size, the scales and the biases (A,); scales' logarithms and the data's information on
     them (A, k).
 
     ``z`` (A, k, n): A alternatives of k sources in n bins, NaN where unknown; ``floor`` (A, k, n); ``bias_sigma`` (k,); ``relative`` and
-    ``tau`` (A, k); ``size``: prior standard deviation of the motion; ``least`` (A,): what is smaller is no motion.
+    ``tau`` (A, k); ``size``: prior standard deviation of the motion; ``least`` (A,): what is smaller is no motion; ``still`` (A, n):
+    standard deviation of the motion of a robot that stands.
     """
     A, k, n = z.shape
     of_bins, price = np.zeros((A, n)), np.zeros(A)
@@ -56,10 +65,10 @@ def channel_evidence(
             if k > 1:
                 _scales(z[i], noise, (tau[i], bias_sigma), x, c[i], b, information[i])
         scale = np.exp(c[i])
-        own = max(least[i], _size_of_motion(z[i], noise, scale, b, size, x))
+        own, moving = _size_of_motion(z[i], noise, scale, b, size, x, least[i])
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
         for m in range(n):
-            of_bins[i, m] = TEMPER * _bin_evidence(z[i], noise, m, scale, b, own, x[m])
+            of_bins[i, m] = TEMPER * _bin_evidence(z[i], noise, m, scale, b, (own, still[i, m], moving), x[m])
     return of_bins, price, c, information
 
 
@@ -154,16 +163,34 @@ def _weighted_sums(z: FloatArray, x: FloatArray, floor: FloatArray, relative: fl
 
 
 @subroutine
-def _size_of_motion(z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, size: float, x: FloatArray) -> float:
-    """Standard deviation of the motion of this drive, near ``x``."""
-    square = 0.0
+def _size_of_motion(
+    z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, size: float, x: FloatArray, least: float
+) -> tuple[float, float]:
+    """Standard deviation of the motion of this drive, near ``x``, where the robot moves, and the share of bins where it does; what is
+    smaller than ``least`` is no motion."""
+    square, moving = 0.0, 0
     for m in range(len(x)):
-        square += _mean(z, noise, m, a, b, size, x[m]) ** 2
-    return math.sqrt(square / len(x) + (0.01 * size) ** 2)
+        mean = _mean(z, noise, m, a, b, size, x[m])
+        if abs(mean) > least:
+            square, moving = square + mean**2, moving + 1
+    return math.sqrt(square / moving) if moving else least, (moving + 0.5) / (len(x) + 1.0)
 
 
 @subroutine
-def _bin_evidence(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, size: float, x: float) -> float:
+def _bin_evidence(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, motion: tuple[float, float, float], x: float) -> float:
+    """Log density of bin ``m`` of a drive with this ``motion``: its size where the robot moves, that where it stands, and the share of bins
+    in which it moves."""
+    size, still, moving = motion
+    moves = _of_size(z, noise, m, a, b, size, x)
+    if size <= still:
+        return moves
+    stands = _of_size(z, noise, m, a, b, still, x)
+    best = max(moves, stands)
+    return best + math.log(moving * math.exp(moves - best) + (1.0 - moving) * math.exp(stands - best))
+
+
+@subroutine
+def _of_size(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, size: float, x: float) -> float:
     """Log density of bin ``m``: all sources measure the motion; or all but one do; or none does. Each is exp(-q / 2) / sqrt(d)."""
     k, S2 = len(z), size**2
     zz, az, C, V_all, zz_out, V_out = 0.0, 0.0, 1.0 / S2, 1.0, 0.0, 1.0

@@ -261,7 +261,7 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
         inputs = _inputs(single, np.zeros((1, len(single)), int), name, 1.0, used)
-        _, _, c, information = channel_evidence(*inputs, _SIZES[name], np.zeros(1))
+        _, _, c, information = channel_evidence(*inputs, _SIZES[name], *_smallest(single, np.zeros((1, len(single)), int), name))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
     return found
@@ -277,12 +277,22 @@ def least_sizes(stacks: Sequence[Stack], choices: Choices, name: str) -> FloatAr
     return np.asarray(np.maximum(_AT_REST * np.minimum(largest, _FAST * _SIZES[name]), STILL[name]))
 
 
+def _smallest(stacks: Sequence[Stack], choices: Choices, name: str) -> tuple[FloatArray, FloatArray]:
+    """`least_sizes` (A,), and the size (A, n) of the motion of a robot that stands: where encoders count, in its unit."""
+    units = [
+        np.where(stack._is_scaled, np.maximum(np.exp(stack.log_unit(name)[rows]), 1.0), 1.0)
+        for stack, rows in zip(stacks, choices.T, strict=True)
+        if stack.channel(name) is not None
+    ]
+    return least_sizes(stacks, choices, name), np.asarray(STILL[name] * np.max(units, axis=0))
+
+
 def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float) -> FloatArray:
     """Evidence (A, n) by bin of one channel, at a level of the noise; what concerns all bins is spread over them."""
     used = [i for i, stack in enumerate(stacks) if stack.channel(name) is not None]
     inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choices, name, level, used)
-    least = least_sizes(stacks, choices, name)
-    of_bins, price, _, _ = channel_evidence(*inputs, _SIZES[name], least)
+    sizes = _SIZES[name], *_smallest(stacks, choices, name)
+    of_bins, price, _, _ = channel_evidence(*inputs, *sizes)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
     slips = np.array([NOISE[stacks[i].kind].relative for i in used])
     slides = [(skids, level), (slips, level), *([(skids, 1.0)] if level < 1.0 else [])]  # the floor is not as quiet as the sensors
@@ -291,14 +301,14 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float
         skidding = np.where(skids[:, None] > 0.0, skidding, floor)
         of_share = np.ascontiguousarray(np.where(skids > 0.0, slip_level * part, relative))
         of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
-        of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, _SIZES[name], least)
+        of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, *sizes)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
         of_bins = np.where(is_better[:, None], of_sliding, of_bins)
         price = np.where(is_better, price_of_sliding + _SKID_ODDS, price)
     is_alone = np.isfinite(z).any(axis=2).sum(axis=1) < 2
     found = of_bins + price[:, None] / z.shape[2]
     if is_alone.any():
-        found[is_alone] = (_of_one_source(stacks, choices, name, used, least) / z.shape[2])[is_alone, None]
+        found[is_alone] = (_of_one_source(stacks, choices, name, used, sizes[1]) / z.shape[2])[is_alone, None]
     return np.asarray(found)
 
 

@@ -19,7 +19,10 @@ def _evidence(z: np.ndarray, floor: np.ndarray, tau: tuple[float, ...]) -> float
     """Of one choice: sources (k, n) with floors (k,)."""
     k, n = z.shape
     floors = np.ascontiguousarray(np.broadcast_to(floor[:, None], (k, n)))[None]
-    of_bins, price, _, _ = channel_evidence(z[None].copy(), floors, np.full((1, k), 0.05), np.array([tau]), np.zeros(k), 0.5, np.zeros(1))
+    noise = floors, np.full((1, k), 0.05)
+    of_bins, price, _, _ = channel_evidence(
+        z[None].copy(), *noise, np.array([tau]), np.zeros(k), 0.5, np.full(1, 0.02), np.full((1, n), 0.02)
+    )
     return float(of_bins.sum() + price[0])
 
 

@@ -109,7 +109,8 @@ def _effects(vehicle: Vehicle) -> frozenset[str]:
     return mujoco_vehicle.EFFECTS
 
 
-def _simulation(vehicle: Vehicle, experiment: Experiment, robot: Robot, seed: int, effects: Mapping[str, float]) -> Simulation:
+def simulation_of(vehicle: Vehicle, experiment: Experiment, robot: Robot, seed: int, effects: Mapping[str, float]) -> Simulation:
+    """``experiment`` on one of three vehicles, with a LiDAR of 191 beams."""
     config = SimulationConfig(sensors=SensorConfig(scanner=ScannerConfig(rate_hz=6.25, beams=191)))
     if vehicle == "simulator":
         return Simulation(experiment, robot, seed, effects, config)
@@ -128,7 +129,7 @@ def weigh_simulated(name: str, effects: Mapping[str, float], seed: int, vehicle:
     robot = load_robot(name)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "turning.mcap"
-        write_simulation(path, _simulation(vehicle, MINUTE, robot, seed, effects))
+        write_simulation(path, simulation_of(vehicle, MINUTE, robot, seed, effects))
         return weigh(drive_of_log(open_log(path, robot)))[0]
 
 

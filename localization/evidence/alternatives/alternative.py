@@ -26,9 +26,6 @@ WAY_M_S = 0.5
 """Prior standard deviation of a robot's forward speed [m/s]: that of the drives of `tests/data`."""
 TURN_RAD_S = 0.6
 """Prior standard deviation of its yaw rate [rad/s]."""
-_SIDE_FLOOR_M_S, _SIDE_OF_WAY, _SIDE_OF_TURN_M = 0.02, 0.1, 0.05
-"""Standard deviation of a robot's sideways speed: floor, part of the speed (slides are below 20 degrees in 99.9 % of three buildings), and
-metres per radian of turn beyond its centre of rotation."""
 
 _FREE_SIGMA = 2.5
 """Sigma of the logarithm of a factor that has no name: a gear, or counts for radians."""
@@ -102,6 +99,8 @@ class Alternative:
     """Sigma of the logarithm of the scale of ``way`` that this choice adds to the source's."""
     turn_sigma: float = 0.0
     delay_s: float = 0.0
+    own_by_bin: FloatArray | None = None
+    """(n,) the part of ``own`` that each bin has; None where it is of all bins alike."""
 
     @property
     def log_prior(self) -> float:
@@ -115,12 +114,20 @@ def mixture(residual: FloatArray, sigma: FloatArray | float, wide: float) -> flo
     ``wide`` is the size of the channel itself, so that a change of units changes the density by its Jacobian alone.
     """
     known = np.isfinite(residual)
-    s = np.array(LEVELS)[:, None] * np.broadcast_to(sigma, residual.shape)[known]
-    r = residual[known]
-    inlier = math.log(1.0 - OUTLIER) - 0.5 * (r / s) ** 2 - np.log(s)
-    outlier = math.log(OUTLIER) - 0.5 * (r / wide) ** 2 - math.log(wide)
-    at_level = TEMPER * np.logaddexp(inlier, outlier).sum(axis=1)
-    return float(np.logaddexp.reduce(at_level) - math.log(len(LEVELS)))
+    return over_levels(mixture_by_bin(residual[known], np.broadcast_to(sigma, residual.shape)[known], wide).sum(axis=1))
+
+
+def mixture_by_bin(residual: FloatArray, sigma: FloatArray, wide: float) -> FloatArray:
+    """`mixture` of each bin at each of `LEVELS`, (6, n); the finite ``residual`` is of all levels, (n,), or by level, (6, n)."""
+    s = np.array(LEVELS)[:, None] * sigma
+    inlier = math.log(1.0 - OUTLIER) - 0.5 * (residual / s) ** 2 - np.log(s)
+    outlier = math.log(OUTLIER) - 0.5 * (residual / wide) ** 2 - math.log(wide)
+    return np.asarray(TEMPER * np.logaddexp(inlier, outlier))
+
+
+def over_levels(evidence: FloatArray) -> float:
+    """Logarithm of the mean of what has the logarithm ``evidence`` (6,) at each of `LEVELS`."""
+    return float(np.logaddexp.reduce(evidence) - math.log(len(LEVELS)))
 
 
 def unrelated_evidence(channel: FloatArray, floor: float) -> float:
@@ -132,21 +139,6 @@ def noise_evidence(channel: FloatArray, sigma: float) -> float:
     """Tempered log density of a ``channel`` (n,) that is noise of standard deviation ``sigma``."""
     known, variance = channel[np.isfinite(channel)], sigma**2
     return -0.5 * TEMPER * float((np.log(math.tau * variance) + known**2 / variance).sum())
-
-
-def side_evidence(side: FloatArray, way: FloatArray, turn: FloatArray, place_sigma_m: float) -> tuple[float, float]:
-    """Evidence of the sideways speed (n,) of a point that should be on the body's x axis, and how far ahead of its place it is [m].
-
-    The place ahead is a x wz with a ~ N(0, place_sigma_m^2), profiled (ridge regression).
-    """
-    sigma = np.sqrt(_SIDE_FLOOR_M_S**2 + (_SIDE_OF_WAY * way) ** 2 + (_SIDE_OF_TURN_M * turn) ** 2)
-    weight = np.where(np.isfinite(side), sigma**-2.0, 0.0)
-    for _ in range(3):
-        information = TEMPER * float((weight * turn * turn)[weight > 0.0].sum())
-        ahead = TEMPER * float((weight * turn * side)[weight > 0.0].sum()) / (information + place_sigma_m**-2)
-        weight = np.where(np.isfinite(side), 1.0 / (sigma**2 * (1.0 + ((side - ahead * turn) / (3.0 * sigma)) ** 2)), 0.0)
-    price = 0.5 * (ahead / place_sigma_m) ** 2 + 0.5 * math.log1p(information * place_sigma_m**2)
-    return mixture(side - ahead * turn, sigma, size_of(np.hypot(way, side))) - price, ahead
 
 
 def free_factor(way: FloatArray, turn: FloatArray, sizes: Mapping[str, float]) -> tuple[float, float]:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.evidence.alternatives.alternative import Alternative, Row, mount_correction, side_evidence
+from localization.evidence.alternatives.alternative import Alternative, Row, mount_correction
+from localization.evidence.alternatives.places import PlacePrior, SideEvidence, side_evidence, usual_place
 from localization.evidence.signals import Source
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -23,9 +24,9 @@ UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048}
 _QUARTER_RAD, _YAW_SIGMA_RAD = math.radians(4.0), math.radians(3.0)
 """LiDARs are mounted by quarter turns: an estimate that is so near to one is that; and the standard deviation of a mount's yaw with a
 slide."""
-_PLACE_SIGMA_M, _WRONG_PLACE_SIGMA_M = 0.07, 0.6
-"""Standard deviation along the robot of a mount with the centre of rotation (robots turn within 5 cm of the middle of their wheels), and of
-a mount that is wrong."""
+_PLACE_SIGMA_M, _WRONG_PLACE = 0.07, PlacePrior(0.6)
+"""Standard deviation along the robot of a mount with the centre of rotation (robots without a load turn within 5 cm of the middle of their
+wheels), and the place of a mount that is wrong."""
 Velocity = NDArray[Any]
 """Complex: ahead + i to the left [m/s]."""
 _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
@@ -34,26 +35,20 @@ _GRID = np.radians(np.arange(-180.0, 180.0, 3.0))
 def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: Robot) -> list[Alternative]:
     """Yaws times upside down times units of the ``rates`` (n, 3) ahead, to the left and turn at the sensor, in the axes of its mount."""
     mount, found = source.mount, list[Alternative]()
-    usual = _place_sigma_m(robot, source.moves_cg)
-    places = [(_WRONG_PLACE_SIGMA_M, False)] if source.is_second else [(usual, False), (_WRONG_PLACE_SIGMA_M, True)]
+    usual = usual_place(_PLACE_SIGMA_M, robot, source.moves_cg)
+    places = [(_WRONG_PLACE, False)] if source.is_second else [(usual, False), (_WRONG_PLACE, True)]
     for is_flipped, (unit, factor) in itertools.product((False, True), (("", 1.0), *UNITS.items())):
         velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:
             velocity, turn = velocity.conj(), -turn
         in_unit = Row("lidar.unit", f"the LiDAR's ranges are in {unit}", _ODDS["unit"], unit, factor, partial(_set_range, 1.0 / factor))
-        for yaw, odds in yaws(velocity, turn, source.place, (usual, _WRONG_PLACE_SIGMA_M)):
+        for yaw, odds in yaws(velocity, turn, source.place, (usual, _WRONG_PLACE)):
             rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
-            for place_sigma, is_elsewhere in places:
-                body, evidence, ahead = in_body(velocity, turn, source.place, yaw, place_sigma)
-                more = [_place_row(source, ahead)] if is_elsewhere else []
-                found.append(Alternative((*rows, *more), body.real, turn, (factor, 1.0), evidence))
+            for place, is_elsewhere in places:
+                way, side = in_body(velocity, turn, source.place, yaw, place)
+                more = [_place_row(source, side.ahead_m)] if is_elsewhere else []
+                found.append(Alternative((*rows, *more), way, turn, (factor, 1.0), side.evidence, own_by_bin=side.by_bin))
     return found
-
-
-def _place_sigma_m(robot: Robot, moves_cg: bool) -> float:
-    """Standard deviation along the robot of a mount with the centre of rotation [m], which follows a centre of gravity that moves: anywhere
-    between the axles."""
-    return math.hypot(_PLACE_SIGMA_M, robot.geometry.wheelbase_m / math.sqrt(12.0) if moves_cg else 0.0)
 
 
 def _place_row(source: Source, ahead: float) -> Row:
@@ -65,13 +60,13 @@ def _place_row(source: Source, ahead: float) -> Row:
     return Row("lidar.place", text, odds, value=ahead, correct=correct, is_fault=source.is_mounted, is_reported=True)
 
 
-def in_body(velocity: Velocity, turn: FloatArray, place: complex, yaw: float, place_sigma_m: float) -> tuple[Velocity, float, float]:
-    """Velocity (n,) in the axes of a body in which the sensor is turned by ``yaw``; the evidence of its sideways part; and how far ahead of
-    its ``place`` the sensor is [m]. A mount of the file has a small yaw, with its prior."""
-    small = 0.0 if yaw else _small_yaw(velocity - 1j * turn * place, turn, place_sigma_m)[0]
-    body = velocity * np.exp(1j * (yaw + small)) - 1j * turn * place
-    evidence, ahead = side_evidence(body.imag, body.real, turn, place_sigma_m)
-    return body, evidence - 0.5 * (small / _YAW_SIGMA_RAD) ** 2, ahead
+def in_body(velocity: Velocity, turn: FloatArray, at: complex, yaw: float, place: PlacePrior) -> tuple[FloatArray, SideEvidence]:
+    """Forward speed (n,) of a body in which the sensor is turned by ``yaw``, and the evidence of its sideways speed. A mount of the file
+    has a small yaw, with its prior."""
+    small = 0.0 if yaw else _small_yaw(velocity - 1j * turn * at, turn, place.spread_m)[0]
+    body = velocity * np.exp(1j * (yaw + small)) - 1j * turn * at
+    side = side_evidence(body.imag, body.real, turn, place)
+    return body.real, side._replace(evidence=side.evidence - 0.5 * (small / _YAW_SIGMA_RAD) ** 2)
 
 
 def _small_yaw(body: Velocity, turn: FloatArray, place_sigma_m: float) -> tuple[float, float]:
@@ -88,14 +83,14 @@ def _small_yaw(body: Velocity, turn: FloatArray, place_sigma_m: float) -> tuple[
     return float(found[0]), float(found[1])
 
 
-def yaws(velocity: Velocity, turn: FloatArray, place: complex, place_sigmas_m: tuple[float, float]) -> list[tuple[float, float]]:
+def yaws(velocity: Velocity, turn: FloatArray, at: complex, places: tuple[PlacePrior, PlacePrior]) -> list[tuple[float, float]]:
     """Yaws by which the mount may be wrong, with the logarithm of their prior odds: 0, and the axis of travel with both ends, for a sensor
     at its place and for one elsewhere."""
     known = np.isfinite(velocity)
     u, w = velocity[known], turn[known]
     found = [(0.0, 0.0)]
-    for place_sigma in place_sigmas_m if len(u) >= 6 else ():
-        yaw = _axis_of_travel(u, w, place, place_sigma)
+    for place in places if len(u) >= 6 else ():
+        yaw = _axis_of_travel(u, w, at, place.spread_m)
         for angle in (math.remainder(yaw, math.tau), math.remainder(yaw + math.pi, math.tau)):
             quarter = round(angle / (0.5 * math.pi)) * 0.5 * math.pi
             is_quarter = abs(angle - quarter) < _QUARTER_RAD
@@ -108,15 +103,15 @@ def yaws(velocity: Velocity, turn: FloatArray, place: complex, place_sigmas_m: t
     return found
 
 
-def _axis_of_travel(velocity: Velocity, turn: FloatArray, place: complex, place_sigma_m: float) -> float:
+def _axis_of_travel(velocity: Velocity, turn: FloatArray, at: complex, place_sigma_m: float) -> float:
     """Yaw [rad] by which the sideways part of the ``velocity`` (n,) is least, the place ahead profiled at each of `_GRID`."""
-    rotated = velocity[None, :] * np.exp(1j * _GRID)[:, None] - 1j * turn * place
+    rotated = velocity[None, :] * np.exp(1j * _GRID)[:, None] - 1j * turn * at
     sigma = np.sqrt(0.02**2 + (0.1 * np.abs(velocity)) ** 2 + (0.15 * np.abs(turn)) ** 2)
     weight = sigma**-2.0
     ahead = (rotated.imag * turn * weight).sum(1) / ((turn**2 * weight).sum() + place_sigma_m**-2)
     cost = np.log1p(((rotated.imag - ahead[:, None] * turn) / sigma) ** 2).sum(axis=1)
     yaw = float(_GRID[int(cost.argmin())])
-    return yaw + _small_yaw(velocity * np.exp(1j * yaw) - 1j * turn * place, turn, place_sigma_m)[0]
+    return yaw + _small_yaw(velocity * np.exp(1j * yaw) - 1j * turn * at, turn, place_sigma_m)[0]
 
 
 def _up_to_pi(angle: float) -> float:
