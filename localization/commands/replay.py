@@ -19,7 +19,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from localization.commands.common import WIDE, names, new_folder, print_table, write_json
-from localization.errors import EstimatorError, EvaluationError, MapError
+from localization.errors import EstimatorError, EvaluationError, MapError, SettingError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import (
@@ -49,7 +49,7 @@ from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, check_forms
 from motion_models.prior import prior_notes, scaling_prior
 from motion_models.registry import advice, make_model
-from motion_models.robot import Mount
+from motion_models.robot import Mount, Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
@@ -78,6 +78,8 @@ class Replay:
     """Motion models, separated by commas."""
     estimator: str = "odometry,lidar,ekf"
     """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
+    pairs: str = ""
+    """MODEL/ESTIMATOR, separated by commas, such as diff_drive/odometry,skid_steer/ekf; default: each estimator with each model."""
     corrections: str = "constant"
     """Parameters of the motion model that ekf and graph estimate, one or more forms separated by commas: none; constant (k and centre
     of rotation, as random walks); cg_field (coefficients of both as functions of the centre of gravity); or parameters by name joined
@@ -112,14 +114,14 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json, self.save_map, self.extend_map)
-        for name in names(self.model, "--model"):
+        for name in self._models:
             make_model(name, robot)
-        for name in names(self.estimator, "--estimator"):
+        for name in self._named_estimators:
             check_estimator(name, has_lidar=True, has_map=True)
-        log = open_log_with_set_up(self.log, robot, self.topic.scored_against(self.reference)).log
+        log = self._open(robot)
         robot, mounts = log.robot, log.mounts
         has_lidar = log.sources.lidar is not None
-        models = [make_model(name, robot) for name in names(self.model, "--model")]
+        models = [make_model(name, robot) for name in self._models]
         forms = names(self.corrections, "--corrections")
         pairs = self._trials(log, models, check_forms(forms))
         self._check_map(has_lidar)
@@ -128,7 +130,8 @@ class Replay:
         reference, positions = self._reference(log), self._positions(log)
         held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
         # the LiDAR alone uses no motion model: it runs once, and counts for each
-        once = [p for p in pairs if p.estimator != _WHEELLESS or p.model is models[0]]
+        alone = next((p for p in pairs if p.estimator == _WHEELLESS), None)
+        once = [p for p in pairs if p.estimator != _WHEELLESS or p is alone]
         layer = ScanLayer(log.duration_s, mounts)
         with _progress(console, log) as (events, on_event):
             found = replay(layer.watch(merge_positions(events, positions)), once, robot, mounts, has_lidar, self.config, on_event)
@@ -136,7 +139,7 @@ class Replay:
         by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
         runs = []
         for p in pairs:
-            run = by_pair.get((p.model.name, p.estimator, p.corrections)) or by_pair[models[0].name, p.estimator, p.corrections]
+            run = by_pair[(alone if alone is not None and p.estimator == _WHEELLESS else p).model.name, p.estimator, p.corrections]
             several = run.corrections is not None and len(forms) > 1
             label = f"{p.estimator}_{p.corrections.replace('+', '_')}" if several else p.estimator
             runs.append(dataclasses.replace(run, model=p.model.name, estimator=label))
@@ -171,13 +174,36 @@ class Replay:
             console.print(self._extend(self.extend_map, runs, head, mounts), markup=False, soft_wrap=True)
         self._print(console, head, results, reference)
 
+    @property
+    def _chosen(self) -> list[tuple[str, str]]:
+        """Model and estimator of `--pairs`; none by default. Raises `SettingError` for what is no pair."""
+        found = []
+        for pair in names(self.pairs, "--pairs") if self.pairs else ():
+            model, slash, estimator = pair.partition("/")
+            if not (model and slash and estimator):
+                raise SettingError(f"--pairs has '{pair}'; a pair is MODEL/ESTIMATOR, such as skid_steer/ekf.")
+            found.append((model, estimator))
+        return found
+
+    @property
+    def _models(self) -> list[str]:
+        return list(dict.fromkeys(model for model, _ in self._chosen)) or names(self.model, "--model")
+
+    @property
+    def _named_estimators(self) -> list[str]:
+        return list(dict.fromkeys(estimator for _, estimator in self._chosen)) or names(self.estimator, "--estimator")
+
+    def _open(self, robot: Robot) -> Log:
+        return open_log_with_set_up(self.log, robot, self.topic.scored_against(self.reference)).log
+
     def _trials(self, log: Log, models: Sequence[MotionModel], forms: Sequence[Form]) -> list[Trial]:
         """Each estimator with each model, and, where it corrects that, each of the ``forms`` of corrections."""
-        prior = self._prior(log)
+        prior, chosen = self._prior(log), self._chosen
         return [
             Trial(model, estimator, form, prior if estimator == LOCALIZER else None)
             for estimator in self._estimators(log)
             for model in models
+            if not chosen or estimator == LOCALIZER or (model.name, estimator) in chosen
             for form in forms[: None if estimator in ESTIMATORS_WITH_CORRECTIONS else 1]
         ]
 
@@ -196,8 +222,8 @@ class Replay:
             write_json(self.json, metrics)
 
     def _estimators(self, log: Log) -> list[str]:
-        has_lidar, is_default = log.sources.lidar is not None, self.estimator == type(self).estimator
-        found = names(self.estimator, "--estimator")
+        has_lidar, is_default = log.sources.lidar is not None, not self.pairs and self.estimator == type(self).estimator
+        found = self._named_estimators
         found += [LOCALIZER] if self.map is not None and LOCALIZER not in found else []
         for name in found:
             check_estimator(name, has_lidar or (is_default and name != LOCALIZER), self.map is not None, log.no_wheels)
@@ -217,7 +243,7 @@ class Replay:
         prior.check_lidar(log.sources.has_clouds, bool(is_planar))
         if not prior.is_in_space and is_planar is False:
             raise MapError(f"map '{self.map}' holds planar scans: poses in it are in the plane. Leave out --config.step.no-planar.")
-        if self.positions is not None and "graph" not in names(self.estimator, "--estimator"):
+        if self.positions is not None and "graph" not in self._named_estimators:
             saved.planar(self.map, "--positions without the estimator graph")
         return prior
 
@@ -255,7 +281,7 @@ class Replay:
         """Refuse `--save-map` before the run, where there will be no map."""
         if self.save_map is None:
             return
-        if "graph" not in names(self.estimator, "--estimator"):
+        if "graph" not in self._named_estimators:
             raise EstimatorError("--save-map saves the map of the graph. Add it: --estimator odometry,ekf,graph.")
         if not has_lidar:
             raise EstimatorError("--save-map needs scans, and there are none in this log. Leave it out, or pass --topic.scan.")
@@ -281,7 +307,7 @@ class Replay:
     def _positions(self, log: Log) -> list[PositionSample]:
         if self.positions is None:
             return []
-        if "graph" not in self.estimator.split(",") and self.map is None:
+        if "graph" not in self._named_estimators and self.map is None:
             raise EstimatorError("--positions are fused by the graph alone. Add it: --estimator odometry,ekf,graph.")
         samples = log.references(self.positions)
         return read_positions(itertools.islice(samples, 0, None, 2) if self._is_held_out(log) else samples, self.positions)
@@ -294,7 +320,7 @@ class Replay:
         return self.positions is not None and self.positions == self._reference_name(log)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
-        prior = scaling_prior(load_robot(self.robot), names(self.model, "--model"))
+        prior = scaling_prior(load_robot(self.robot), self._models)
         return {
             "log": head.log,
             "robot": head.robot,
@@ -316,7 +342,7 @@ class Replay:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
-        for sentence in advice(load_robot(self.robot), names(self.model, "--model")):
+        for sentence in advice(load_robot(self.robot), self._models):
             console.print(sentence, markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 

@@ -7,7 +7,7 @@ import io
 import json
 import shlex
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from localization.commands.diagnose import Diagnose
 from localization.commands.info import Info
 from localization.commands.init import Init
 from localization.commands.replay import Replay
-from localization.logs import TopicOverrides, open_log
+from localization.logs import Log, TopicOverrides, open_log
 from localization.output import check_outputs
 from localization.report.try_page import Part, TryResult, summarize, write_try_page
 from motion_models.diff_drive import DiffDrive
@@ -99,8 +99,7 @@ class Try:
         robot = load_robot(robot_file)
         runner.run("info", Info(self.log, robot_file, json=folder / "info.json"), self._line("info"))
         runner.run("check", Check(self.log, robot_file, out=folder / "check"), self._line("check"))
-        checked = folder / "check" / "robot.toml"
-        robot_file = str(checked) if checked.exists() else robot_file
+        robot_file = _corrected_file(robot_file, folder / "check" / "robot.toml")
         models = tuple(dict.fromkeys((DiffDrive.name, recommended_model(robot))))
         before = load_robot(robot_file)
         cut = self._cut(before)
@@ -112,11 +111,11 @@ class Try:
         calibrated = folder / "calibrated.toml"
         best = str(calibrated) if calibrated.exists() else robot_file
         has_lidar = open_log(self.log, load_robot(best)).sources.lidar is not None
-        estimators = "odometry,graph" if has_lidar else "odometry,ekf"
-        replay = Replay(
-            self.log, best, folder / "replay", model=",".join(models), estimator=estimators, reference=self.reference, static=True
-        )
-        runner.run("replay", replay, self._line("replay", f"--model {','.join(models)} --estimator {estimators}"))
+        pairs = ",".join((*(f"{model}/odometry" for model in models), f"{models[-1]}/{'graph' if has_lidar else 'ekf'}"))
+        # The calibrated robot differs from the one that the cut was judged with by its motion model alone.
+        command = Replay if cut is None else _ReplayAsDeclared
+        replay = command(self.log, best, folder / "replay", pairs=pairs, reference=self.reference, static=True)
+        runner.run("replay", replay, self._line("replay", f"--pairs {pairs}"))
         runner.run("diagnose", Diagnose(self.log, best, out=folder / "diagnosis", static=True), self._line("diagnose"))
         return TryResult(self.log.name, before, load_robot(best), models[-1], tuple(runner.parts), cut, _contents(folder, models))
 
@@ -147,6 +146,22 @@ class _CalibrateOn(Calibrate):
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         return super()._cut(path, robot, kind) if self.cut is None else self.cut
+
+
+@dataclass(frozen=True)
+class _ReplayAsDeclared(Replay):
+    """`Replay` of a log that the robot file was found to describe."""
+
+    def _open(self, robot: Robot) -> Log:
+        return open_log(self.log, robot, self.topic.scored_against(self.reference))
+
+
+def _corrected_file(robot_file: str, checked: Path) -> str:
+    """``checked`` where it corrects the robot of ``robot_file``, else that: a log is asked for its set-up once for each robot."""
+    if not checked.exists():
+        return robot_file
+    before, after = load_robot(robot_file), load_robot(str(checked))
+    return robot_file if replace(after, name=before.name) == before else str(checked)
 
 
 @contextlib.contextmanager
