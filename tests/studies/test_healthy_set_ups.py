@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers.cut_logs import REAL
 from tests.helpers.extended import cases
-from tests.studies.healthy_set_ups import KINDS, check, check_window
+from tests.studies.healthy_set_ups import KINDS, check, check_window, seed_of
 
 if importlib.util.find_spec("localization.evidence") is None:
     pytest.skip("the inference of set-ups is not there", allow_module_level=True)
@@ -24,6 +24,11 @@ SOURCES = {
 @pytest.mark.parametrize("kind", cases(KINDS, usual=USUAL))
 def test_healthy_drive_of_a_kind_is_accused_of_nothing(kind: str) -> None:
     assert check(kind, 20, SOURCES.get(kind, ("wheels", "gyro"))).accusations == ()
+
+
+def test_side_that_hardly_rolls_shows_no_unit() -> None:
+    """On a circle to the left the left wheels hardly roll: twice their rates change nothing else, and were the more probable unit."""
+    assert check("circles one way", seed_of(1301, 4), ("wheels", "gyro", "lidar", "reference")).accusations == ()
 
 
 @pytest.mark.extended

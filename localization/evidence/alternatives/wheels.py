@@ -34,6 +34,8 @@ _FIELDS_SIGMA, _FIELDS_WIDE = 0.1, 3.0
 _MIN_MOVING = 12
 """Values in motion that show a ratio: half a wheel's rates over six seconds."""
 
+_SLIP = 0.15
+"""Noise of wheels, a part of their motion (`likelihood.NOISE`)."""
 Wiring = tuple[tuple[int, ...], tuple[int, ...], FloatArray, tuple[Row, ...]]
 """Columns of the left and right wheels, signs (joints,), rows."""
 
@@ -216,7 +218,14 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
             text = f"rates of the {side} wheels are in another unit than the others' ({name})"
             row = Row(f"wheels.factor_{side}", text, _ODDS["side_unit"], name, factor, partial(_scale_side, side, factor))
             way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
-            yield Alternative((row,), way, turn, (math.sqrt(factor), math.sqrt(factor)), _alike_evidence(rates, *sides), 0.05, 0.05)
+            own, other = (of_left, of_right) if side == "left" else (of_right, of_left)
+            units = factor ** (0.5 * _seen(own / factor, other))
+            yield Alternative((row,), way, turn, (units, units), _alike_evidence(rates, *sides), 0.05, 0.05)
+
+
+def _seen(rate: FloatArray, other: FloatArray) -> FloatArray:
+    """Share (n,) of the ``rate`` of a side that is seen beside the noise of the ``other`` side's: one that hardly rolls shows no unit."""
+    return np.asarray(rate**2 / (rate**2 + (_SLIP * other) ** 2 + 1e-12))
 
 
 def _set_sides(left: tuple[str, ...], right: tuple[str, ...], robot: Robot) -> Robot:
