@@ -294,6 +294,11 @@ def no_such_estimator(tmp_path):
     return [str(log), "--robot", "vaultbot", "--estimator", "ukf"], "ekf"
 
 
+def no_pair(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
+    return [str(log), "--robot", "vaultbot", "--pairs", "diff_drive/odometry,skid_steer"], "a pair is MODEL/ESTIMATOR"
+
+
 def no_such_robot(tmp_path):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(2.0))
     return [str(log), "--robot", "r2d2"], "husky_a200"
@@ -325,8 +330,8 @@ def a_setting_of_no_use(tmp_path):
     "case",
     [
         *(no_such_file, not_a_bag, no_such_topic, unknown_joints, one_message, other_times, no_such_reference),
-        *(no_such_model, no_such_estimator, no_such_robot, no_lidar, a_setting_of_no_use),
-        *(nothing_asked(option) for option in ("--model", "--estimator", "--corrections")),
+        *(no_such_model, no_such_estimator, no_such_robot, no_pair, no_lidar, a_setting_of_no_use),
+        *(nothing_asked(option) for option in ("--model", "--estimator", "--pairs", "--corrections")),
     ],
 )
 def test_replay_bad_input_is_refused_and_no_file_written(case, tmp_path, capsys):
@@ -337,6 +342,19 @@ def test_replay_bad_input_is_refused_and_no_file_written(case, tmp_path, capsys)
     assert hint in printed
     assert not (tmp_path / "out").exists()
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_replay_of_pairs_runs_these_alone_as_in_the_whole_table(tmp_path):
+    log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(4.0))
+    of_pairs = ("--pairs", "skid_steer/lidar,diff_drive/odometry,skid_steer/ekf")
+    of_all = ("--model", "diff_drive,skid_steer", "--estimator", "odometry,lidar,ekf")
+    found = []
+    for name, options in (("pairs", of_pairs), ("all", of_all)):
+        assert replay(log, tmp_path / name, "--robot", "vaultbot", *options) == 0
+        metrics = json.loads((tmp_path / name / "metrics.json").read_text())
+        found.append({(r["model"], r["estimator"]): r for r in metrics["results"]})
+    assert sorted(found[0]) == [("diff_drive", "odometry"), ("skid_steer", "ekf"), ("skid_steer", "lidar")]
+    assert all(found[1][pair] == result for pair, result in found[0].items())
 
 
 def test_replay_existing_output_is_refused(tmp_path, capsys):

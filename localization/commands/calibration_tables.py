@@ -33,6 +33,8 @@ from motion_models.skid_steer import SkidSteer
 
 Trial = tuple[float, float]
 _MANY_TIMES = 1.5  # a noise model that is wrong by less is right
+_DIGITS = 12
+"""Digits beyond which a robot's own number is rounding, and zero is printed."""
 
 
 def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
@@ -56,7 +58,8 @@ def print_fit(console: Console, found: Calibrated, about: TurningInPlace, cuts: 
     )
     table.columns[4].justify = "left"
     for name, (before, value, sigma) in _parameters(found).items():
-        add_row(table, name, f"{before:.5g}", f"{value:.5g}", f"{sigma:.2g}", text_of(found.model, name))
+        shown = f"{round(before, _DIGITS) + 0.0:.5g}", f"{value:.5g}", f"{sigma:.2g}"
+        add_row(table, name, *shown, text_of(found.model, name))
     print_table(console, table)
     if found.calibration.held:
         print_line(console, "\nNot revealed by this drive, and held:")
