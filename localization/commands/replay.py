@@ -42,8 +42,11 @@ from localization.maps import SavedMap, load_map, save_map
 from localization.maps.space_places import make_places
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial
+from localization.report.cg_figure import turn_blocks
+from localization.report.page import Block
 from localization.report.replay_page import COLUMNS, MISSING, Column, ReportHead, overview_png, verdict, with_values, write_report
 from localization.report.scan_layer import ScanLayer
+from localization.report.turn_layer import TurnLayer
 from localization.trajectory import write_tum
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, check_forms
@@ -132,9 +135,10 @@ class Replay:
         # the LiDAR alone uses no motion model: it runs once, and counts for each
         alone = next((p for p in pairs if p.estimator == _WHEELLESS), None)
         once = [p for p in pairs if p.estimator != _WHEELLESS or p is alone]
-        layer = ScanLayer(log.duration_s, mounts)
+        layer, turns = ScanLayer(log.duration_s, mounts), TurnLayer(robot)
         with _progress(console, log) as (events, on_event):
-            found = replay(layer.watch(merge_positions(events, positions)), once, robot, mounts, has_lidar, self.config, on_event)
+            watched = turns.watch(layer.watch(merge_positions(events, positions)))
+            found = replay(watched, once, robot, mounts, has_lidar, self.config, on_event)
         self._refuse_tilt(log, once, found)
         by_pair = {(p.model.name, p.estimator, p.corrections): run for p, run in zip(once, found, strict=True)}
         runs = []
@@ -163,6 +167,7 @@ class Replay:
             ],
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
+            center_of_gravity=_about_center_of_gravity(turns, found, models, robot),
             scans=layer.scans,
         )
         self._write(head, results, reference)
@@ -345,6 +350,15 @@ class Replay:
         for sentence in advice(load_robot(self.robot), self._models):
             console.print(sentence, markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
+
+
+def _about_center_of_gravity(layer: TurnLayer, runs: Sequence[Run], models: Sequence[MotionModel], robot: Robot) -> list[Block]:
+    """k and centre of rotation against a centre of gravity that moves, by the last estimator that fuses the LiDAR; none without."""
+    fused = [run for run in runs if run.lidar is not None and run.estimator != _WHEELLESS and len(run.trajectory)]
+    if not fused:
+        return []
+    turns = layer.turns(fused[-1].trajectory)
+    return turn_blocks(turns, [(model.name, model) for model in models], robot) if turns.moves else []
 
 
 def saved_map(runs: Sequence[Run], head: ReportHead, mounts: Mapping[str, Mount], config: Mapping[str, Any]) -> SavedMap:

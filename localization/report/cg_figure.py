@@ -40,26 +40,42 @@ class Turns(NamedTuple):
         return len(self.k) > 1 and float(np.ptp(self.cg[:, 0])) > _MIN_SPREAD_M
 
 
+class Turn(NamedTuple):
+    """One turn in place."""
+
+    cg: FloatArray
+    k: float
+    x_cr: float
+
+
+def turn_of(ways: FloatArray, motion: FloatArray, cg: FloatArray, robot: Robot) -> Turn | None:
+    """The turn in place in which the wheels turned by ``ways`` (2,) [rad] and the robot moved by ``motion`` (3,), p = (1 - R(yaw)) c; None
+    for another motion."""
+    (left, right), (x, y, yaw) = ways, motion
+    if abs(yaw) < _MIN_TURN_RAD or abs(yaw) > np.pi or abs(left + right) > _MAX_FORWARD * abs(right - left):
+        return None
+    c, s = np.cos(yaw), np.sin(yaw)
+    at = np.linalg.solve(np.array([[1.0 - c, s], [-s, 1.0 - c]]), np.array([x, y]))
+    without_slip = robot.geometry.wheel_radius_m / robot.geometry.track_width_m * (right - left)
+    return Turn(cg, float(yaw / without_slip), float(at[0]))
+
+
+def turns_of(found: Sequence[Turn]) -> Turns:
+    """All of them as arrays."""
+    return Turns(np.array([t.cg for t in found]).reshape(-1, 2), np.array([t.k for t in found]), np.array([t.x_cr for t in found]))
+
+
 def measured_turns(maneuvers: Sequence[Maneuver], robot: Robot) -> Turns:
-    """k and centre of rotation of each window that turns in place, by what measured the motion: p = (1 - R(yaw)) c."""
-    cg, k, x_cr = [], [], []
-    per_rad = robot.geometry.wheel_radius_m / robot.geometry.track_width_m
+    """k and centre of rotation of each window that turns in place, by what measured the motion."""
+    found = []
     for m in maneuvers:
-        if m.middle:
-            continue
         inside = slice(m.lead, m.lead + int(m.ends[-1]))
-        left, right = m.dt[inside] @ m.wheels[inside]
-        x, y, yaw = m.measured[-1]
-        by_wheels = per_rad * (right - left)
-        if abs(yaw) < _MIN_TURN_RAD or abs(yaw) > np.pi or abs(left + right) > _MAX_FORWARD * abs(right - left):
-            continue
-        c, s = np.cos(yaw), np.sin(yaw)
-        at = np.linalg.solve(np.array([[1.0 - c, s], [-s, 1.0 - c]]), np.array([x, y]))
-        has_position = bool(np.isfinite(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1, 0, 0]))
-        cg.append(np.atleast_2d(m.cg)[inside if m.cg.ndim == 2 else slice(None)].mean(axis=0))
-        k.append(yaw / by_wheels)
-        x_cr.append(at[0] if has_position else np.nan)
-    return Turns(np.array(cg).reshape(-1, 2), np.array(k), np.array(x_cr))
+        cg = np.atleast_2d(m.cg)[inside if m.cg.ndim == 2 else slice(None)].mean(axis=0)
+        turn = None if m.middle else turn_of(m.dt[inside] @ m.wheels[inside], m.measured[-1], cg, robot)
+        if turn is not None:
+            has_position = bool(np.isfinite(np.broadcast_to(m.cov, (len(m.ends), 3, 3))[-1, 0, 0]))
+            found.append(turn if has_position else turn._replace(x_cr=np.nan))
+    return turns_of(found)
 
 
 def predicted_turns(model: MotionModel, robot: Robot, cg: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -97,13 +113,18 @@ def cg_svg(turns: Turns, models: Sequence[tuple[str, MotionModel]], robot: Robot
 
 def cg_blocks(turns: Turns, model: str, before: Robot, after: Robot) -> list[html.Block]:
     """The figure by the robot ``before`` and, where that is another one, ``after`` a calibration of the ``model``; none without turns."""
-    if not len(turns.k) or after.drive == DIFF_DRIVE:
-        return []
     models = [("by the robot file", make_model(model, before))]
     if after != before:
         models.append(("calibrated", make_model(model, after)))
+    return turn_blocks(turns, models, after)
+
+
+def turn_blocks(turns: Turns, models: Sequence[tuple[str, MotionModel]], robot: Robot) -> list[html.Block]:
+    """The figure with the curves of ``models`` (label, model); none without turns, and for a robot with casters."""
+    if not len(turns.k) or robot.drive == DIFF_DRIVE:
+        return []
     caption = "Each dot is a window of turning in place. k is the yaw rate over that of wheels without slip."
-    return [html.Figure(cg_svg(turns, models, after), "k and centre of rotation against the centre of gravity", caption)]
+    return [html.Figure(cg_svg(turns, models, robot), "k and centre of rotation against the centre of gravity", caption)]
 
 
 def describe_turns(turns: Turns, model: MotionModel, robot: Robot) -> str:

@@ -74,6 +74,8 @@ class ReportHead:
     """Versions by library."""
     log_fingerprint: str
     """Hash of the log."""
+    center_of_gravity: Sequence[html.Block] = ()
+    """k and centre of rotation against the centre of gravity."""
     scans: Scans = ()
     """Some scans of the drive, for the map: stamp [ns] and points (M, 2) in the body frame [m]."""
 
@@ -97,7 +99,7 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     runs = plotted_runs(results)
     sentences = verdict_sentences(results, reference)
     sections = [
-        *(_sections(runs, reference, head.scans, is_interactive) if runs else []),
+        *(_sections(runs, reference, head, is_interactive) if runs else []),
         html.Section("About the log", html.bullets(head.warnings) or [html.Paragraph("No problem was found in it.")]),
         html.glossary(_TERMS),
         html.Section("Sources and versions", [html.Definitions(_provenance(head, reference))]),
@@ -108,17 +110,18 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
 
 
 def _sections(
-    runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, scans: Scans, is_interactive: bool
+    runs: Sequence[PlottedRun], reference: ReferenceTrack | Relations | None, head: ReportHead, is_interactive: bool
 ) -> list[html.Section]:
     """Numbers and figures."""
     best = best_run(runs) if reference is not None else None
     near = [run for run in runs if best is not None and run is not best and run.error is not None and is_close(run, best)]
     notes = " ".join(_about_reference(runs, reference))
-    explore = [explorer(runs, reference, scans)] if is_interactive and any(len(run.result.run.trajectory) for run in runs) else []
+    explore = [explorer(runs, reference, head.scans)] if is_interactive and any(len(run.result.run.trajectory) for run in runs) else []
     return [
         html.Section(
             "Accuracy" if reference is not None else "Runs", [*accuracy_tables(runs, best, near), html.Paragraph(notes, is_small=True)]
         ),
+        html.Section("What the centre of gravity does", list(head.center_of_gravity)),
         html.Section("Explore", explore),
         html.Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
         html.Section("Map", _grid_blocks(runs)),
