@@ -74,10 +74,10 @@ class ReportHead:
     """Versions by library."""
     log_fingerprint: str
     """Hash of the log."""
-    center_of_gravity: Sequence[html.Block] = ()
-    """k and centre of rotation against the centre of gravity."""
     scans: Scans = ()
     """Some scans of the drive, for the map: stamp [ns] and points (M, 2) in the body frame [m]."""
+    center_of_gravity: Sequence[html.Block] = ()
+    """k and centre of rotation against the centre of gravity."""
 
 
 def write_report(
