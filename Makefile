@@ -29,7 +29,7 @@ KERNELS := $(shell grep -rlE '^@(threaded_kernel|kernel|subroutine)' --include='
 	$(BIN)/skidloc warm-up
 	touch $@
 
-# A minute: real rotations held out, then a drive whose arms move the centre of gravity, and beside both one with a hidden load.
+# Two minutes: real rotations held out, then a drive whose arms move the centre of gravity, and beside both one with a hidden load.
 demo: .venv/installed
 	rm -rf $(DEMO) && mkdir $(DEMO)
 	@echo "Numba compiles what is used, the first time (half a minute)."
