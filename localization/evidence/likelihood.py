@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives.alternative import (
+    SLIP,
     STILL_M_S,
     STILL_RAD_S,
     TEMPER,
@@ -55,8 +56,8 @@ class Noise:
 
 
 NOISE: Mapping[Kind, Noise] = {
-    "wheels": Noise(0.15, 0.01, 0.03, 0.25, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12),
-    "driver": Noise(0.15, 0.01, 0.03, 0.05, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12),
+    "wheels": Noise(SLIP, 0.01, 0.03, 0.25, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12),
+    "driver": Noise(SLIP, 0.01, 0.03, 0.05, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12),
     "gyro": Noise(0.04, 0.01, 0.0, 0.03, 0.0, bias=0.03),
     "lidar": Noise(0.06, 0.02, 0.02, 0.01, 0.04),
     "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),

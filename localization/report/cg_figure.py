@@ -12,6 +12,7 @@ from localization.report.figures import Figure, svg
 from localization.report.page import COLOURS, WIDTH_IN
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Maneuver
+from motion_models.calibration.regressions import center_from_end_poses
 from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.se2 import FloatArray
@@ -41,7 +42,7 @@ class Turns(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """One turn in place."""
+    """One turn in place: an entry of `Turns`."""
 
     cg: FloatArray
     k: float
@@ -49,15 +50,14 @@ class Turn(NamedTuple):
 
 
 def turn_of(ways: FloatArray, motion: FloatArray, cg: FloatArray, robot: Robot) -> Turn | None:
-    """The turn in place in which the wheels turned by ``ways`` (2,) [rad] and the robot moved by ``motion`` (3,), p = (1 - R(yaw)) c; None
-    for another motion."""
-    (left, right), (x, y, yaw) = ways, motion
+    """The turn in place in which the wheels turned by ``ways`` (2,) [rad] and the robot moved by ``motion`` (3,); None for another
+    motion."""
+    (left, right), yaw = ways, float(motion[2])
     if abs(yaw) < _MIN_TURN_RAD or abs(yaw) > np.pi or abs(left + right) > _MAX_FORWARD * abs(right - left):
         return None
-    c, s = np.cos(yaw), np.sin(yaw)
-    at = np.linalg.solve(np.array([[1.0 - c, s], [-s, 1.0 - c]]), np.array([x, y]))
+    centre = center_from_end_poses(np.zeros(3), motion).value
     without_slip = robot.geometry.wheel_radius_m / robot.geometry.track_width_m * (right - left)
-    return Turn(cg, float(yaw / without_slip), float(at[0]))
+    return Turn(cg, float(yaw / without_slip), float(centre[0]))
 
 
 def turns_of(found: Sequence[Turn]) -> Turns:

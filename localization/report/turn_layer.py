@@ -29,7 +29,7 @@ class _Window:
 
 
 class TurnLayer:
-    """Windows of a drive, kept while its events pass through `watch`: four numbers each two seconds, however long it is."""
+    """Windows of a drive, kept while its events pass through `watch`: six numbers each two seconds, however long it is."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._windows = robot, list[_Window]()

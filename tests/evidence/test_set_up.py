@@ -221,7 +221,7 @@ def test_faults_beside_a_lidar_are_found_together(tmp_path: Path, name: str) -> 
 
 
 def test_gyro_reversed_beside_a_turned_lidar_leaves_the_gyro_open_and_turns_the_lidar(tmp_path: Path) -> None:
-    """Left and right exchanged beside a LiDAR upside down turn alike, and gravity says that the gyro is upright.
+    """Left and right exchanged beside a LiDAR upside down turn alike, and gravity measures that the gyro is upright.
 
     The LiDAR is ahead of the front axle: nearer, a load could make up for the place that it has where the robot drives backwards.
     """

@@ -24,6 +24,7 @@ import skidloc
 from localization.calibration.calibrate import turning
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.simulator import RunRecord, write_simulation
+from motion_models.calibration.regressions import center_of_arc
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
 from tests.helpers.diagnosis_drives import drive
@@ -34,6 +35,8 @@ _CG_SHARE = 1.0 / 6.0
 _SEED = 6300
 _STEADY_S = 1.0
 """After which a turn in place is steady [s]."""
+_EXACT = 1e-6 * np.eye(3)
+"""Covariance of true poses, of which the centre of an arc asks for some."""
 
 
 def _minute(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
@@ -71,7 +74,7 @@ class Case:
 
 
 def true_turning(runs: Sequence[RunRecord], robot: Robot) -> Turning:
-    """Least squares over the steady parts of all turns in place, by the true poses and wheel angles."""
+    """Mean over the steady parts of all turns in place, by the true poses and wheel angles."""
     k, centres = [], []
     for run in runs:
         if not run.name.startswith("turn"):
@@ -81,17 +84,8 @@ def true_turning(runs: Sequence[RunRecord], robot: Robot) -> Turning:
         turned = np.unwrap(poses[:, 2])
         ways = robot.geometry.wheel_radius_m * (angles[-1] - angles[0])
         k.append((turned[-1] - turned[0]) / (ways[1] - ways[0]) * robot.geometry.track_width_m)
-        centres.append(_centre(poses[:, :2], turned))
+        centres.append(center_of_arc(poses, _EXACT).value[0])
     return Turning(float(np.mean(k)), float(np.mean(centres)))
-
-
-def _centre(positions: np.ndarray, turned: np.ndarray) -> float:
-    """How far ahead of the body's origin the point is that stays best: position + R(turned) c = const [m]."""
-    n = len(turned)
-    rows = np.zeros((2 * n, 4))
-    rows[0::2, 0], rows[0::2, 1], rows[0::2, 2] = -np.cos(turned), np.sin(turned), 1.0
-    rows[1::2, 0], rows[1::2, 1], rows[1::2, 3] = -np.sin(turned), -np.cos(turned), 1.0
-    return float(np.linalg.lstsq(rows, positions.ravel(), rcond=None)[0][0])
 
 
 def run_case(seed: int, vehicle: Vehicle, model: str, folder: Path) -> Case:

@@ -67,7 +67,7 @@ def usual_place(sigma_m: float, robot: Robot, moves_cg: bool = False) -> PlacePr
 
 
 class SideEvidence(NamedTuple):
-    """What the sideways speed of a sensor says."""
+    """Evidence of the sideways speed of a sensor."""
 
     evidence: float
     ahead_m: float

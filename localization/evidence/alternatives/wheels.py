@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import FACTOR_SIGMA, Alternative, Row, free_factor, mixture, size_of
+from localization.evidence.alternatives.alternative import FACTOR_SIGMA, SLIP, Alternative, Row, free_factor, mixture, size_of
 from localization.evidence.signals import Source
 from motion_models.prior import expected_scaling
 from motion_models.robot import Robot
@@ -34,8 +34,6 @@ _FIELDS_SIGMA, _FIELDS_WIDE = 0.1, 3.0
 _MIN_MOVING = 12
 """Values in motion that show a ratio: half a wheel's rates over six seconds."""
 
-_SLIP = 0.15
-"""Noise of wheels, a part of their motion (`likelihood.NOISE`)."""
 Wiring = tuple[tuple[int, ...], tuple[int, ...], FloatArray, tuple[Row, ...]]
 """Columns of the left and right wheels, signs (joints,), rows."""
 
@@ -225,7 +223,7 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
 
 def _seen(rate: FloatArray, other: FloatArray) -> FloatArray:
     """Share (n,) of the ``rate`` of a side that is seen beside the noise of the ``other`` side's: one that hardly rolls shows no unit."""
-    return np.asarray(rate**2 / (rate**2 + (_SLIP * other) ** 2 + 1e-12))
+    return np.asarray(rate**2 / (rate**2 + (SLIP * other) ** 2 + 1e-12))
 
 
 def _set_sides(left: tuple[str, ...], right: tuple[str, ...], robot: Robot) -> Robot:
