@@ -21,7 +21,7 @@ from localization.evaluation.reference_check import compare_with_log
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
 from localization.events import Event
-from localization.evidence import CORRECTED, SetUp, open_log_with_set_up
+from localization.evidence import CORRECTED, SetUp, SetUpLog, open_log_with_set_up
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
@@ -133,7 +133,7 @@ def check_robot(path: Path, robot: Robot | None, given: Given, reference: str | 
     radius_row, measured_robot = _radius(log.robot, set_up)
     rows += [] if radius_row is None else [radius_row]
     run = _replayed(log, measured_robot)
-    rows += [*_filter_rows(log, run), _reference_row(log, reference)]
+    rows += [*_filter_rows(log, run), _reference_row(found, reference)]
     rows += [] if draft is None else _draft_rows(draft, is_known=log.sources.wheels.kind == "joint_states")
     model = make_model(model_of(measured_robot), measured_robot)
     measured = {} if run is None else {name: run.parameters[name] for name in model.param_names if name in run.parameters}
@@ -296,8 +296,9 @@ def _scaling_row(robot: Robot, run: Run, source: str) -> CheckRow:
     return CheckRow("track and multiplier", value, measured, "ok" if is_same else "contradiction", advice)
 
 
-def _reference_row(log: Log, given: str | None) -> CheckRow:
+def _reference_row(known: SetUpLog, given: str | None) -> CheckRow:
     """Clock, scale and axes of the reference by the motion of the sensors: of the first minute, or of more where that is too even."""
+    log = known.log
     topic = given or log.reference_topic
     if topic is None:
         return CheckRow("reference", "none", "", "cannot be seen", "none is needed; with one (mocap, GPS, map) errors can be measured.")
@@ -305,7 +306,7 @@ def _reference_row(log: Log, given: str | None) -> CheckRow:
     if isinstance(found, Relations):
         return CheckRow("reference", topic, "relations of poses", "cannot be seen", "only whole tracks are compared with the sensors.")
     try:
-        compared = compare_with_log(log, found)
+        compared = compare_with_log(log, found, known.sources)
     except EvaluationError as error:
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", str(error))
     if compared.verdict == "undecidable":

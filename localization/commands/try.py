@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from localization.calibration.calibrate import Cut, cut_log
+from localization.calibration.calibrate import Cut
 from localization.commands.calibrate import Calibrate
 from localization.commands.check import Check
 from localization.commands.common import PlainConsole, new_folder, print_line, write_json
@@ -24,7 +24,10 @@ from localization.commands.diagnose import Diagnose
 from localization.commands.info import Info
 from localization.commands.init import Init
 from localization.commands.replay import Replay
-from localization.logs import Log, TopicOverrides, open_log
+from localization.diagnosis.drive import Drive, drive_of_log
+from localization.diagnosis.handover import Reader
+from localization.evidence import open_log_as_declared
+from localization.logs import Log, open_log
 from localization.output import check_outputs
 from localization.report.try_page import Part, TryResult, summarize, write_try_page
 from motion_models.diff_drive import DiffDrive
@@ -102,29 +105,33 @@ class Try:
         robot_file = _corrected_file(robot_file, folder / "check" / "robot.toml")
         models = tuple(dict.fromkeys((DiffDrive.name, recommended_model(robot))))
         before = load_robot(robot_file)
-        cut = self._cut(before)
+        known = self._cut(before)
+        cut = None if known is None else _cut_of(known[1])
         for model in models:
             name = "calibrated.toml" if model == models[-1] else f"{model}.toml"
             numbers = folder / f"calibrate_{model}.json"
-            calibrate = _CalibrateOn((self.log,), robot_file, model, cut=cut, out=folder / name, json=numbers)
+            calibrate = _CalibrateCut((self.log,), robot_file, model, cut=cut, out=folder / name, json=numbers)
             runner.run(f"calibrate {model}", calibrate, self._line("calibrate", f"--model {model}"))
         calibrated = folder / "calibrated.toml"
         best = str(calibrated) if calibrated.exists() else robot_file
         has_lidar = open_log(self.log, load_robot(best)).sources.lidar is not None
         pairs = ",".join((*(f"{model}/odometry" for model in models), f"{models[-1]}/{'graph' if has_lidar else 'ekf'}"))
-        # The calibrated robot differs from the one that the cut was judged with by its motion model alone.
+        # Calibration changes nothing of the set-up by which the log was cut.
         command = Replay if cut is None else _ReplayAsDeclared
         replay = command(self.log, best, folder / "replay", pairs=pairs, reference=self.reference, static=True)
         runner.run("replay", replay, self._line("replay", f"--pairs {pairs}"))
-        runner.run("diagnose", Diagnose(self.log, best, out=folder / "diagnosis", static=True), self._line("diagnose"))
+        diagnose = _DiagnoseDrive(self.log, best, out=folder / "diagnosis", static=True, known=known)
+        runner.run("diagnose", diagnose, self._line("diagnose"))
         return TryResult(self.log.name, before, load_robot(best), models[-1], tuple(runner.parts), cut, _contents(folder, models))
 
-    def _cut(self, robot: Robot) -> Cut | None:
-        """Windows of the log with what measured them; None where nothing did."""
+    def _cut(self, robot: Robot) -> tuple[Log, Drive] | None:
+        """The log and its windows, with what was measured in each; None where nothing was."""
         try:
-            return cut_log(self.log, robot, TopicOverrides(), "auto", None)
+            log = open_log_as_declared(self.log, robot)
+            drive = drive_of_log(log)
         except SkidlocError:
             return None
+        return (log, drive) if drive.maneuvers else None
 
     def _line(self, command: str, more: str = "") -> str:
         """Command line of one part alone."""
@@ -139,7 +146,7 @@ class Try:
 
 
 @dataclass(frozen=True)
-class _CalibrateOn(Calibrate):
+class _CalibrateCut(Calibrate):
     """`Calibrate` on windows that were cut before, where there are any: cutting matches all scans."""
 
     cut: Cut | None = None
@@ -154,6 +161,24 @@ class _ReplayAsDeclared(Replay):
 
     def _open(self, robot: Robot) -> Log:
         return open_log(self.log, robot, self.topic.scored_against(self.reference))
+
+
+@dataclass(frozen=True)
+class _DiagnoseDrive(Diagnose):
+    """`Diagnose` of a log whose windows were cut before, where there are any."""
+
+    known: tuple[Log, Drive] | None = None
+
+    def _reader(self, path: Path) -> Reader:
+        reader = super()._reader(path)
+        if self.known is not None:
+            reader.know(*self.known)
+        return reader
+
+
+def _cut_of(drive: Drive) -> Cut:
+    """The windows of ``drive`` for a calibration."""
+    return Cut(drive.name, drive.maneuvers, drive.motion_reference, drive.warnings)
 
 
 def _corrected_file(robot_file: str, checked: Path) -> str:

@@ -19,7 +19,7 @@ from localization.diagnosis.gate import HandoverCheck, HeldRows, Replayed, compa
 from localization.diagnosis.linearization import TOLERANCE, Linearization, candidate_causes, linearize, make_predictor, make_regression
 from localization.diagnosis.noise import Noise
 from localization.log_replay import Run, replay
-from localization.logs.reader import Log
+from localization.logs.reader import Log, open_log
 from localization.pipeline import Trial
 from motion_models import se2
 from motion_models.calibration.maneuvers import IntArray
@@ -57,16 +57,24 @@ class Reader:
     _replayed: dict[tuple[int, str, int], tuple[Robot, list[Run]]] = dataclasses.field(default_factory=dict, init=False, repr=False)
     """Runs by robot, model and start; with the robot as above."""
 
+    def know(self, log: Log, drive: Drive) -> None:
+        """Take the ``log`` as open, and its ``drive`` as cut, which were before."""
+        self._logs[id(drive.robot)] = drive.robot, log
+        self._drives[id(drive.robot)] = drive.robot, drive
+
     def log(self, robot: Robot) -> Log:
-        """The log by ``robot``; opened and checked once."""
+        """The log by ``robot``; checked once for all robots that read it in the same way."""
         if id(robot) not in self._logs:
-            self._logs[id(robot)] = robot, self.open(robot)
+            known = next((log for other, log in self._logs.values() if is_read_alike(robot, other)), None)
+            self._logs[id(robot)] = robot, self.open(robot) if known is None else open_log(known.path, robot, known.overrides)
         return self._logs[id(robot)][1]
 
     def drive(self, robot: Robot) -> Drive:
-        """The windows of the log by ``robot``."""
+        """The windows of the log by ``robot``; cut once for all robots that read it in the same way."""
         if id(robot) not in self._drives:
-            drive = self.cut(self.log(robot))
+            log = self.log(robot)
+            known = next((drive for other, drive in self._drives.values() if is_read_alike(robot, other)), None)
+            drive = self.cut(log) if known is None else dataclasses.replace(known, robot=log.robot)
             self._drives |= {id(robot): (robot, drive), id(drive.robot): (drive.robot, drive)}  # a log's wiring may be another robot's
         return self._drives[id(robot)][1]
 
@@ -78,6 +86,11 @@ class Reader:
             events = (event for event in log.events() if event.stamp_ns >= start_ns)
             self._replayed[key] = robot, replay(events, trials, log.robot, log.mounts, log.sources.lidar is not None)
         return self._replayed[key][1]
+
+
+def is_read_alike(robot: Robot, other: Robot) -> bool:
+    """Whether messages are the same motion to both, which differ by their motion models at most."""
+    return dataclasses.replace(robot, name=other.name, models=other.models) == other
 
 
 @dataclasses.dataclass(frozen=True)

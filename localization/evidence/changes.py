@@ -16,7 +16,7 @@ import numpy as np
 from localization.evidence.alternatives import Alternative, Row
 from localization.evidence.alternatives.alternative import LEVELS
 from localization.evidence.angles import BoolArray
-from localization.evidence.likelihood import Choice, Stack, evidence_by_bin, log_posterior, varied
+from localization.evidence.likelihood import Choice, Evidence, Stack, varied
 from motion_models.se2 import FloatArray
 
 _ODDS = math.log(0.1)
@@ -28,27 +28,28 @@ _TRIED, _EVERY = 8, 2
 _REMEDY = "Drive with one set-up per log: cut the log there, and find what restarted."
 
 
-def with_changes(stacks: Sequence[Stack], choices: Sequence[Choice]) -> tuple[list[Stack], list[Choice]]:
-    """``stacks`` with an alternative that changes within the log for each source and each of ``choices`` that one improves, and the choices
-    with them."""
-    found, changed = list(stacks), list[Choice]()
+def with_changes(evidence: Evidence, choices: Sequence[Choice]) -> tuple[Evidence, list[Choice]]:
+    """``evidence`` with an alternative that changes within the log for each source and each of ``choices`` that one improves, and those
+    choices."""
+    found, changed = list(evidence.stacks), list[Choice]()
     for choice in choices:
-        for i, stack in enumerate(stacks):
-            composite = _best_change(stacks, choice, i)
+        for i, stack in enumerate(evidence.stacks):
+            composite = _best_change(evidence, choice, i)
             if composite is not None:
                 alternatives = [*found[i].alternatives, composite]
                 found[i] = stack.of(alternatives)
                 changed.append((*choice[:i], len(alternatives) - 1, *choice[i + 1 :]))
-    return found, changed
+    return evidence.with_more(found), changed
 
 
-def _best_change(stacks: Sequence[Stack], choice: Choice, index: int) -> Alternative | None:
+def _best_change(evidence: Evidence, choice: Choice, index: int) -> Alternative | None:
     """The most probable alternative of one source that has a row more on one side of a change, the other sources as in ``choice``; None
     where none is more probable than the best without a change."""
+    stacks = evidence.stacks
     stack, bins = stacks[index], range(_MIN_BINS, len(stacks[index].t) - _MIN_BINS, _EVERY)
-    level = max(LEVELS, key=lambda each: log_posterior(stacks, np.array([choice]), each)[0])
+    level = max(LEVELS, key=lambda each: evidence.log_posterior(np.array([choice]), each)[0])
     choices = varied(choice, index, stack)
-    E = evidence_by_bin(stacks, choices, level) + stack.log_jacobians
+    E = evidence.by_bin(choices, level) + stack.log_jacobians
     own = np.array([a.log_prior + a.own for a in stack.alternatives])
     candidates = list[tuple[float, int, int, Row, bool]]()
     for base, k, row in _pairs(stack) if bins else ():
@@ -60,9 +61,9 @@ def _best_change(stacks: Sequence[Stack], choice: Choice, index: int) -> Alterna
     joined = [_joined(stack, base, k, row, m, is_since) for _, base, k, row, is_since in best for m in bins]
     if not joined:
         return None
-    tried = [stack.of(joined) if i == index else other for i, other in enumerate(stacks)]
-    scores = log_posterior(tried, varied(choice, index, tried[index]), level)
-    unchanged = log_posterior(stacks, choices, level)
+    tried = Evidence([stack.of(joined) if i == index else other for i, other in enumerate(stacks)])
+    scores = tried.log_posterior(varied(choice, index, tried.stacks[index]), level)
+    unchanged = evidence.log_posterior(choices, level)
     return joined[int(scores.argmax())] if scores.max() > unchanged.max() else None
 
 

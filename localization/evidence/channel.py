@@ -7,7 +7,7 @@ c_i ~ N(0, tau_i^2), a bias b_i of gyros, and n_i ~ N(0, V_i), V_i = floor_i^2 +
     log p(z) = -1/2 [z' V^-1 z - (a' V^-1 z)^2 / C + log|V| + log(C S^2) + k log 2 pi],    C = a' V^-1 a + S^-2,
 
 (Rasmussen & Williams 2006, A.3). Scales and biases are those of the maximum, with the width of their posterior (Laplace). In a share of the
-bins one source is somewhere else, or all are: a mixture. A profile shows this to be nine tenths of the time of a set-up: hence the loops.
+bins one source is somewhere else, or all are: a mixture. A profile shows this to be most of the time of a set-up: hence the loops.
 """
 
 from __future__ import annotations

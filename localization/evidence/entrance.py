@@ -45,17 +45,21 @@ class SetUpLog:
     log: Log
     """With what is certain corrected (`Log.robot`, `Log.mounts`)."""
     set_up: SetUp
+    sources: tuple[Source, ...] | None = None
+    """What it was inferred from; None where the log is read otherwise now, or where the answer was known."""
 
 
 def open_log_with_set_up(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> SetUpLog:  # noqa: B008
     """The log at ``path`` as `open_log` opens it, with what is certain corrected. Raises what that does."""
     log, question = open_log(path, robot, topics), _question(Path(path), robot, topics)
-    found = _ANSWERS[question] if question in _ANSWERS else infer_set_up(log)
+    sources = None if question in _ANSWERS else tuple(read_sources(log))
+    found = _ANSWERS[question] if sources is None else infer(sources, log.robot)
     _ANSWERS[question] = found
     if not found.is_as_declared:
+        sources = None
         log = open_log(path, found.robot, topics if found.is_gyro_used else replace(topics, imu=""))
         log.add_notes(found.sentences)
-    return SetUpLog(log, found)
+    return SetUpLog(log, found, sources)
 
 
 _ANSWERS: dict[bytes, SetUp] = {}

@@ -179,6 +179,22 @@ class Stack:
         own = self.jitter.get(channel, 0.0)
         return np.hypot(level * self.floor(name), own * self.unit(channel)[:, None]) if own else level * self.floor(name)
 
+    def alike(self, name: str) -> Choices:
+        """(A,) index of the first alternative by which a channel is the same, with its noise and its unit."""
+        return self._alike[name]
+
+    @cached_property
+    def _alike(self) -> dict[str, Choices]:
+        found = {}
+        for name in _SIZES:
+            parts = [self.tau[name][:, None], self.log_unit(name)]
+            parts += [a for a in (self.channel(name), self._floors.get(name)) if a is not None]
+            parts += [self._floors["skidding"]] if name == "turn" and "skidding" in self._floors else []
+            rows = np.hstack(parts)
+            first: dict[bytes, int] = {}
+            found[name] = np.array([first.setdefault(row.tobytes(), i) for i, row in enumerate(rows)])
+        return found
+
     @cached_property
     def _floors(self) -> dict[str, FloatArray]:
         noise, way = NOISE[self.kind], self.channel("way")
@@ -243,16 +259,38 @@ def varied(choice: Choice, index: int, stack: Stack) -> Choices:
     return found
 
 
-def log_posterior(stacks: Sequence[Stack], choices: Choices, level: float) -> FloatArray:
-    """Log posterior (A,) of ``choices`` at a ``level`` of the noise."""
-    own = sum(stack.own[rows] for stack, rows in zip(stacks, choices.T, strict=True))
-    return np.asarray(own + evidence_by_bin(stacks, choices, level).sum(axis=1))
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Evidence of choices among the alternatives of ``stacks``.
 
+    Most choices differ from others in one channel, or in rows that no channel shows: what was computed of a channel is kept.
+    """
 
-def evidence_by_bin(stacks: Sequence[Stack], choices: Choices, level: float) -> FloatArray:
-    """(A, n) the part of `log_posterior` that the sources have of each other."""
-    names = [name for name in _SIZES if any(stack.channel(name) is not None for stack in stacks)]
-    return np.asarray(sum(_evidence(stacks, choices, name, level) for name in names))
+    stacks: Sequence[Stack]
+    _known: dict[tuple[str, float], dict[Choice, FloatArray]] = field(default_factory=dict)
+    """Evidence (n,) by channel, level of the noise, and index of the first alternative of each source with the same channel."""
+
+    def with_more(self, stacks: Sequence[Stack]) -> Evidence:
+        """The evidence of ``stacks``, which have further alternatives behind those that were there."""
+        return Evidence(stacks, self._known)
+
+    def log_posterior(self, choices: Choices, level: float) -> FloatArray:
+        """Log posterior (A,) of ``choices`` at a ``level`` of the noise."""
+        own = sum(stack.own[rows] for stack, rows in zip(self.stacks, choices.T, strict=True))
+        return np.asarray(own + self.by_bin(choices, level).sum(axis=1))
+
+    def by_bin(self, choices: Choices, level: float) -> FloatArray:
+        """(A, n) the part of `log_posterior` that the sources have of each other."""
+        names = [name for name in _SIZES if any(stack.channel(name) is not None for stack in self.stacks)]
+        return np.asarray(sum(self._of_channel(choices, name, level) for name in names))
+
+    def _of_channel(self, choices: Choices, name: str, level: float) -> FloatArray:
+        known = self._known.setdefault((name, level), {})
+        firsts = [tuple(row) for row in np.stack([s.alike(name)[k] for s, k in zip(self.stacks, choices.T, strict=True)], axis=1).tolist()]
+        new = [first for first in dict.fromkeys(firsts) if first not in known]
+        if new:
+            known.update(zip(new, _evidence(self.stacks, np.array(new), name, level), strict=True))
+        return np.array([known[first] for first in firsts])
 
 
 def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:

@@ -13,7 +13,7 @@ from localization.evidence.alternatives import MAKERS, Alternative, Row
 from localization.evidence.alternatives.alternative import LEVELS, size_of, unrelated_evidence
 from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
-from localization.evidence.likelihood import Choice, Stack, least_sizes, log_posterior, varied
+from localization.evidence.likelihood import Choice, Evidence, Stack, least_sizes, varied
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -156,26 +156,28 @@ class Found:
 def search(stacks: Sequence[Stack]) -> Found:
     """The best choices, and how far the drive refutes each single fault."""
     null = tuple(0 for _ in stacks)
+    evidence = Evidence(stacks)
     found: dict[Choice, float] = {}
     against: dict[str, float] = {}
     for level in _SEARCH_LEVELS:
-        for key, value in _search_at(stacks, null, level, found).items():
+        for key, value in _search_at(evidence, null, level, found).items():
             against[key] = min(value, against.get(key, math.inf))
     best = [choice for choice in sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED] if found[choice] > -_FAR]
-    stacks, changed = with_changes(stacks, list(dict.fromkeys([*best[:_CHANGED], null])))
+    evidence, changed = with_changes(evidence, list(dict.fromkeys([*best[:_CHANGED], null])))
     kept = list(dict.fromkeys([null, *best, *changed]))
-    return Found(dict(zip(kept, _marginal(stacks, kept).tolist(), strict=True)), against, stacks)
+    return Found(dict(zip(kept, _marginal(evidence, kept).tolist(), strict=True)), against, evidence.stacks)
 
 
-def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[Choice, float]) -> dict[str, float]:
+def _search_at(evidence: Evidence, null: Choice, level: float, found: dict[Choice, float]) -> dict[str, float]:
     """Add the best choices at a ``level`` to ``found``; the Bayes factors against single faults."""
+    stacks = evidence.stacks
     at_level: dict[Choice, float] = {}
     done: set[Choice] = set()
 
     def expand(choice: Choice) -> None:
         done.add(choice)
         for i in range(len(stacks)):
-            for k, value in enumerate(log_posterior(stacks, varied(choice, i, stacks[i]), level)):
+            for k, value in enumerate(evidence.log_posterior(varied(choice, i, stacks[i]), level)):
                 at_level[(*choice[:i], k, *choice[i + 1 :])] = float(value)
 
     expand(null)
@@ -188,7 +190,7 @@ def _search_at(stacks: Sequence[Stack], null: Choice, level: float, found: dict[
     best = sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]
     twins = [twin for choice in best for twin in (*_mirrored(stacks, choice), *_shifted(stacks, choice))]
     if twins and not is_clear:
-        at_level.update(zip(twins, log_posterior(stacks, np.array(twins), level).tolist(), strict=True))
+        at_level.update(zip(twins, evidence.log_posterior(np.array(twins), level).tolist(), strict=True))
         for choice in sorted({*best, *twins}, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
             if choice not in done:
                 expand(choice)
@@ -265,9 +267,9 @@ def _mirror_of(stack: Stack, k: int, signs: Mapping[str, float]) -> int | None:
     return int(np.flatnonzero(fits)[stack.own[fits].argmax()]) if fits.any() else None
 
 
-def _marginal(stacks: Sequence[Stack], choices: Sequence[Choice]) -> FloatArray:
+def _marginal(evidence: Evidence, choices: Sequence[Choice]) -> FloatArray:
     """Log posterior (A,) of ``choices``, integrated over the level of the noise."""
-    return np.asarray(np.logaddexp.reduce([log_posterior(stacks, np.array(choices), level) for level in LEVELS]))
+    return np.asarray(np.logaddexp.reduce([evidence.log_posterior(np.array(choices), level) for level in LEVELS]))
 
 
 def rows_of(stacks: Sequence[Stack], choice: Choice) -> tuple[Row, ...]:

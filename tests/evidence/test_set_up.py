@@ -18,6 +18,7 @@ from localization.cli import main
 from localization.events import WheelSample
 from localization.evidence import SetUp, entrance, infer_set_up, open_log_with_set_up
 from localization.evidence.alternatives.alternative import mount_correction
+from localization.evidence.entrance import infer
 from localization.logs import TopicOverrides, open_log
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot, robot_toml
@@ -70,7 +71,7 @@ def test_healthy_log_has_no_sentence(name: str) -> None:
 
 def test_a_log_is_asked_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[object] = []
-    monkeypatch.setattr(entrance, "infer_set_up", lambda log: asked.append(log) or infer_set_up(log))
+    monkeypatch.setattr(entrance, "infer", lambda *question: asked.append(question) or infer(*question))
     log = drive(tmp_path / "log.mcap")
     first, again = open_log_with_set_up(log, ROBOT), open_log_with_set_up(log, ROBOT)
     assert first.set_up is again.set_up
