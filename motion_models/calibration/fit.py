@@ -246,6 +246,7 @@ class Problem:
             self.combine[names.index(master), len(names) + i] = factor
         self.everything = np.concatenate([start, [0.0, 0.0, *config.reference_at, 0.0]])
         self.start = self.everything[self.columns]
+        self._last: tuple[FloatArray, tuple[FloatArray, FloatArray]] = np.zeros(0), (np.zeros(0), np.zeros(0))
         declared = dict(zip((*model.param_names, *REFERENCE_PARAM_NAMES), (*scales(model), *REFERENCE_SCALES), strict=True))
         self.scales = np.array([config.scales.get(name, declared[name]) for name in names])
         sigmas = np.array([config.prior_sigma.get(name, np.inf) for name in names])
@@ -302,6 +303,11 @@ class Problem:
         ways that bend: differences of positions are biased by half the covariance of heading and side (Barfoot and Furgale 2014,
         "Associating uncertainty with three-dimensional poses", sec. III). Without a measured heading there is no such logarithm.
         """
+        if not np.array_equal(x, self._last[0]):  # a stage of the fit begins where the one before ended
+            self._last = x, self._residuals(x)
+        return self._last[1]
+
+    def _residuals(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         poses, d, _ = predict(self.model, self.batch, self.params(x), self.reference_params(x), self.all_columns, self.config.noise)
         off = se2.between(self.batch.measured, poses)
         d = d @ self.combine.T
