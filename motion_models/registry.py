@@ -43,6 +43,12 @@ def recommended_model(robot: Robot) -> str:
     return SkidSteer.name if robot.arms is None else FrictionModel.name
 
 
+def usual_models(robots: Sequence[Robot]) -> tuple[str, ...]:
+    """The motion models that are compared on logs of ``robots`` unless others are named: the drivers' own, and those that describe the
+    robots best."""
+    return tuple(dict.fromkeys((DiffDrive.name, SkidSteer.name, *map(recommended_model, robots))))
+
+
 def advice(robot: Robot, models: Sequence[str]) -> list[str]:
     """A sentence on a model that describes ``robot`` better than ``models``; else none."""
     best = recommended_model(robot)

@@ -257,6 +257,14 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise, clock_offset_s)
 
 
+def heading_error(found: Calibrated, maneuvers: Sequence[Maneuver], model: MotionModel | None = None) -> float:
+    """Root mean square of the heading errors over ``maneuvers`` that the fit was not fitted to, or of another ``model`` as its robot file
+    has it, with the clock of the fit [rad]. NaN where none was held out."""
+    if model is None:
+        return math.nan if found.heldout is None else float(np.sqrt(found.heldout.squared_angle.mean()))
+    return float(np.sqrt(np.mean(dataclasses.replace(found.fit, model=model, params=model.nominal).residuals(maneuvers)[:, 2] ** 2)))
+
+
 def _has_own_radius(model: MotionModel) -> bool:
     """Whether a parameter of ``model`` changes how far the robot drives straight ahead."""
     return bool(model.twist(np.ones(2), np.zeros(2), model.nominal).d_params[0].any())

@@ -26,6 +26,7 @@ from localization.calibration.calibrate import (
 from localization.calibration.windows import WindowConfig
 from localization.commands.calibration_tables import (
     calibration_numbers,
+    print_better_model,
     print_by_source,
     print_cuts,
     print_fit,
@@ -33,7 +34,7 @@ from localization.commands.calibration_tables import (
     print_rotation_errors,
     regression_numbers,
 )
-from localization.commands.common import in_radians, write_json
+from localization.commands.common import in_radians, print_line, write_json
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from motion_models.base import MotionModel
@@ -141,6 +142,7 @@ class Calibrate:
             print_rotation_errors(console, found, _rotations(self.source, robot), robot)
         by_source = _each(found, cuts, robot) if len(cuts) > 1 else []
         print_by_source(console, by_source)
+        print_better_model(console, found, cuts, robot)
         if self.windows is not None:
             write_text_file(self.windows, windows_text([m for each in cuts for m in each.maneuvers]))
         numbers = {"robot": robot.name, "model": model.name, **calibration_numbers(found, about, cuts, by_source)}
@@ -171,6 +173,8 @@ class Calibrate:
         multiplier = robot.driver.wheel_separation_multiplier
         found = skid_steer_fit(table, multiplier)
         print_regressions(console, table, found, robot)
+        for sentence in advice(robot, [self.model]):
+            print_line(console, sentence)
         sigmas = dict(zip(SkidSteer.param_names, (float(s) for s in np.sqrt(np.diagonal(found.cov))), strict=True))
         values = dict(zip(SkidSteer.param_names, (float(c) for c in found.coefficients), strict=True))
         numbers = {"robot": robot.name, "model": "skid_steer", **regression_numbers(table, found, values, sigmas, multiplier)}
@@ -198,8 +202,6 @@ class Calibrate:
                 console.print(text, markup=False, soft_wrap=True)
         if self.json is not None:
             write_json(self.json, {"source": [path.name for path in self.source], **numbers})
-        for sentence in advice(robot, [self.model]):
-            console.print(sentence, markup=False, soft_wrap=True)
 
 
 def _kind(path: Path) -> str:

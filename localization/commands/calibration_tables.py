@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from localization.calibration.calibrate import Calibrated, Cut, TurningInPlace, describe_clocks
+from localization.calibration.calibrate import Calibrated, Cut, TurningInPlace, describe_clocks, heading_error
 from localization.calibration.windows import driven
 from localization.commands.common import add_row, plain_table, print_line, print_table
 from motion_models.base import MotionModel
@@ -27,6 +27,7 @@ from motion_models.calibration.regressions import (
     cor_y_multivariate,
     rotation_ratio,
 )
+from motion_models.registry import make_model, recommended_model
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
@@ -48,6 +49,22 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
         )
         for note in each.warnings:
             print_line(console, f"  {note}")
+
+
+def print_better_model(console: Console, found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> None:
+    """That the model which describes ``robot`` best predicts these maneuvers better than the fit of another, where it does."""
+    best = recommended_model(robot)
+    if best == found.model.name:
+        return
+    maneuvers = [m for each in cuts for m in each.maneuvers]
+    fitted, other = heading_error(found, maneuvers), heading_error(found, maneuvers, make_model(best, robot))
+    if other < fitted:
+        print_line(
+            console,
+            f"{best} fits this robot better: as the robot file has it, it predicts the heading of these windows to"
+            f" {math.degrees(other):.2f} deg (root mean square), {found.model.name} as fitted to {math.degrees(fitted):.2f} deg on windows"
+            f" that it was not fitted to. Calibrate with --model {best}.",
+        )
 
 
 def print_fit(console: Console, found: Calibrated, about: TurningInPlace, cuts: Sequence[Cut], robot: Robot) -> None:

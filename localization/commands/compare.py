@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 
-from localization.commands.common import names, write_json
+from localization.commands.common import model_names, names, write_json
 from localization.comparison.comparison_page import CompareHead, check_report, write_comparison_report
 from localization.comparison.jobs import OK, Job, LogOrigin, Row, job_key, run_job, run_local, run_on_cluster, trials
 from localization.comparison.manifest import Entry, read_manifest
@@ -49,8 +49,8 @@ class Compare:
     manifest: Path | None = None
     """CSV file with a row for each log: log (path, or URL as s3://bucket/drive.mcap, extra `fleet`), robot, reference, floor, day. Results
     are kept log by log in results/ beside the table, trajectories in trajectories/. `skidloc table` shows k by robot, floor and day."""
-    model: str = "diff_drive,skid_steer"
-    """Motion models, separated by commas."""
+    model: str = "auto"
+    """Motion models, separated by commas; `auto`: diff_drive, skid_steer, and friction where a robot has arms."""
     estimator: str = "odometry,ekf"
     """Estimators, separated by commas."""
     corrections: str = "constant"
@@ -101,11 +101,13 @@ class Compare:
     def _jobs(self, console: Console, table: ResultTable | ResultFolder) -> list[Job]:
         """One for each log; what is the same as another would make intervals narrower than they are."""
         forms = check_forms(names(self.corrections, "--corrections"))
-        models, estimators = names(self.model, "--model"), names(self.estimator, "--estimator")
+        estimators = names(self.estimator, "--estimator")
         for estimator in estimators:
             check_estimator(estimator, has_lidar=True)
-        wanted, entries = tuple(trials(models, estimators, forms)), self._entries()
+        entries = self._entries()
         robots = {name: load_robot(name) for name in dict.fromkeys(entry.robot for entry in entries)}
+        models = model_names(self.model, list(robots.values()))
+        wanted = tuple(trials(models, estimators, forms))
         for robot, model in itertools.product(robots.values(), models):
             make_model(model, robot)
         folder = Path.cwd() if self.manifest is None else self.manifest.parent.absolute()
@@ -170,7 +172,8 @@ class Compare:
 
     def _notes(self, jobs: Sequence[Job]) -> list[str]:
         """On the robots: where k comes from if its file has none."""
-        robots, models = {job.robot.name: job.robot for job in jobs}, names(self.model, "--model")
+        robots = {job.robot.name: job.robot for job in jobs}
+        models = model_names(self.model, list(robots.values()))
         return list(dict.fromkeys(note for robot in robots.values() for note in prior_notes(robot, models)))
 
 

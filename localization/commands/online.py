@@ -32,6 +32,7 @@ from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
 from localization.ros.transports.transport import SimTimeTransport
 from motion_models.prior import prior_notes
+from motion_models.registry import advice
 
 _LINE_S = 0.25
 _MAX_GAP_S = 5.0
@@ -108,6 +109,8 @@ class OnlineCommand(OnlineSettings):
             session.close(forget=is_done)
         for note in dict.fromkeys([*prior_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
+        for sentence in advice(robot, [trial.model.name]):
+            console.print(sentence, markup=False, soft_wrap=True)
         self._summarize(console, session, seconds, count)
         if self.dashboard and console.is_terminal:
             console.print("the dashboard stays until Ctrl-C", markup=False)
@@ -161,6 +164,8 @@ class OnlineCommand(OnlineSettings):
             node = Node.start(transport, run, report, stop.is_set, view, answers)
             text = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
             console.print(text, markup=False, soft_wrap=True)
+            for sentence in advice(run.robot, [self.model]):
+                console.print(sentence, markup=False, soft_wrap=True)
             with Live(console=console, auto_refresh=False, transient=True) as live:
                 node.spin(stop.is_set, lambda n: self._show(console, live, n))
             count = node.finish()

@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from localization.commands.common import WIDE, names, new_folder, print_table, write_json
+from localization.commands.common import WIDE, model_names, names, new_folder, print_table, write_json
 from localization.errors import EstimatorError, EvaluationError, MapError, SettingError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
 from localization.evaluation.reference_files import load_reference
@@ -77,8 +77,8 @@ class Replay:
     out: Path
     """New folder for metrics.json, report.html, overview.png, trajectories (TUM) and fused.mcap, in which /tf is
     that of the last model and estimator."""
-    model: str = "diff_drive,skid_steer"
-    """Motion models, separated by commas."""
+    model: str = "auto"
+    """Motion models, separated by commas; `auto`: diff_drive, skid_steer, and friction for a robot with arms."""
     estimator: str = "odometry,lidar,ekf"
     """Estimators, separated by commas; `lidar` is left out where the log has no scans, unless asked for."""
     pairs: str = ""
@@ -117,14 +117,14 @@ class Replay:
         """Run the command, with output on ``console``."""
         robot = load_robot(self.robot)
         check_outputs(self.out, self.json, self.save_map, self.extend_map)
-        for name in self._models:
+        for name in self._models(robot):
             make_model(name, robot)
         for name in self._named_estimators:
             check_estimator(name, has_lidar=True, has_map=True)
         log = self._open(robot)
         robot, mounts = log.robot, log.mounts
         has_lidar = log.sources.lidar is not None
-        models = [make_model(name, robot) for name in self._models]
+        models = [make_model(name, robot) for name in self._models(robot)]
         forms = names(self.corrections, "--corrections")
         pairs = self._trials(log, models, check_forms(forms))
         self._check_map(has_lidar)
@@ -190,9 +190,10 @@ class Replay:
             found.append((model, estimator))
         return found
 
-    @property
-    def _models(self) -> list[str]:
-        return list(dict.fromkeys(model for model, _ in self._chosen)) or names(self.model, "--model")
+    def _models(self, robot: Robot) -> list[str]:
+        if self._chosen:
+            return list(dict.fromkeys(model for model, _ in self._chosen))
+        return model_names(self.model, [robot])
 
     @property
     def _named_estimators(self) -> list[str]:
@@ -325,7 +326,8 @@ class Replay:
         return self.positions is not None and self.positions == self._reference_name(log)
 
     def _metrics(self, head: ReportHead, results: Sequence[Result]) -> dict[str, Any]:
-        prior = scaling_prior(load_robot(self.robot), self._models)
+        robot = load_robot(self.robot)
+        prior = scaling_prior(robot, self._models(robot))
         return {
             "log": head.log,
             "robot": head.robot,
@@ -347,7 +349,8 @@ class Replay:
             console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
-        for sentence in advice(load_robot(self.robot), self._models):
+        robot = load_robot(self.robot)
+        for sentence in advice(robot, self._models(robot)):
             console.print(sentence, markup=False, soft_wrap=True)
         console.print(f"report: {self.out / 'report.html'}", markup=False, soft_wrap=True)
 

@@ -406,9 +406,29 @@ def _advice(
         return ["Whether it is better than dead reckoning takes a reference of less noise (RTK, mocap, a surveyed map)."]
     if base is not None and base in equals:
         return ["Confirm on another drive, before relying on it, that it is better than dead reckoning."]
+    if (by_wheels := _better_by_wheels(lines, best, reference)) is not None:
+        return [by_wheels]
     if any(line.result.run.estimator == best.result.run.estimator for line in equals):
         return [f"Use {best.result.run.estimator}; which motion model is better in it is not significant on this drive."]
     return [f"Use {best.words}."]
+
+
+def _better_by_wheels(lines: Sequence[PlottedRun], best: PlottedRun, reference: ReferenceTrack | Relations) -> str | None:
+    """To use the best estimator with another motion model, of which dead reckoning is better by more than the estimator is worse."""
+    estimator = best.result.run.estimator
+    by_wheels = {line.model: line for line in lines if line.result.run.estimator == DEAD_RECKONING and line.error is not None}
+    own = by_wheels.get(best.model)
+    alike = [x for x in lines if x.result.run.estimator == estimator and x.error is not None and x.model in by_wheels]
+    if estimator == DEAD_RECKONING or own is None or best not in alike:
+        return None
+    line = min(alike, key=lambda each: _error(by_wheels[each.model]))
+    other = by_wheels[line.model]
+    if not _is_worse(own, other, reference) or _error(line) - _error(best) > _error(own) - _error(other):
+        return None
+    return (
+        f"Use {line.words} ({metres(_error(line))}): where scans fail the robot drives by its wheels alone, whose error is"
+        f" {metres(_error(other))} with {line.model}, and {metres(_error(own))} with {best.model}."
+    )
 
 
 def _unscored(lines: Sequence[PlottedRun]) -> list[str]:

@@ -362,6 +362,28 @@ def test_calibrate_out_of_every_model_is_read_back(tmp_path: Path, name: str) ->
     assert "# +- " in (tmp_path / "new" / "robot.toml").read_text()
 
 
+def windows_of_moving_cg(n: int = 30) -> list[Maneuver]:
+    """Windows of the friction model at three centres of gravity."""
+    rng, found = np.random.default_rng(4), []
+    for i in range(n):
+        q = np.repeat(rng.uniform(-3, 3, (1, 2)), 20, axis=0)
+        cg = np.array([(-0.08, 0.02), (0.0, 0.0), (0.08, -0.02)][i % 3])
+        delta = preintegrate(TRUTH, np.full(20, 0.1), q, cg, TRUTH.nominal, WheelNoise()).delta
+        measured = (delta + rng.normal(0, [1e-3, 1e-3, 1e-3]))[None]
+        found.append(Maneuver(np.full(20, 0.1), q, measured, np.array([20]), np.tile(cg, (20, 1)), np.diag([1e-6] * 3), f"g{i // 3}"))
+    return found
+
+
+@pytest.mark.parametrize("is_better", [True, False])
+def test_calibrate_of_another_model_compares_friction_on_the_same_windows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], is_better: bool
+) -> None:
+    """A robot with arms: one centre of rotation is not that of several centres of gravity; it is that of windows which obey it."""
+    (tmp_path / "w.csv").write_text(windows_text(windows_of_moving_cg() if is_better else made_windows("icr")))
+    run(tmp_path, tmp_path / "w.csv", "--robot", "vaultbot", "--model", "icr")
+    assert ("Calibrate with --model friction." in " ".join(capsys.readouterr().out.split())) is is_better
+
+
 def test_windows_text_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "w.csv"
     path.write_text(windows_text(made_windows("skid_steer")))

@@ -13,7 +13,7 @@ from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.online_calibration import make_corrections
 from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
-from motion_models.registry import advice, make_model, recommended_model
+from motion_models.registry import advice, make_model, recommended_model, usual_models
 from motion_models.robot import Driver, Geometry, Robot
 from motion_models.robot_file import load_robot, parse_robot
 from motion_models.robot_names import robot_names
@@ -136,4 +136,6 @@ def test_robot_with_arms_is_advised_to_take_the_friction_model() -> None:
     vaultbot, husky, burger = (load_robot(name) for name in ("vaultbot", "husky_a200", "turtlebot3_burger"))
     assert [recommended_model(robot) for robot in (vaultbot, husky, burger)] == ["friction", "skid_steer", "diff_drive"]
     assert "--model friction" in advice(vaultbot, ["diff_drive", "skid_steer"])[0]
+    assert usual_models([burger, husky]) == ("diff_drive", "skid_steer")
+    assert usual_models([husky, vaultbot]) == ("diff_drive", "skid_steer", "friction")
     assert advice(vaultbot, ["friction"]) == advice(husky, ["skid_steer"]) == []

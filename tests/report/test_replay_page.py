@@ -59,6 +59,20 @@ def test_summary_names_the_best_run_and_its_gains():
     assert text.endswith("Use ekf with skid_steer.")
 
 
+def test_summary_takes_the_model_that_is_better_where_scans_fail():
+    """Of estimators that scans make all but equal; not where the better dead reckoning is no better, or the estimator by it far worse."""
+    by_wheels = [run("diff_drive", "odometry", 0.6, 1), run("friction", "odometry", 0.2, 2)]
+    fused = run("diff_drive", "ekf", 0.050, 3)
+    found = score([*by_wheels, fused, run("friction", "ekf", 0.055, 3)], track())
+    text = verdict(found, track())
+    advice = text[text.index("Use ") :]
+    assert advice.startswith("Use ekf with friction (")
+    assert [f"{r.accuracy.ate_rmse_m:.3f} m" in advice for r in found] == [True, True, False, True]
+    worse = score([*by_wheels, fused, run("friction", "ekf", 0.58, 3)], track())
+    alike = score([by_wheels[0], run("friction", "odometry", 0.6, 1), fused, run("friction", "ekf", 0.055, 3)], track())
+    assert not any("scans fail" in verdict(each, track()) for each in (worse, alike))
+
+
 def test_summary_names_a_track_reference_with_ate_and_distance():
     results = score(three_runs(), track())
     text = verdict(results, track())
