@@ -185,7 +185,7 @@ class Calibrate:
         if self.out is not None:
             sources = ", ".join(path.name for path in self.source)
             remarks = f"Calibrated by skidloc: {self.model} on {sources}, from {robot.name}."
-            if new is robot:
+            if not numbers.get("recommended", True):
                 remarks = f"Not changed by skidloc: {self.model} fitted on {sources} was worse than {robot.name} on held-out maneuvers."
             write_text_file(self.out, robot_toml(relocated(new, self.out.parent), {self.model: sigmas}, remarks))
             console.print(f"robot file: {self.out}", markup=False, soft_wrap=True)

@@ -6,8 +6,8 @@ import contextlib
 import io
 import json
 import shlex
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,14 @@ from localization.commands.init import Init
 from localization.commands.replay import Replay
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.handover import Reader
+from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.scores import Result
 from localization.evidence import open_log_as_declared
 from localization.logs import Log, open_log
 from localization.output import check_outputs
-from localization.report.try_page import Part, TryResult, summarize, write_try_page
+from localization.report.replay_page import ReportHead
+from localization.report.try_page import Part, Replayed, TryResult, summarize, write_try_page
+from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import SkidlocError
 from motion_models.input_files import read_text
@@ -107,22 +111,23 @@ class Try:
         before = load_robot(robot_file)
         known = self._cut(before)
         cut = None if known is None else _cut_of(known[1])
-        for model in models:
-            name = "calibrated.toml" if model == models[-1] else f"{model}.toml"
-            numbers = folder / f"calibrate_{model}.json"
-            calibrate = _CalibrateCut((self.log,), robot_file, model, cut=cut, out=folder / name, json=numbers)
-            runner.run(f"calibrate {model}", calibrate, self._line("calibrate", f"--model {model}"))
         calibrated = folder / "calibrated.toml"
+        for model in models:
+            path = calibrated if model == models[-1] else folder / f"{model}.toml"
+            others = tuple(folder / f"{other}.toml" for other in models[:-1])
+            numbers = folder / f"calibrate_{model}.json"
+            calibrate = _CalibrateCut((self.log,), robot_file, model, cut=cut, others=others, out=path, json=numbers)
+            runner.run(f"calibrate {model}", calibrate, self._line("calibrate", f"--model {model}"))
         best = str(calibrated) if calibrated.exists() else robot_file
         has_lidar = open_log(self.log, load_robot(best)).sources.lidar is not None
         pairs = ",".join((*(f"{model}/odometry" for model in models), f"{models[-1]}/{'graph' if has_lidar else 'ekf'}"))
-        # Calibration changes nothing of the set-up by which the log was cut.
-        command = Replay if cut is None else _ReplayAsDeclared
-        replay = command(self.log, best, folder / "replay", pairs=pairs, reference=self.reference, static=True)
+        is_known = cut is not None  # calibration changes nothing of the set-up by which the log was cut
+        replay = _ReplayKept(self.log, best, folder / "replay", pairs=pairs, reference=self.reference, static=True, is_known=is_known)
         runner.run("replay", replay, self._line("replay", f"--pairs {pairs}"))
         diagnose = _DiagnoseDrive(self.log, best, out=folder / "diagnosis", static=True, known=known)
         runner.run("diagnose", diagnose, self._line("diagnose"))
-        return TryResult(self.log.name, before, load_robot(best), models[-1], tuple(runner.parts), cut, _contents(folder, models))
+        replayed = replay.kept[0] if replay.kept else None
+        return TryResult(self.log.name, before, load_robot(best), models[-1], tuple(runner.parts), cut, _contents(folder, models), replayed)
 
     def _cut(self, robot: Robot) -> tuple[Log, Drive] | None:
         """The log and its windows, with what was measured in each; None where nothing was."""
@@ -147,20 +152,39 @@ class Try:
 
 @dataclass(frozen=True)
 class _CalibrateCut(Calibrate):
-    """`Calibrate` on windows that were cut before, where there are any: cutting matches all scans."""
+    """`Calibrate` on windows that were cut before, where there are any: cutting matches all scans.
+
+    Its robot file has the parameters of other models too, from the files ``others`` that are named by them, where these were written.
+    """
 
     cut: Cut | None = None
+    others: tuple[Path, ...] = ()
 
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         return super()._cut(path, robot, kind) if self.cut is None else self.cut
 
+    def _fit(self, console: Console, robot: Robot, model: MotionModel, kind: str) -> tuple[Robot, dict[str, float], dict[str, Any]]:
+        found, sigmas, numbers = super()._fit(console, robot, model, kind)
+        for path in self.others:
+            fitted = load_robot(path).models.get(path.stem) if path.exists() else None
+            found = found if fitted is None else replace(found, models={**found.models, path.stem: fitted})
+        return found, sigmas, numbers
+
 
 @dataclass(frozen=True)
-class _ReplayAsDeclared(Replay):
-    """`Replay` of a log that the robot file was found to describe."""
+class _ReplayKept(Replay):
+    """`Replay` whose result is kept for the page."""
+
+    is_known: bool = False
+    """Whether the robot file was found to describe the log."""
+    kept: list[Replayed] = field(default_factory=list)
 
     def _open(self, robot: Robot) -> Log:
-        return open_log(self.log, robot, self.topic.scored_against(self.reference))
+        return open_log(self.log, robot, self.topic.scored_against(self.reference)) if self.is_known else super()._open(robot)
+
+    def _write(self, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
+        super()._write(head, results, reference)
+        self.kept.append(Replayed(results, reference))
 
 
 @dataclass(frozen=True)

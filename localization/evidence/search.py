@@ -30,8 +30,6 @@ _FAR = 30.0
 """Logarithm of the evidence below the best at any level, beyond which no level brings a choice back."""
 _CHANGED = 3
 """Best choices of which one source is tried with a change within the log."""
-_CLEAR = 9.0
-"""Logarithm of the evidence by which the robot file's set-up beats each single row, from where on no pair of rows is tried."""
 _SEARCH_LEVELS = (0.35, 1.0)
 """Levels of the noise at which set-ups are searched."""
 _MAX_BINS = 140
@@ -182,14 +180,12 @@ def _search_at(evidence: Evidence, null: Choice, level: float, found: dict[Choic
 
     expand(null)
     against = _against(stacks, null, at_level)
-    rivals = max((score for choice, score in at_level.items() if any(row.is_fault for row in rows_of(stacks, choice))), default=-math.inf)
-    is_clear = rivals <= at_level[null] - _CLEAR
-    for width in () if is_clear else _WIDTHS:
+    for width in _WIDTHS:
         for choice in [c for c in sorted(at_level, key=at_level.__getitem__, reverse=True)[: 2 * width] if c not in done][:width]:
             expand(choice)
     best = sorted(at_level, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]
     twins = [twin for choice in best for twin in (*_mirrored(stacks, choice), *_shifted(stacks, choice))]
-    if twins and not is_clear:
+    if twins:
         at_level.update(zip(twins, evidence.log_posterior(np.array(twins), level).tolist(), strict=True))
         for choice in sorted({*best, *twins}, key=at_level.__getitem__, reverse=True)[: _WIDTHS[0]]:
             if choice not in done:

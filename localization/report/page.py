@@ -84,6 +84,8 @@ class Cell:
     """The run whose line style stands before the text."""
     mark: str = ""
     """Colour's name of a dot before the text."""
+    link: str = ""
+    """Relative address of the page that the text names."""
     bar: tuple[float, str] | None = None
     """Length (0 to 1) and colour's name of a bar below the text."""
 

@@ -123,7 +123,7 @@ def _sections(
         ),
         html.Section("What the centre of gravity does", list(head.center_of_gravity)),
         html.Section("Explore", explore),
-        html.Section("Trajectories", [_map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
+        html.Section("Trajectories", [map_figure(runs, map_view(runs, reference))], is_static=bool(explore)),
         html.Section("Map", _grid_blocks(runs)),
         html.Section("Errors", _error_figure(runs, reference), is_static=bool(explore) and not isinstance(reference, Relations)),
         html.Section("In space", _space_figures(runs)),
@@ -171,7 +171,8 @@ def _about_reference(runs: Sequence[PlottedRun], reference: ReferenceTrack | Rel
     return [*sentences, *dict.fromkeys(warning for a in scored for warning in a.warnings)]
 
 
-def _map_figure(runs: Sequence[PlottedRun], view: MapPlane) -> html.Figure:
+def map_figure(runs: Sequence[PlottedRun], view: MapPlane) -> html.Figure:
+    """Trajectories from above, with the reference and the map, where there are any."""
     aligned = "Each run is aligned with the reference as a whole." if view.reference is not None else "All runs start at the same pose."
     sentences = [aligned]
     if view.map_of is not None:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from localization.calibration.calibrate import Cut
+from localization.evaluation.references import ReferenceTrack, Relations
+from localization.evaluation.scores import Result, score
 from localization.report import page as html
 from localization.report.cg_figure import Turns, cg_blocks, describe_turns, measured_turns
+from localization.report.replay_page import map_figure
+from localization.report.runs import DEAD_RECKONING, map_view, plotted_runs
+from localization.report.summary import metres
 from motion_models.calibration.maneuvers import Maneuver
+from motion_models.diff_drive import DiffDrive
 from motion_models.registry import make_model
 from motion_models.robot import DIFF_DRIVE, Robot
 
@@ -34,6 +40,34 @@ class Part:
 
 
 @dataclass(frozen=True)
+class Replayed:
+    """Result of the replay."""
+
+    results: Sequence[Result]
+    reference: ReferenceTrack | Relations | None
+
+    def odometry_errors(self) -> tuple[dict[str, float], str]:
+        """ATE of dead reckoning by model [m], and what it was measured against: the reference, else the path by the LiDAR; none without
+        both."""
+        runs = [result.run for result in self.results]
+        track = self.reference if isinstance(self.reference, ReferenceTrack) else self._path_by_lidar()
+        if track is None:
+            return {}, ""
+        scored = score([run for run in runs if run.estimator == DEAD_RECKONING], track)
+        errors = {r.run.model: r.accuracy.ate_rmse_m for r in scored if r.accuracy is not None and not r.contradictions}
+        return {model: error for model, error in errors.items() if error is not None}, track.source
+
+    def _path_by_lidar(self) -> ReferenceTrack | None:
+        matched = [r.run for r in self.results if r.run.lidar is not None and len(r.run.trajectory)]
+        if not matched:
+            return None
+        path = matched[-1].trajectory
+        return ReferenceTrack(
+            path.stamps_ns, path.poses[:, :2], path.poses[:, 2], source=f"the path of {matched[-1].estimator} by the LiDAR"
+        )
+
+
+@dataclass(frozen=True)
 class TryResult:
     """All that `skidloc try` found."""
 
@@ -47,6 +81,7 @@ class TryResult:
     cut: Cut | None
     contents: Mapping[str, Any]
     """JSON of the parts, by name."""
+    replayed: Replayed | None = None
 
     @property
     def maneuvers(self) -> tuple[Maneuver, ...]:
@@ -65,26 +100,42 @@ class TryResult:
 
 
 def improvement(contents: Mapping[str, Any], model: str) -> str:
-    """Errors of predicted windows on held-out parts of the drive: diff_drive against ``model`` with the CG; empty where unknown."""
-    base, ours = contents.get("calibrate_diff_drive"), contents.get(f"calibrate_{model}")
-    if model == "diff_drive" or base is None or ours is None or not (base["heldout"] and ours["heldout"]):
+    """Errors of predicted windows on held-out parts of the drive: diff_drive against ``model``; empty where unknown."""
+    rows = _held_out_errors(contents, model)
+    if len(rows) < 3:
         return ""
-    parts = []
-    for name, unit, factor in (("heading_deg", "deg", 1.0), ("position_m", "mm", 1e3)):
-        if name in base["errors"] and name in ours["errors"]:
-            tried = ((base, "before"), (base, "after"), (ours, "after"))
-            driver, fitted, by_cg = (f"{factor * numbers['errors'][name][when][0]:.3g} {unit}" for numbers, when in tried)
-            parts.append(
-                f"the {name.split('_')[0]} is off by {by_cg} with {model} and the centre of gravity, by {fitted} with diff_drive "
-                f"calibrated, and by {driver} with diff_drive as the driver has it"
-            )
-    return f"Over windows that the calibration did not use (RMS), {'; '.join(parts)}." if parts else ""
+    (_, fitted), (_, ours) = rows[1:]
+    parts = [f"the {name} is off by {ours[name]} with {model}, by {fitted[name]} with diff_drive" for name in ours]
+    return f"Over windows that the calibration did not use, {'; '.join(parts)} (RMS)." if parts else ""
+
+
+def odometry_sentence(replayed: Replayed | None, model: str) -> str:
+    """What dead reckoning over the whole drive is off by, with diff_drive and with ``model``; empty where unknown."""
+    errors, source = ({}, "") if replayed is None else replayed.odometry_errors()
+    if model == DiffDrive.name or not errors.keys() >= {DiffDrive.name, model}:
+        return ""
+    ours, base = (metres(errors[name]) for name in (model, DiffDrive.name))
+    return f"By wheels alone this drive is off by {ours} with {model}, and by {base} with diff_drive (ATE against {source})."
+
+
+def _held_out_errors(contents: Mapping[str, Any], model: str) -> list[tuple[str, dict[str, str]]]:
+    """Errors by quantity for diff_drive as the driver has it, diff_drive calibrated, and ``model``; none where not all are known."""
+    base, ours = contents.get(f"calibrate_{DiffDrive.name}"), contents.get(f"calibrate_{model}")
+    if model == DiffDrive.name or base is None or ours is None or not (base["heldout"] and ours["heldout"]):
+        return []
+    rows = (("diff_drive, as the driver has it", base, "before"), ("diff_drive, calibrated", base, "after"), (model, ours, "after"))
+    units = (("heading", "heading_deg", "deg", 1.0), ("position", "position_m", "mm", 1e3))
+    known = [unit for unit in units if unit[1] in base["errors"] and unit[1] in ours["errors"]]
+    return [
+        (words, {name: f"{factor * numbers['errors'][key][when][0]:.2g} {unit}" for name, key, unit, factor in known})
+        for words, numbers, when in rows
+    ]
 
 
 def summarize(found: TryResult) -> list[str]:
     """The sentences at the top, the most important first."""
     model = make_model(found.model, found.after)
-    sentences = [improvement(found.contents, found.model)]
+    sentences = [odometry_sentence(found.replayed, found.model), improvement(found.contents, found.model)]
     if found.after.drive != DIFF_DRIVE:
         sentences.append(describe_turns(found.turns, model, found.after))
     numbers = found.contents.get(f"calibrate_{found.model}")
@@ -135,14 +186,38 @@ def try_page(found: TryResult) -> str:
     """HTML of the whole page."""
     blocks = cg_blocks(found.turns, found.model, found.before, found.after if found.is_calibrated else found.before)
     sections = [
+        html.Section("How much better the odometry is", _odometry_blocks(found)),
         html.Section("What the centre of gravity does", blocks),
         html.Section("What to do next", html.bullets(_next_steps(found))),
         html.Section("Robot", [html.Definitions(_robot(found))]),
         html.Section("Parts", [_parts_table(found)]),
-        *(html.Section(f"Output of {part.name}", html.bullets(_lines(part.text), f"{part.name}: all lines")) for part in found.parts),
+        html.Section("Output of the parts", [block for part in found.parts for block in html.bullets(_lines(part.text), part.name)]),
     ]
     facts = f"{found.after.name} · {len(found.maneuvers)} windows" + (f" by {found.cut.measured_by}" if found.cut is not None else "")
-    return html.render(html.Page(f"First look at {found.log}", facts, summarize(found) or ["Nothing measured the motion."], sections))
+    sentences = summarize(found) or ["Nothing measured the motion."]
+    runs = [] if found.replayed is None else plotted_runs(found.replayed.results)
+    return html.render(html.Page(f"First look at {found.log}", facts, sentences, sections, [run.number for run in runs]))
+
+
+def _odometry_blocks(found: TryResult) -> list[html.Block]:
+    """Errors of the models on held-out windows and over the whole drive, and the paths."""
+    rows = _held_out_errors(found.contents, found.model)
+    if not rows:
+        return []
+    errors, source = ({}, "") if found.replayed is None else found.replayed.odometry_errors()
+    names = list(rows[0][1])
+    columns = [*(f"{name} of a window" for name in names), *(["whole drive"] if errors else [])]
+    by_row = (None, errors.get(DiffDrive.name), errors.get(found.model))
+    cells = [[html.Cell(words), *(html.Cell(of[name]) for name in names)] for words, of in rows]
+    for row, error in zip(cells, by_row, strict=True):
+        row += [html.Cell("" if error is None else metres(error))] if errors else []
+    note = "Windows: RMS on parts of the drive that the calibration did not use."
+    note += f" Whole drive: ATE of the wheels alone against {source}." if errors else ""
+    blocks: list[html.Block] = [html.Table([html.Cell(""), *map(html.Cell, columns)], cells), html.Paragraph(note, is_small=True)]
+    if found.replayed is not None:
+        runs = plotted_runs(found.replayed.results)
+        blocks.append(map_figure(runs, map_view(runs, found.replayed.reference)))
+    return blocks
 
 
 def _lines(text: str) -> list[str]:
@@ -169,7 +244,7 @@ def _parts_table(found: TryResult) -> html.Table:
         [
             html.Cell(part.name, mark="green" if part.is_done else "red"),
             html.Cell(part.line, is_code=True),
-            html.Cell(_PAGES.get(part.name, "") if part.is_done else ""),
+            html.Cell("page", link=_PAGES[part.name]) if part.is_done and part.name in _PAGES else html.Cell(),
         ]
         for part in found.parts
     ]

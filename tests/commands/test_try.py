@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from localization.cli import main
+from localization.evaluation.scores import score
 from localization.report.cg_figure import cg_svg, describe_turns, measured_turns, predicted_turns
-from localization.report.try_page import improvement
+from localization.report.try_page import Replayed, improvement, odometry_sentence
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model
 from motion_models.robot import WheelNoise
 from motion_models.robot_file import load_robot
+from tests.helpers.report import run, track
 
 HUSKY_BAG = Path(__file__).parents[1] / "data" / "husky-outdoor-gps" / "test1.bag"
 ROBOT = load_robot("vaultbot")
@@ -60,8 +64,22 @@ def test_improvement_names_each_model_with_its_held_out_error() -> None:
         return {"heldout": True, "errors": {"position_m": {"before": [before, 0, 0], "after": [after, 0, 0]}}}
 
     text = improvement({"calibrate_diff_drive": numbers(0.163, 0.076), "calibrate_friction": numbers(0.05, 0.009)}, "friction")
-    assert "off by 9 mm with friction and the centre of gravity, by 76 mm with diff_drive calibrated, and by 163 mm with diff_drive" in text
+    assert text.endswith("the position is off by 9 mm with friction, by 76 mm with diff_drive (RMS).")
     assert improvement({"calibrate_skid_steer": numbers(0.05, 0.009)}, "skid_steer") == ""
+
+
+def test_odometry_is_compared_with_the_reference_else_with_the_path_by_the_lidar() -> None:
+    by_wheels = [run("diff_drive", "odometry", 0.6, 1), run("friction", "odometry", 0.2, 2)]
+    matched = dataclasses.replace(run("friction", "graph", 0.01, 3), lidar=object())
+    of_reference = odometry_sentence(Replayed(score([*by_wheels, matched], track()), track()), "friction")
+    assert "with diff_drive (ATE against /ground_truth/odom)" in of_reference
+    results = score([*by_wheels, matched], None)
+    of_path = odometry_sentence(Replayed(results, None), "friction")
+    assert "with diff_drive (ATE against the path of graph by the LiDAR)" in of_path
+    found = [[float(value) for value in re.findall(r"by (\d\.\d+) m", text)] for text in (of_reference, of_path)]
+    assert found[0] == pytest.approx(found[1], rel=0.05)
+    assert found[0][0] < 0.5 * found[0][1]
+    assert odometry_sentence(Replayed(results[:2], None), "friction") == odometry_sentence(None, "friction") == ""
 
 
 def test_try_without_lengths_names_the_options_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -77,5 +95,8 @@ def test_try_of_the_husky_writes_one_page_with_all_parts(tmp_path: Path, capsys:
     page = (out / "index.html").read_text(encoding="utf-8")
     for part in ("info", "check", "calibrate skid_steer", "replay", "diagnose"):
         assert f"skidloc {part.split()[0]} " in capsys.readouterr().out + page
-    assert "k and centre of rotation" in page or "What to do next" in page
+    assert "What to do next" in page
+    assert "By wheels alone this drive is off by" in page  # its GPS is the reference
+    assert page.count("<svg") > 3
+    assert load_robot(out / "calibrated.toml").models["diff_drive"]["wheel_separation_multiplier"] > 1.0
     assert hasattr(importlib.import_module("localization.commands.try"), "Try")
