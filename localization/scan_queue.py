@@ -80,7 +80,7 @@ class FaultyScans:
         found = []
         if self.empty:
             scans = f"{self.empty} scan{'s' * (self.empty > 1)}"
-            found.append(f"{scans} without a usable point: the pose is by wheels and gyro there.")
+            found.append(f"{scans} without a usable point: the pose is by the other sensors there.")
         if self.late:
             found.append(f"{self.late} scan{'s' * (self.late > 1)} came after later ones and could not be used.")
         if self.has_turned:

@@ -43,7 +43,7 @@ class StepConfig(Settings):
     lost_rate_rad_s: Positive = 0.5
     """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
     slopes: bool = True
-    """Model gravity on slopes where the IMU's accelerometer shows that the ground tilts; false takes all ground as level."""
+    """Model gravity on slopes where the IMU's accelerometer shows that the ground tilts. --no-slopes: all ground is level."""
     planar: bool | None = None
     """Estimate poses in the plane; false: in space, which takes an IMU with an accelerometer and a 3D LiDAR. None: in the plane, until the
     IMU shows that the ground tilts while there are clouds of a 3D LiDAR."""

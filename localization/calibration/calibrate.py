@@ -186,6 +186,9 @@ def make_motion_reference(
     if sources.imu is not None and name in ("auto", "gyro"):
         return GyroMotionReference(robot.gyro_noise, log.mounts, config.window_s), f"gyro {sources.imu.topic}"
     absent = {"auto": "neither a LiDAR nor an IMU", "lidar": "no LiDAR", "gyro": "no IMU"}.get(name, "no motion reference")
+    there = "lidar" if sources.lidar is not None else "gyro" if sources.imu is not None else ""
+    if there:
+        raise CalibrationError(f"{log.path.name} has {absent}: name --motion-reference {there}, or a reference with --reference.")
     raise CalibrationError(
         f"{log.path.name} has {absent}, so nothing measures what the wheels do; name a reference (poses, or positions of centimetres) with"
         " --reference, or topics with --topic.scan, --topic.points or --topic.imu. `skidloc info` lists them."

@@ -276,6 +276,7 @@ def _filter_rows(log: Log, run: Run | None) -> list[CheckRow]:
         rows.append(CheckRow("clock of wheels", "0", clock, "cannot be seen", "start, stop and turn quickly a few times."))
     else:
         is_same = abs(offset) <= max(_MAX_CLOCK_S, _SIGMAS * sigma)
+        clock += ", a latency that the estimators learn" if is_same and abs(offset) > _SIGMAS * sigma else ""
         other = "" if log.sources.lidar and log.sources.imu else f" or clock.{source.lower()}_time_offset_s = {-offset:.3f}"
         advice = "" if is_same else f"write clock.wheel_time_offset_s = {offset:.3f}{other}, or let drivers stamp the time of measurement."
         rows.append(CheckRow("clock of wheels", "0", clock, "ok" if is_same else "contradiction", advice))
@@ -289,7 +290,7 @@ def _scaling_row(robot: Robot, run: Run, source: str) -> CheckRow:
     value = f"k {expected:.3f}" + ("" if is_known else f" +- {spread:.2f} by geometry")
     if sigma > 0.5 * spread:
         advice = f"turn in place for 20 s; until then: wheel_separation_multiplier {1.0 / expected:.2f}."
-        return CheckRow("track and multiplier", value, f"k {k:.3f} +- {sigma:.3f} by {source}", "cannot be seen", advice)
+        return CheckRow("track and multiplier", value, f"k {k:.3f} +- {sigma:.3f} by {source}, too uncertain", "cannot be seen", advice)
     is_same = abs(k - expected) <= _SIGMAS * math.hypot(sigma, spread)
     measured = f"k {k:.3f} +- {sigma:.3f} by {source}: wheel_separation_multiplier {1.0 / k:.2f}" if k > 0.0 else f"k {k:.3f}"
     advice = "" if is_same else "check track_width_m and wheel_radius_m: k of such a geometry is another."

@@ -85,9 +85,13 @@ def choose_geometry(
             draft.choose(name, [(None if like is None else getattr(like, name), of_like)])
     if urdf is not None and urdf.has_one_axle and not urdf.kinds and "wheelbase_m" not in draft.values:
         draft.choose("wheelbase_m", [(draft.values.get("track_width_m"), "the track; nothing but the driven wheels touches the ground")])
-    for name, flag in (("wheel_radius_m", "--wheel-radius-m"), ("track_width_m", "--track-width-m"), ("wheelbase_m", "--wheelbase-m")):
+    for name, flag, how in (
+        ("wheel_radius_m", "--wheel-radius-m", "from the axle to the floor"),
+        ("track_width_m", "--track-width-m", "from contact to contact"),
+        ("wheelbase_m", "--wheelbase-m", "from contact to contact"),
+    ):
         if name not in draft.values:
-            draft.missing.append(f"{name}: measure it (contact to contact) and give {flag}, or a URDF with --urdf.")
+            draft.missing.append(f"{name}: measure it ({how}) and give {flag}, or a URDF with --urdf.")
     if "mass_kg" not in draft.values:
         draft.missing.append("mass_kg: weigh the robot and give --mass-kg; 50 kg is written, which only CG and simulation use.")
     _choose_driver(draft, given, controllers, fit if is_drivers else None)

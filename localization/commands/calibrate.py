@@ -106,7 +106,7 @@ class Calibrate:
         (kind,) = kinds
         if kind == "rotations" and self.model == "skid_steer" and not self.fit:
             if self.page is not None:
-                raise CalibrationError("--page shows a fit to windows; regressions on a table of rotations are printed. Leave --page out.")
+                raise CalibrationError("skid_steer on a table of rotations has no page: name --model friction, or leave --page out.")
             new, sigmas, numbers = self._regressions(console, robot)
         else:
             new, sigmas, numbers = self._fit(console, robot, model, kind)

@@ -67,7 +67,7 @@ class Cg:
         weighed = None if self.weighings is None else weighed_cg(self.weighings, g.wheelbase_m, g.track_width_m)
         uses_arms = bool(self.posture or self.joint or self.payload or self.urdf or self.weighed_posture)
         if weighed is None and not uses_arms:
-            raise CgError("nothing to find a centre of gravity by: name a CSV of weighings, a --posture, or joints by --joint NAME=VALUE.")
+            raise CgError("name what a centre of gravity is found by: a CSV of weighings, a --posture, or --joint NAME=VALUE.")
         source, static = [], None
         if weighed is not None:
             source.append(f"{weighed.weighings} weighing{'s' if weighed.weighings > 1 else ''}")
@@ -145,7 +145,7 @@ class Cg:
         if not self.payload and not self.at:
             return None
         if not self.at:
-            raise CgError(f"--payload {self.payload:g} hangs in the air: name the link that holds it with --at.")
+            raise CgError(f"--payload {self.payload:g} takes --at LINK, the link that holds it.")
         return Payload(self.at, self.payload, self.offset, self.payload_sigma)
 
     def _numbers(

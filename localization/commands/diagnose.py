@@ -255,9 +255,13 @@ def print_handover(console: Console, corrected: Sequence[Finding], manual_steps:
     labels = ", ".join(f.definition.label for f in corrected)
     if labels:
         console.print(f"in robot.toml: {labels}", markup=False, soft_wrap=True)
-    parts = [f"{model} can hold {max(100.0 * share, 0.0):.0f} % of it" for model, share in shares.items() if share < _WHOLE_SHARE]
+    parts = [
+        f"{model} can represent {max(100.0 * share, 0.0):.0f} % of the corrected motion"
+        for model, share in shares.items()
+        if share < _WHOLE_SHARE
+    ]
     if parts:
-        console.print(f"as coefficients: {', '.join(parts)}", markup=False, soft_wrap=True)
+        console.print(f"as coefficients, {', '.join(parts)}", markup=False, soft_wrap=True)
     for step in manual_steps:
         if not step.startswith(KEEPS_VALUES):
             console.print(f"to do: {step}", markup=False, soft_wrap=True)

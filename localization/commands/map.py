@@ -154,7 +154,7 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     kind = " in space" if len(found["size_m"]) > 2 else ""
     lines = [
         f"{found['keyframes']} keyframes{kind} with {found['points']} points and {found['loop_closures']} loop closures",
-        f"{size}; positions of keyframes have a sigma of at most {found['sigma_m']:.3f} m against the first",
+        f"{size}; positions of keyframes have a sigma of at most {found['sigma_m']:.3f} m against the first.",
     ]
     named = [f"{key} {found[key]}" for key in ("log", "robot", "model", "corrections") if found.get(key)]
     mounts = found.get("mounts")

@@ -41,7 +41,7 @@ class Robots:
         table = plain_table("robot", "drive", "radius [m]", "track [m]", "wheelbase [m]", "mass [kg]", "k", "+-", "k from")
         for each in found:
             lengths = [f"{each[key]:.4g}" for key in ("wheel_radius_m", "track_width_m", "wheelbase_m", "mass_kg")]
-            add_row(table, each["robot"], each["drive"], *lengths, f"{each['k']:.3f}", f"{each['k_sigma']:.3f}", each["k_from"])
+            add_row(table, each["robot"], each["drive"], *lengths, f"{each['k']:.3f}", _known(each["k_sigma"]), each["k_from"])
         print_table(console, table)
         print_line(
             console,
@@ -53,6 +53,11 @@ class Robots:
         )
         if self.json is not None:
             write_json(self.json, {"robots": found})
+
+
+def _known(sigma: float) -> str:
+    """A standard deviation; nothing where the robot file has none."""
+    return f"{sigma:.3f}" if sigma > 0.0 else ""
 
 
 def summary(robot: Robot) -> dict[str, Any]:

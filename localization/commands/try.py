@@ -102,10 +102,10 @@ class Try:
                 track_width_m=lengths[1],
                 wheelbase_m=lengths[2],
             )
-            runner.run("init", init, self._line("init"), is_needed=True)
+            runner.run("init", init, self._line("init", robot_file), is_needed=True)
         robot = load_robot(robot_file)
-        runner.run("info", Info(self.log, robot_file, json=folder / "info.json"), self._line("info"))
-        runner.run("check", Check(self.log, robot_file, out=folder / "check"), self._line("check"))
+        runner.run("info", Info(self.log, robot_file, json=folder / "info.json"), self._line("info", robot_file))
+        runner.run("check", Check(self.log, robot_file, out=folder / "check"), self._line("check", robot_file))
         robot_file = _corrected_file(robot_file, folder / "check" / "robot.toml")
         models = tuple(dict.fromkeys((DiffDrive.name, recommended_model(robot))))
         before = load_robot(robot_file)
@@ -117,15 +117,16 @@ class Try:
             others = tuple(folder / f"{other}.toml" for other in models[:-1])
             numbers = folder / f"calibrate_{model}.json"
             calibrate = _CalibrateCut((self.log,), robot_file, model, cut=cut, others=others, out=path, json=numbers)
-            runner.run(f"calibrate {model}", calibrate, self._line("calibrate", f"--model {model}"))
+            runner.run(f"calibrate {model}", calibrate, self._line("calibrate", robot_file, f"--model {model}"))
         best = str(calibrated) if calibrated.exists() else robot_file
         has_lidar = open_log(self.log, load_robot(best)).sources.lidar is not None
         pairs = ",".join((*(f"{model}/odometry" for model in models), f"{models[-1]}/{'graph' if has_lidar else 'ekf'}"))
+        reference = "" if self.reference is None else f" --reference {shlex.quote(self.reference)}"
         is_known = cut is not None  # calibration changes nothing of the set-up by which the log was cut
         replay = _ReplayKept(self.log, best, folder / "replay", pairs=pairs, reference=self.reference, static=True, is_known=is_known)
-        runner.run("replay", replay, self._line("replay", f"--pairs {pairs}"))
+        runner.run("replay", replay, self._line("replay", best, f"--pairs {pairs}{reference}"))
         diagnose = _DiagnoseDrive(self.log, best, out=folder / "diagnosis", static=True, known=known)
-        runner.run("diagnose", diagnose, self._line("diagnose"))
+        runner.run("diagnose", diagnose, self._line("diagnose", best))
         replayed = replay.kept[0] if replay.kept else None
         return TryResult(self.log.name, before, load_robot(best), models[-1], tuple(runner.parts), cut, _contents(folder, models), replayed)
 
@@ -138,16 +139,17 @@ class Try:
             return None
         return (log, drive) if drive.maneuvers else None
 
-    def _line(self, command: str, more: str = "") -> str:
-        """Command line of one part alone."""
-        robot = self.robot or str(self.out / "robot.toml")
-        options = {"init": f"--out {robot}" + "".join(f" --{n} {shlex.quote(str(p))}" for n, p in self._descriptions())}
-        tail = options.get(command, f"--robot {robot}")
+    def _line(self, command: str, robot_file: str, more: str = "") -> str:
+        """Command line of one part alone; the runner shows paths as they are at the end."""
+        robot = shlex.quote(robot_file)
+        tail = f"--out {robot}{self._descriptions()}" if command == "init" else f"--robot {robot}"
         out = f" --out {command}" if command in ("check", "replay", "diagnose") else ""
         return f"skidloc {command} {shlex.quote(str(self.log))} {tail}{' ' + more if more else ''}{out}"
 
-    def _descriptions(self) -> list[tuple[str, Path]]:
-        return [(name, path) for name, path in (("urdf", self.urdf), ("controller", self.controller)) if path is not None]
+    def _descriptions(self) -> str:
+        """Options of `init` that were given."""
+        given = {name: getattr(self, name) for name in ("urdf", "controller", "wheel_radius_m", "track_width_m", "wheelbase_m")}
+        return "".join(f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value in given.items() if value is not None)
 
 
 @dataclass(frozen=True)
@@ -230,6 +232,7 @@ class _Runner:
 
     def run(self, name: str, command: Any, line: str, is_needed: bool = False) -> None:
         """Run ``command``. Raises what it does where the others cannot go on without it."""
+        line = line.replace(str(self.folder), str(self._out))
         self._describe(name)
         self._console.print(f"[bold]{escape(name)}[/]  {escape(line)}", soft_wrap=True)
         quiet = PlainConsole(width=_WIDTH, record=True, file=io.StringIO(), highlight=False)

@@ -188,7 +188,7 @@ def print_twin(console: Console, result: TwinResult) -> None:
     for finding in result.findings:
         print_line(console, f"cause: {finding.describe()}")
     for repair in result.repaired:
-        gain = f"root mean square error on windows held out smaller by {repair.gain} m; {repair.judged.touch}"
+        gain = f"error on windows held out (position, heading times half the track) smaller by {repair.gain} m; {repair.judged.touch}"
         print_line(console, f"{repair.name}: {gain}{'' if repair.is_better else '. ' + _NOT_BETTER}")
         for change in repair.changes:
             print_line(console, f"  {change.describe()}")

@@ -100,8 +100,8 @@ def describe(found: DrivenWeighing, at: tuple[float, float] | None) -> str:
     if found.p_value > _SIGNIFICANCE or not is_shown.any():
         least = _TWO_SIDED_95 * found.mass_kg * found.sigmas.max()
         if found.model_errors:
-            return f"{where}, by a friction model that does not describe this drive: a load of {least:.1f} kg m could be there or not."
-        return f"{where}: that of the robot file, within the interval (a load of {least:.1f} kg m would show)."
+            return f"{where}, by a friction model that does not describe this drive: a load moment of {least:.1f} kg m may be there or not."
+        return f"{where}: no load was found; a load moment of {least:.1f} kg m would show."
     sides = [names[int(offset < 0.0)] for names, offset in zip((("ahead", "back"), ("left", "right")), found.offset, strict=True)]
     shown = [i for i in range(2) if is_shown[i]]
     shift = " and ".join(f"{abs(1e3 * found.offset[i]):.0f} mm farther {sides[i]}" for i in shown)

@@ -396,6 +396,8 @@ def _advice(found: ComparisonFindings) -> str:
     equal = [found.words[mean.name] for mean, d in pairs if d is None or not found.is_shown(d)]
     if not pairs:
         return "Name another model or estimator to have it compared."
+    if not found.tested:
+        return "No test was made: it takes two logs or more on which the same pairs ran."
     if not equal:
         return f"Use {found.words[best.name]}."
     if len(equal) < len(pairs):

@@ -490,7 +490,7 @@ def sentence(d: Diagnosis) -> str:
         return f"{cannot}{found}{contradiction} {d.next_drive}"
     added = [] if d.extension is None else [text for text in (d.extension.describe(), d.extension.describe_refused()) if text]
     if d.verdict == "consistent":
-        text = f"Nothing beyond tolerances is wrong with {d.model} on this drive that {d.windows} windows could show"
+        text = f"{d.model} fits this drive: {d.windows} windows show no error beyond its tolerance"
         if d.joint_p < _JOINT_LEVEL:
             text = f"Each cause by itself is within its tolerance, and {_joint(d)}"
         tolerated = describe_tolerated(d)

@@ -141,9 +141,9 @@ class HandoverCheck:
 
     def describe_replays(self) -> str:
         """Errors of the estimators on windows held out, replayed with both files, as a clause."""
-        replayed = ", ".join(f"{name} {one.before_m:.3g} -> {one.after_m:.3g} m" for name, one in self.replays.items())
-        held = "on another drive" if self.other_drives else "the half held out"
-        return f"replayed with the written file, {held}: {replayed} a window"
+        replayed = ", ".join(f"{name} {1e3 * one.before_m:.3g} -> {1e3 * one.after_m:.3g} mm" for name, one in self.replays.items())
+        held = "on another drive" if self.other_drives else "on the half held out"
+        return f"replayed with the written file, error of a window {held}: {replayed}"
 
     def to_dict(self) -> dict[str, Any]:
         """For `diagnose --json`; root mean squares by component [m or rad]."""

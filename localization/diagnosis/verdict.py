@@ -515,5 +515,6 @@ def general_advice(verdict: str, blind: Sequence[str]) -> str:
         )
     if verdict == "consistent" and blind:
         hidden = ", ".join(dict.fromkeys(blind))
-        return f"This drive would not show a typical {hidden}; turns in place, arcs to both sides and other postures would."
+        shown_by = "turns in place, arcs to both sides and other postures would show them"
+        return f"Errors of typical size in {hidden} do not show on this drive; {shown_by}."
     return ""

@@ -93,7 +93,7 @@ class LidarLosses:
             found.append(f"{sum(self.causes.values())} of {self.scans} scans: {parts}")
         if self.silences:
             found.append("no scans came for a second or more" + (f", {self.silences} times" if self.silences > 1 else ""))
-        return f"{self.summary} ({'; '.join(found)}). The pose is by wheels and gyro there. {self.advice}" if found else ""
+        return f"{self.summary} ({'; '.join(found)}). The pose is by the other sensors there. {self.advice}" if found else ""
 
     def numbers(self) -> dict[str, Any]:
         """Numbers of the losses, as `metrics.json` has them."""

@@ -134,7 +134,8 @@ def describe_turns(turns: Turns, model: MotionModel, robot: Robot) -> str:
     k, x_cr = predicted_turns(model, robot, turns.cg)
     low, high = (float(f(turns.k)) for f in (np.min, np.max))
     moved = f", while the centre of gravity moved by {100.0 * np.ptp(turns.cg[:, 0]):.1f} cm along the robot" if turns.moves else ""
-    text = f"In {len(turns.k)} turns in place k was between {low:.2f} and {high:.2f}{moved}. {model.name} is off by "
+    span = f"{low:.2f}" if f"{low:.2f}" == f"{high:.2f}" else f"between {low:.2f} and {high:.2f}"
+    text = f"In {len(turns.k)} turns in place k was {span}{moved}. {model.name} is off by "
     text += f"{np.sqrt(np.mean((k - turns.k) ** 2)):.3f} in k"
     known = np.isfinite(turns.x_cr)
     if known.any():

@@ -154,7 +154,7 @@ def _odds(found: DiagnosisResult) -> list[Chart]:
         charts.append(
             Chart(
                 f"In place of {f.definition.label}",
-                [("odds", "odds against it (1: as likely)")],
+                [("odds", f"odds relative to {f.definition.label}")],
                 [("row", "")],
                 series,
                 columns,

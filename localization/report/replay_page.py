@@ -163,8 +163,8 @@ def _about_reference(runs: Sequence[PlottedRun], reference: ReferenceTrack | Rel
         )
     if isinstance(reference, ReferenceTrack) and reference.yaws is None:
         sentences.append(
-            "It has positions only, so there are no heading errors, no RPE and no NEES; its own noise and the distance of its antenna "
-            "from the robot's base are part of the errors."
+            "It has positions only, so there are no heading errors and no RPE, and NEES is that of the distances; its own noise and the "
+            "distance of its antenna from the robot's base are part of the errors."
         )
     if len(runs) > 1:
         sentences.append("Bold: the smallest error of its column.")

@@ -239,7 +239,7 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
     advice = dict.fromkeys(losses.advice for _, losses in lost if losses is not None)
     if any(line.error is not None for line in lines):
         parts = [f"{line.words} ({losses.summary})" for line, losses in lost if losses is not None]
-        return [f"Part of the way is by wheels and gyro alone in {join_words(parts)}; the errors include that.", *advice]
+        return [f"Part of the way is without the LiDAR in {join_words(parts)}; the errors include that.", *advice]
     parts = [f"{line.words}: {losses.summary}" for line, losses in lost if losses is not None]
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
@@ -249,7 +249,7 @@ def _as_published(best: PlottedRun) -> list[str]:
     run, then = best.result.run, headline(best.result.live)
     loops = run.counts.get("loops", 0)
     if then is not None and run.hindsight == "gyro bias":
-        return [f"That is with what was found later of the gyro; as published while it drove, without jumps, its error was {metres(then)}."]
+        return [f"That is the trajectory as corrected later by the gyro's bias; the poses that were published live had {metres(then)}."]
     if not loops or then is None:
         return []
     places = "a place" if loops == 1 else f"{loops} places"
@@ -339,7 +339,7 @@ def _shown(result: Result) -> str:
     if result.nees_mean is None and result.position_nees is not None:
         dof, band = 1, result.position_nees.band
     factor = math.sqrt(band[1] / dof)
-    return f"; so short a drive shows only sigmas that are {factor:.1f} times too small or more" if factor > _MIN_SHOWN_FACTOR else ""
+    return f"; on so short a drive sigmas that are less than {factor:.1f} times too small stay hidden" if factor > _MIN_SHOWN_FACTOR else ""
 
 
 def _exactness(best: PlottedRun, reference: ReferenceTrack | Relations) -> list[str]:
@@ -397,7 +397,7 @@ def _advice(
     lines: Sequence[PlottedRun], best: PlottedRun, equals: Sequence[PlottedRun], reference: ReferenceTrack | Relations
 ) -> list[str]:
     if len(lines) == 1:
-        return [f"To learn what {best.result.run.estimator} gains, run it beside {DEAD_RECKONING} and another model."]
+        return ["Run a second model or estimator to compare it with."]
     with_lidar = [line for line in lines if line.result.run.estimator != DEAD_RECKONING and len(line.result.run.map_points)]
     if best.result.run.estimator == DEAD_RECKONING and with_lidar and not any(line in equals for line in with_lidar):
         return ["The LiDAR made no run better than the wheels alone: check its mount, its stamps and its range in the robot file first."]

@@ -115,7 +115,8 @@ def odometry_sentence(replayed: Replayed | None, model: str) -> str:
     if model == DiffDrive.name or not errors.keys() >= {DiffDrive.name, model}:
         return ""
     ours, base = (metres(errors[name]) for name in (model, DiffDrive.name))
-    return f"By wheels alone this drive is off by {ours} with {model}, and by {base} with diff_drive (ATE against {source})."
+    errors_by = f"{ours} with {model}, and by {base} with diff_drive, both calibrated on it"
+    return f"By wheels alone this drive is off by {errors_by} (ATE against {source})."
 
 
 def _held_out_errors(contents: Mapping[str, Any], model: str) -> list[tuple[str, dict[str, str]]]:
@@ -159,7 +160,7 @@ def _calibrated(numbers: Mapping[str, Any], found: TryResult) -> str:
     k = track / turning["effective_track_m"][0]
     sigma = k * turning["effective_track_m"][1] / turning["effective_track_m"][0]
     x, x_sigma = turning["x_cr_m"]
-    where = f", and the centre of rotation is {x:+.3f} +- {x_sigma:.3f} m ahead" if found.model != "diff_drive" else ""
+    where = f", and the centre of rotation is {x:+.3f} +- {x_sigma:.3f} m ahead" if x_sigma > 0.0 and found.model != "diff_drive" else ""
     return f"Calibrated at the nominal centre of gravity, k is {k:.3f} +- {sigma:.3f}{where}."
 
 

@@ -297,5 +297,5 @@ def provenance(result: TwinResult, m: Mended, source: str) -> str:
     lines = [f"Numbers found by skidloc twin on {source}: {result.fitted} windows fitted, {len(result.windows)} held out."]
     lines += [change.describe() for change in m.changes]
     lines += [f"The wheels' friction is that of {name} beside this file: without it they have none." for name in m.beside]
-    lines.append(f"Held out: root mean square error smaller by {m.gain} m; {m.judged.touch}.")
+    lines.append(f"Held out: error (position, heading times half the track) smaller by {m.gain} m; {m.judged.touch}.")
     return "\n     ".join(lines)

@@ -111,7 +111,7 @@ def diff_drive_controller_yaml(
     texts = [_rounded(value, sigma) for value, sigma in zip(found, _multiplier_sigmas(model, robot, params, sigmas or {}), strict=True)]
     twist = _diagonal(twist_variances(model, robot, params, publish_rate_hz))
     lines = [
-        f"# {robot.name}: calibrated with the model '{model.name}'. Exact straight ahead and in the yaw rate of turning in place; on arcs",
+        f"# {robot.name}: by the model '{model.name}'. Exact straight ahead and in the yaw rate of turning in place; on arcs",
         f"# as near as this controller comes. Parameters of the node '{node}'; keep its others. Multipliers of 1 are left out.",
         f"{node}:",
         "  ros__parameters:",

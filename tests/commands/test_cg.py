@@ -125,13 +125,13 @@ def test_cg_of_bad_input_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
         bad.write_text(text)
         assert complaint in refused(capsys, bad)
     for arguments, complaint in (
-        ((), "nothing to find a centre of gravity by"),
+        ((), "name what a centre of gravity is found by"),
         ((tmp_path / "lost.csv",), "cannot be read"),
         (("--posture", "nap"), "no posture 'nap'; there are ready, stow_back"),
         (("--posture", "ready", "--joint", "elbow=1"), "no joint elbow that moves mass; such joints are left_shoulder_pan_joint"),
         (("--posture", "ready", "--joint", "left_elbow_joint=up"), "must be NAME=VALUE"),
         (("--joint", "left_elbow_joint=1"), "left_shoulder_pan_joint"),  # the others are missing
-        (("--posture", "ready", "--payload", "3"), "hangs in the air"),
+        (("--posture", "ready", "--payload", "3"), "takes --at LINK"),
         (("--posture", "ready", "--payload", "-3", "--at", "left_gripper"), "must be positive"),
         (("--posture", "ready", "--payload", "3", "--at", "hook"), "hook"),
         (("--posture", "ready", "--payload", "300", "--at", "left_gripper"), "would tip over"),

@@ -72,10 +72,10 @@ def test_odometry_is_compared_with_the_reference_else_with_the_path_by_the_lidar
     by_wheels = [run("diff_drive", "odometry", 0.6, 1), run("friction", "odometry", 0.2, 2)]
     matched = dataclasses.replace(run("friction", "graph", 0.01, 3), lidar=object())
     of_reference = odometry_sentence(Replayed(score([*by_wheels, matched], track()), track()), "friction")
-    assert "with diff_drive (ATE against /ground_truth/odom)" in of_reference
+    assert "with diff_drive, both calibrated on it (ATE against /ground_truth/odom)" in of_reference
     results = score([*by_wheels, matched], None)
     of_path = odometry_sentence(Replayed(results, None), "friction")
-    assert "with diff_drive (ATE against the path of graph by the LiDAR)" in of_path
+    assert "calibrated on it (ATE against the path of graph by the LiDAR)" in of_path
     found = [[float(value) for value in re.findall(r"by (\d\.\d+) m", text)] for text in (of_reference, of_path)]
     assert found[0] == pytest.approx(found[1], rel=0.05)
     assert found[0][0] < 0.5 * found[0][1]

@@ -151,5 +151,5 @@ def test_weigh_by_tyres_of_the_model_finds_no_model_error() -> None:
 
 def test_describe_where_the_model_is_wrong_claims_no_file_value() -> None:
     wrong = dataclasses.replace(_weighing((0.001, 0.0)), model_errors=("track_width -0.07 (-3.5 sigma): more than robots differ by.",))
-    assert "that of the robot file" in describe(_weighing((0.001, 0.0)), None)
+    assert "no load was found" in describe(_weighing((0.001, 0.0)), None)
     assert "does not describe this drive" in describe(wrong, None)

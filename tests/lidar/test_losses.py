@@ -56,7 +56,7 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
     assert losses.is_long
     assert losses.describe() == (
         "LiDAR lost for 40 % of the drive, longest 6 s at t = 9 s (no scans came for a second or more). "
-        "The pose is by wheels and gyro there. Check the LiDAR's driver, cable and topic."
+        "The pose is by the other sensors there. Check the LiDAR's driver, cable and topic."
     )
     assert losses.numbers()["silences"] == 1
 
@@ -106,7 +106,7 @@ def test_verdict_with_reference_recommends_by_error(reference) -> None:
     text = verdict(results, reference)
     assert best_run(plotted_runs(results)).result is results[0]
     assert text.startswith("ekf with skid_steer is best: ")
-    assert "by wheels and gyro alone in ekf with skid_steer (LiDAR lost for 60 % of the drive, longest 60 s at t = 7 s)" in text
+    assert "without the LiDAR in ekf with skid_steer (LiDAR lost for 60 % of the drive, longest 60 s at t = 7 s)" in text
     assert "Check the LiDAR's mount" in text
     assert "ecommended" not in text
 

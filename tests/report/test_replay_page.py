@@ -86,7 +86,7 @@ def test_summary_of_corrected_poses_says_the_error_of_the_published_ones():
     results = score([corrected, run(estimator="odometry", noise=0.9)], track())
     published = f"{results[0].live.ate_rmse_m:.3f} m"
     assert results[0].live.ate_rmse_m > 2.0 * results[0].accuracy.ate_rmse_m
-    assert f"as published while it drove, without jumps, its error was {published}" in verdict(results, track())
+    assert f"the poses that were published live had {published}" in verdict(results, track())
     assert "without jumps" not in verdict(score([run(noise=0.1)], track()), track())
 
 
@@ -220,8 +220,8 @@ def test_summary_large_innovations_with_honest_poses_are_no_overconfidence():
     text = verdict([dataclasses.replace(result, nees_mean=1.5, nees_band=None)], track())
     assert "overconfident" not in text
     assert (
-        "Its covariances are not too small by the reference (mean NEES 1.5, where 3 is expected; so short a drive shows only "
-        "sigmas that are 1.8" in text
+        "Its covariances are not too small by the reference (mean NEES 1.5, where 3 is expected; on so short a drive "
+        "sigmas that are less than 1.8 times too small stay hidden" in text
     )
     assert "differ by more than their covariances predict: mean NIS" in text
     assert "`skidloc diagnose`" in text

@@ -28,7 +28,10 @@ def _move_lidar(name: str, unit: str) -> Callable[[CorrectionDraft, float], Corr
         mounts = {**robot.mounts, frame: dataclasses.replace(old, **{name: getattr(old, name) + size})}
         overridden = tuple(dict.fromkeys([*robot.tf.overridden, frame]))
         draft = draft.with_robot(mounts=mounts, tf=dataclasses.replace(robot.tf, overridden=overridden))
-        text = f"[mounts] of {frame} goes before /tf_static by [tf] overridden: correct the transform where it comes from, and remove that."
+        text = (
+            f"robot.toml overrides the transform of {frame} that /tf_static has ([mounts], [tf] overridden): correct it in the URDF, and"
+            " then remove both entries."
+        )
         return draft if text in draft.steps else draft.with_step(text)
 
     return correct
