@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from localization.calibration.calibrate import Cut
+from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, Relations
-from localization.evaluation.scores import Result, score
+from localization.evaluation.scores import Result
 from localization.report import page as html
 from localization.report.cg_figure import Turns, cg_blocks, describe_turns, measured_turns
 from localization.report.replay_page import map_figure
@@ -46,16 +48,16 @@ class Replayed:
     results: Sequence[Result]
     reference: ReferenceTrack | Relations | None
 
+    @cached_property
     def odometry_errors(self) -> tuple[dict[str, float], str]:
         """ATE of dead reckoning by model [m], and what it was measured against: the reference, else the path by the LiDAR; none without
         both."""
-        runs = [result.run for result in self.results]
-        track = self.reference if isinstance(self.reference, ReferenceTrack) else self._path_by_lidar()
-        if track is None:
-            return {}, ""
-        scored = score([run for run in runs if run.estimator == DEAD_RECKONING], track)
-        errors = {r.run.model: r.accuracy.ate_rmse_m for r in scored if r.accuracy is not None and not r.contradictions}
-        return {model: error for model, error in errors.items() if error is not None}, track.source
+        reckoned = [result for result in self.results if result.run.estimator == DEAD_RECKONING]
+        found = {r.run.model: r.accuracy for r in reckoned if not r.contradictions}
+        source = "" if self.reference is None else self.reference.source
+        if self.reference is None and (path := self._path_by_lidar()) is not None:
+            found, source = {r.run.model: evaluate(r.run.trajectory, path) for r in reckoned}, path.source
+        return {m: a.ate_rmse_m for m, a in found.items() if a is not None and a.ate_rmse_m is not None}, source
 
     def _path_by_lidar(self) -> ReferenceTrack | None:
         matched = [r.run for r in self.results if r.run.lidar is not None and len(r.run.trajectory)]
@@ -111,7 +113,7 @@ def improvement(contents: Mapping[str, Any], model: str) -> str:
 
 def odometry_sentence(replayed: Replayed | None, model: str) -> str:
     """What dead reckoning over the whole drive is off by, with diff_drive and with ``model``; empty where unknown."""
-    errors, source = ({}, "") if replayed is None else replayed.odometry_errors()
+    errors, source = ({}, "") if replayed is None else replayed.odometry_errors
     if model == DiffDrive.name or not errors.keys() >= {DiffDrive.name, model}:
         return ""
     ours, base = (metres(errors[name]) for name in (model, DiffDrive.name))
@@ -205,7 +207,7 @@ def _odometry_blocks(found: TryResult) -> list[html.Block]:
     rows = _held_out_errors(found.contents, found.model)
     if not rows:
         return []
-    errors, source = ({}, "") if found.replayed is None else found.replayed.odometry_errors()
+    errors, source = ({}, "") if found.replayed is None else found.replayed.odometry_errors
     names = list(rows[0][1])
     columns = [*(f"{name} of a window" for name in names), *(["whole drive"] if errors else [])]
     by_row = (None, errors.get(DiffDrive.name), errors.get(found.model))
