@@ -215,7 +215,8 @@ def _find_own(
             b[0], b[1], b[2], b[3], b[4] = nearest[k], 0.0, heading, heading, 0.0
             seen_through[k] = 0.0
             continue
-        b[1], b[2], b[3] = b[1] + travelled, min(b[2], heading), max(b[3], heading)
+        b[1] += min(travelled, _VIEW_EVERY_M)  # one scan is one view, however far the robot has driven since the last
+        b[2], b[3] = min(b[2], heading), max(b[3], heading)
         if (b[1] >= _MIN_TRAVEL_M and b[3] - b[2] >= _MIN_TURN_RAD) or seen_through[k] >= _MIN_SEEN_THROUGH:
             b[4] = 1.0
         candidates += b[1] >= _SAME_FOR_M and b[4] == 0.0 and travelled > 0.0

@@ -52,6 +52,14 @@ def test_nothing_is_removed_from_scans_of_a_robot_at_rest() -> None:
     assert faults.found == {}
 
 
+def test_few_scans_far_apart_show_no_part_of_the_robot() -> None:
+    """Half a metre and 12 degrees from scan to scan: the post has the same range in four of them, as a wall has by chance; ten show it."""
+    rng, body = np.random.default_rng(0), OwnBody(FaultLog(CovarianceInflation()))
+    sizes = [len(body.remove(step(k, rng, np.array([0.5, 0.0, 0.2]))).scan.points) for k in range(14)]
+    assert sizes[:8] == [len(ANGLES)] * 8
+    assert sizes[-1] == len(ANGLES) - 20
+
+
 def scan_of(walls: np.ndarray, pose: np.ndarray, rng: np.random.Generator, cover: np.ndarray | None = None) -> Scan:
     """Ranges to ``walls`` (n, 5) from ``pose`` (3,) with 1 cm of noise, and where it is nearer, to what ``cover`` (360,) them."""
     ranges = rooms.look_around(walls, pose, ANGLES) + 0.01 * rng.normal(size=len(ANGLES))
