@@ -227,7 +227,7 @@ def _set_up_rows(set_up: SetUp) -> list[CheckRow]:
         against = [value for key, value in set_up.against.items() if key in {f"{source}.{name}" for name in names}]
         if not against:
             continue
-        second = f"the other sources: {_odds(min(against))} against each fault"
+        second = f"odds of {_odds(min(against))} against each fault, by the other sources"
         is_seen = min(against) > _REFUTED
         advice = "" if is_seen else f"{_TURN_AND_STRAIGHT}."
         rows.append(CheckRow(quantity, "as in the robot file", second, "ok" if is_seen else "cannot be seen", advice))
@@ -252,7 +252,7 @@ def _radius(robot: Robot, set_up: SetUp) -> tuple[CheckRow | None, Robot]:
         advice = "drive straight on for 10 s with a LiDAR, or record a reference."
         return CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice), robot
     measured, sigma = radius * math.exp(-way[0]), radius * way[1]
-    second = f"{measured:.4g} +- {sigma:.2g} m by the ways of the other sources"
+    second = f"{measured:.4g} +- {sigma:.2g} m by the distances of the other sources"
     if abs(way[0]) <= _SAME_SCALE + _SIGMAS * way[1] or set_up.sentences:
         return CheckRow("wheel radius", f"{radius:.4g} m", second, "ok"), robot
     advice = f"write {part}.wheel_radius_m = {measured:.4g}, or check units, gear and the LiDAR's ranges."
@@ -312,7 +312,7 @@ def _reference_row(known: SetUpLog, given: str | None) -> CheckRow:
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "contradiction", str(error))
     if compared.verdict == "undecidable":
         return CheckRow("reference", topic, f"{len(found.stamps_ns)} poses", "cannot be seen", _DRIVE_WITH_REFERENCE)
-    second = f"speed and turns of the sensors: way {compared.scale:.4g} times theirs" if compared.scale > 0.0 else "another motion"
+    second = f"speed and turns of the sensors: distance {compared.scale:.4g} times theirs" if compared.scale > 0.0 else "another motion"
     advice = " ".join(text.removeprefix(f"{found.source}: ") for text in compared.sentences)
     return CheckRow("reference", topic, second, "contradiction" if advice else "ok", advice)
 

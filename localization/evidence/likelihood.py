@@ -300,7 +300,7 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
         inputs = _inputs(single, np.zeros((1, len(single)), int), name, 1.0, used)
-        _, _, c, information = channel_evidence(*inputs, _SIZES[name], *_smallest(single, np.zeros((1, len(single)), int), name))
+        _, _, c, information = channel_evidence(*inputs, _SIZES[name], *_sizes_at_rest(single, np.zeros((1, len(single)), int), name))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
     return found
@@ -316,7 +316,7 @@ def least_sizes(stacks: Sequence[Stack], choices: Choices, name: str) -> FloatAr
     return np.asarray(np.maximum(_AT_REST * np.minimum(largest, _FAST * _SIZES[name]), STILL[name]))
 
 
-def _smallest(stacks: Sequence[Stack], choices: Choices, name: str) -> tuple[FloatArray, FloatArray]:
+def _sizes_at_rest(stacks: Sequence[Stack], choices: Choices, name: str) -> tuple[FloatArray, FloatArray]:
     """`least_sizes` (A,), and the size (A, n) of the motion of a robot that stands: where encoders count, in its unit."""
     units = [
         np.where(stack._is_scaled, np.maximum(np.exp(stack.log_unit(name)[rows]), 1.0), 1.0)
@@ -330,7 +330,7 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float
     """Evidence (A, n) by bin of one channel, at a level of the noise; what concerns all bins is spread over them."""
     used = [i for i, stack in enumerate(stacks) if stack.channel(name) is not None]
     inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choices, name, level, used)
-    sizes = _SIZES[name], *_smallest(stacks, choices, name)
+    sizes = _SIZES[name], *_sizes_at_rest(stacks, choices, name)
     of_bins, price, _, _ = channel_evidence(*inputs, *sizes)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
     slips = np.array([NOISE[stacks[i].kind].relative for i in used])
