@@ -1,12 +1,15 @@
 """Tilt of the ground, apart from the error of the IMU's mount.
 
-A mount that is off by a degree or two looks like a slope, but stays with the body, while a slope turns against it and changes with the way:
-both are the states of a slow filter, whose measurement is their sum, the tilt by the attitude.
+A mount that is off looks like a slope, but stays with the body, while a slope turns against it and changes with the way: both are the
+states of a slow filter, whose measurement is their sum, the tilt by the attitude. Mounts in robot files are right within a degree or two,
+or the IMU sits askew and the file does not have it: a bank of two filters, whose measurements decide between them (Bar-Shalom, Li and
+Kirubarajan 2001, sec. 11.6, the static multiple-model estimator).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,21 +21,36 @@ _LEVEL = math.tan(math.radians(3.0))
 """Tilt up to which the ground counts as level: a Husky outdoors is level within 1.8 deg, and mounts are known to a degree or two."""
 _CERTAIN = 3.5
 """Sigmas at which the ground counts as tilted."""
-_MOUNT_SIGMA, _GROUND_SIGMA = math.radians(1.2), math.radians(6.0)
-"""Sigma of mounts in robot files, and of the slope of hills (median 5.8 deg, 95 % below 10.7)."""
+_GROUND_SIGMA = math.radians(6.0)
+"""Sigma of the slope of hills (median 5.8 deg, 95 % below 10.7)."""
 _HILL_M = 5.0
 """Way over which a slope changes."""
 _LASTING = 2.0
 """For how many windows errors of the vertical last."""
 
 
+class _Mount(NamedTuple):
+    """How far the IMU's mount may be off [rad], and the probability of that before anything is measured."""
+
+    sigma: float
+    prior: float
+
+
+_MOUNTS = (_Mount(math.radians(1.2), 0.95), _Mount(math.radians(10.0), 0.05))
+"""As robot files have them; and not in the file, of one robot in twenty by judgement."""
+
+
 class GroundTilt:
     """`restart` with each first vertical, then `update` by each measured one."""
 
     def __init__(self) -> None:
-        self._mean, self._cov = np.zeros(4), np.diag([_MOUNT_SIGMA**2] * 2 + [_GROUND_SIGMA**2] * 2)
+        self._means = np.zeros((len(_MOUNTS), 4))
+        self._covs = np.array([np.diag([mount.sigma**2] * 2 + [_GROUND_SIGMA**2] * 2) for mount in _MOUNTS])
+        self._log_odds = np.log([mount.prior for mount in _MOUNTS])
+        self._mean, self._cov = np.zeros(4), np.zeros((4, 4))
+        self._mix()
         self.is_certain = False
-        """Whether the ground has been found to tilt."""
+        """Whether the ground has been found to tilt: until the mount is more probable to be off, and explains it."""
 
     @property
     def mount_error(self) -> FloatArray:
@@ -54,22 +72,40 @@ class GroundTilt:
         """(2, 2) of the ground's slope."""
         return self._cov[2:, 2:]
 
+    @property
+    def probabilities(self) -> FloatArray:
+        """(2,) of `_MOUNTS`."""
+        odds = np.exp(self._log_odds - self._log_odds.max())
+        return np.asarray(odds / odds.sum())
+
     def restart(self) -> None:
         """The ground is another one: nothing is known of its tilt."""
-        self._cov[2:] = self._cov[:, 2:] = 0.0
-        self._cov[2, 2] = self._cov[3, 3] = _GROUND_SIGMA**2
+        self._covs[:, 2:] = self._covs[:, :, 2:] = 0.0
+        self._covs[:, 2, 2] = self._covs[:, 3, 3] = _GROUND_SIGMA**2
+        self._mix()
 
     def update(self, downhill: FloatArray, cov: FloatArray, turn: float, way: float) -> None:
         """Update by the measured ``downhill`` slope (2,) of mount and ground together and its ``cov`` (2, 2), after ``turn`` [rad] and
         ``way`` [m]."""
-        _separate(self._mean, self._cov, downhill, cov, turn, way)
-        if not self.is_certain and np.hypot(*self.ground) > _LEVEL:
-            self.is_certain = bool(self.ground @ np.linalg.solve(self.ground_cov, self.ground) > _CERTAIN**2)
+        for i in range(len(_MOUNTS)):
+            self._log_odds[i] += _separate(self._means[i], self._covs[i], downhill, cov, turn, way) / _LASTING
+        self._mix()
+        square = float(self.ground @ np.linalg.solve(self.ground_cov, self.ground))
+        is_shown = bool(np.hypot(*self.ground) > _LEVEL and square > _CERTAIN**2)
+        self.is_certain = is_shown or (self.is_certain and bool(self.probabilities[0] > 0.5))
+
+    def _mix(self) -> None:
+        """Mean and covariance of the mixture."""
+        p = self.probabilities
+        self._mean = p @ self._means
+        off = self._means - self._mean
+        self._cov = np.einsum("h,hij->ij", p, self._covs + off[:, :, None] * off[:, None, :])
 
 
 @kernel
-def _separate(mean: FloatArray, cov: FloatArray, downhill: FloatArray, own: FloatArray, turn: float, way: float) -> None:
-    """See `GroundTilt.update`: ``mean`` (4,) and ``cov`` (4, 4) change in place; ``own`` (2, 2) is the measurement's."""
+def _separate(mean: FloatArray, cov: FloatArray, downhill: FloatArray, own: FloatArray, turn: float, way: float) -> float:
+    """See `GroundTilt.update`: ``mean`` (4,) and ``cov`` (4, 4) change in place; ``own`` (2, 2) is the measurement's. Returns the log
+    likelihood of the measurement."""
     c, s = math.cos(turn), math.sin(turn)
     fade = math.exp(-way / _HILL_M)
     move = np.eye(4)
@@ -81,10 +117,15 @@ def _separate(mean: FloatArray, cov: FloatArray, downhill: FloatArray, own: Floa
     new = _GROUND_SIGMA * _GROUND_SIGMA * (1.0 - fade * fade)
     cov[2, 2] += new
     cov[3, 3] += new
-    found, gain = np.zeros(4), np.empty(4)
+    found, gain, log_likelihood = np.zeros(4), np.empty(4), 0.0
     for axis in range(2):
         row = np.array([1.0 - axis, axis, 1.0 - axis, axis])
         variance = _LASTING * own[axis, axis]
-        update_in_place(found, cov, row, downhill[axis] - mean[axis] - mean[2 + axis], variance, gain)
+        error = downhill[axis] - mean[axis] - mean[2 + axis]
+        off = error - found[axis] - found[2 + axis]
+        spread = variance + cov[axis, axis] + 2.0 * cov[axis, 2 + axis] + cov[2 + axis, 2 + axis]
+        log_likelihood -= 0.5 * (off * off / spread + math.log(math.tau * spread))
+        update_in_place(found, cov, row, error, variance, gain)
     for i in range(4):
         mean[i] += found[i]
+    return log_likelihood
