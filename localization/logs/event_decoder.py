@@ -285,6 +285,8 @@ class PublisherSeparator:
         self._mean: list[float] = []
         self._sizes_of_one: tuple[list[float], list[float]] = [], []
         """Scales of changes since the last reading, and from the mean."""
+        self._steps: list[float] = []
+        """Least change of each value by either of two publishers: the step of an encoder that counts coarsely."""
 
     def admit(self, stamp_ns: int, values: Sequence[float], speed: float) -> bool:
         """Whether a reading of ``values`` (velocities, place; NaN where absent) at ``speed`` [m/s] is to be used."""
@@ -293,6 +295,7 @@ class PublisherSeparator:
             self._current = _Publisher(stamp_ns, list(values))
             self._sizes = [0.0] * len(values)
             self._mean, self._sizes_of_one = list(values), ([0.0] * len(values), [0.0] * len(values))
+            self._steps = [math.inf] * len(values)
             return True
         if self._other is not None and stamp_ns - self._other.stamp_ns > _MAX_PUBLISHER_GAP_NS:
             self._other, self._log_odds, self._largest = None, _ARE_TWO, 0.0
@@ -311,10 +314,12 @@ class PublisherSeparator:
         """The publisher of a reading; the one before, where it is another, is the other one."""
         changes, other = _changes(values, current.values), self._other
         back = changes if other is None else _changes(values, other.values)
+        for found in (changes, back):
+            self._steps = [min(step, change) if change > _RESOLUTION else step for step, change in zip(self._steps, found, strict=True)]
         cost, of_one = self._cost(changes), self._cost_of_one(values, changes)
         if other is not None:
             cost_of_other = self._cost(back)
-            of_scales = _log_scales(changes, _scales(self._sizes))
+            of_scales = _log_scales(changes, self._scales(self._sizes))
             gained = min(of_one, cost + of_scales) - min(cost, cost_of_other) - of_scales
             self._log_odds = min(max(self._log_odds + min(_OUTLIER, gained) + _IS_ONE, _ARE_TWO), 2.0 * _CERTAIN)
             if cost_of_other < cost:
@@ -331,7 +336,7 @@ class PublisherSeparator:
 
     def _cost(self, changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``changes`` by either of two publishers, without that of the scales."""
-        return _cauchy(changes, _scales(self._sizes))
+        return _cauchy(changes, self._scales(self._sizes))
 
     def _cost_of_one(self, values: Sequence[float], changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``values`` by a single publisher, of whose two predictions the better one so far counts."""
@@ -339,13 +344,17 @@ class PublisherSeparator:
         last, mean = self._sizes_of_one
         pairs = zip(last, changes, mean, off, strict=True)
         found = [(size, change) if size <= other else (other, from_mean) for size, change, other, from_mean in pairs]
-        scales = _scales([size for size, _ in found])
+        scales = self._scales([size for size, _ in found])
         self._sizes_of_one = _fitted(last, changes), _fitted(mean, off)
         self._mean = [
             m if not math.isfinite(v) else v if math.isnan(m) else m + _FOLLOW * (v - m) for m, v in zip(self._mean, values, strict=True)
         ]
         of_one = [change for _, change in found]
         return _cauchy(of_one, scales) + _log_scales(of_one, scales)
+
+    def _scales(self, sizes: Sequence[float]) -> list[float]:
+        """Scales of the densities of changes of such ``sizes``: no value is finer than its step."""
+        return [max(size, _RESOLUTION, step if step < math.inf else 0.0) for size, step in zip(sizes, self._steps, strict=True)]
 
     def _learn(self, changes: Sequence[float]) -> None:
         self._sizes = _fitted(self._sizes, changes)
@@ -355,11 +364,6 @@ def _changes(values: Sequence[float], before: Sequence[float]) -> list[float]:
     """Sizes of the changes of ``values`` from those ``before``; NaN where they are not known."""
     changes = [abs(a - b) for a, b in zip(values, before, strict=True)]
     return [change if change < math.inf else math.nan for change in changes]
-
-
-def _scales(sizes: Sequence[float]) -> list[float]:
-    """Scales of the densities of changes of such ``sizes``."""
-    return [max(size, _RESOLUTION) for size in sizes]
 
 
 def _cauchy(changes: Sequence[float], scales: Sequence[float]) -> float:

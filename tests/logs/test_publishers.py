@@ -34,16 +34,22 @@ def topic(seed: int, kind: str) -> tuple[FloatArray, float]:
     speed, turn, noise = np.clip(0.3 + wandering(rng, count, hz), 0.0, 1.0), wandering(rng, count, hz), rng.uniform(0.05, 0.5)
     heading = np.cumsum(turn) / hz
     sides = np.column_stack([speed - 0.3 * turn, speed + 0.3 * turn])
+    step = rng.uniform(0.1, 0.3)  # of a rate by counts [m/s]
+    started = np.clip((np.arange(count) / hz - 2.0) * 0.5, 0.0, 0.4)[:, None] * np.array([1.0, rng.uniform(0.9, 1.1)])
+    counts = np.floor(np.cumsum(started, axis=0) / step + rng.uniform(0.0, 1.0, 2))
     return {
         "noisy turn rates": np.column_stack([speed, turn + rng.normal(0.0, noise, count)]),
         "noisy wheels": sides + rng.normal(0.0, 0.3 * noise, (count, 2)),
         "coarse encoders": np.round(100.0 * sides * hz + rng.uniform(0.0, 1.0, (count, 2))) / (100.0 * hz),
+        "few counts from rest on": step * np.diff(counts, axis=0, prepend=0.0),
         "outliers": np.column_stack([speed, turn + 0.1 * rng.standard_t(1.5, count)]),
         "places alone": np.cumsum(speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0) / hz,
     }[kind], hz
 
 
-@pytest.mark.parametrize("kind", ["noisy turn rates", "noisy wheels", "coarse encoders", "outliers", "places alone"])
+@pytest.mark.parametrize(
+    "kind", ["noisy turn rates", "noisy wheels", "coarse encoders", "few counts from rest on", "outliers", "places alone"]
+)
 def test_single_publisher_loses_no_reading(kind: str) -> None:
     assert [left_out(*topic(seed, kind)) for seed in SEEDS] == [0.0] * len(SEEDS)
 
