@@ -37,7 +37,7 @@ class _Mount(NamedTuple):
 
 
 _MOUNTS = (_Mount(math.radians(1.2), 0.95), _Mount(math.radians(10.0), 0.05))
-"""As robot files have them; and not in the file, of one robot in twenty by judgement."""
+"""One that is as the robot file has it, and one that is not, of one robot in twenty by judgement."""
 
 
 class GroundTilt:

@@ -8,7 +8,7 @@ import math
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,6 @@ from rich.table import Table
 
 from localization.errors import SettingError
 from localization.output import output_errors, refuse_existing, write_text_file
-from motion_models.registry import usual_models
-from motion_models.robot import Robot
 
 # Control characters but for line ends and tabs, marks that turn the direction of writing, and bytes of file names that are no text.
 _COMMANDS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -44,11 +42,6 @@ def names(text: str, option: str) -> list[str]:
     if not found:
         raise SettingError(f"{option} is '{text}', which names nothing; it must be one name, or several separated by commas.")
     return found
-
-
-def model_names(text: str, robots: Sequence[Robot]) -> list[str]:
-    """Names of motion models in ``text``; those that are usual for ``robots`` where it is `auto`. Raises what `names` does."""
-    return list(usual_models(robots)) if text == "auto" else names(text, "--model")
 
 
 @contextlib.contextmanager

@@ -16,7 +16,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 
-from localization.commands.common import model_names, names, write_json
+from localization.commands.common import names, write_json
+from localization.commands.models import model_names
 from localization.comparison.comparison_page import CompareHead, check_report, write_comparison_report
 from localization.comparison.jobs import OK, Job, LogOrigin, Row, job_key, run_job, run_local, run_on_cluster, trials
 from localization.comparison.manifest import Entry, read_manifest

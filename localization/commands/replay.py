@@ -18,7 +18,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from localization.commands.common import WIDE, model_names, names, new_folder, print_table, write_json
+from localization.commands.common import WIDE, names, new_folder, print_table, write_json
+from localization.commands.models import model_names
 from localization.errors import EstimatorError, EvaluationError, MapError, SettingError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
 from localization.evaluation.reference_files import load_reference

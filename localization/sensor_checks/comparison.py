@@ -29,7 +29,7 @@ from motion_models.se2 import FloatArray
 
 Sensor = Literal["wheels", "gyro", "LiDAR"]
 
-_MAX_RATIO = 2.5
+MAX_RATIO = 2.5
 """Motions whose sizes differ by more are not equal: the wheels of a robot that skids turn about twice as far."""
 OPPOSITE_RAD = math.radians(130.0)
 """Direction of a turn, which is 0 or pi, from where on it is opposite; equal and opposite are certain to 50 deg then, 4 standard errors of
@@ -80,7 +80,7 @@ class Gain(NamedTuple):
     bound: float
     """Error of the direction at most [rad], by the scatter of the bins (`_CONFIDENCE`); infinite where the window shows no direction."""
     is_equal: bool
-    """Directions and scales (within `_MAX_RATIO`) are equal, whatever the error."""
+    """Directions and scales (within `MAX_RATIO`) are equal, whatever the error."""
 
 
 UNKNOWN = Gain(0.0, 0.0, math.inf, is_equal=False)
@@ -105,7 +105,7 @@ class Comparison(NamedTuple):
             n, alpha, sigma = _fit_turns(a, b, bins.durations_s, *limits)
         bound = _QUANTILES[n - 2] * sigma / abs(alpha) if n >= quantity.min_bins and alpha else math.inf
         scale, angle, most = abs(alpha), math.atan2(alpha.imag, alpha.real), quantity.max_angle
-        is_equal = abs(angle) <= most and bound <= min(most, math.pi - most) and 1.0 <= _MAX_RATIO * scale <= _MAX_RATIO**2
+        is_equal = abs(angle) <= most and bound <= min(most, math.pi - most) and 1.0 <= MAX_RATIO * scale <= MAX_RATIO**2
         return Gain(scale, angle, bound, is_equal)
 
 
@@ -128,7 +128,7 @@ def _fit_turns(
     alpha, beta = (information * ab - au * ub) / determinant, (aa * ub - au * ab) / determinant
     square = bb - alpha * ab - beta * ub  # of residuals and prior
     variance = max(square / (n - 2), min_noise**2)
-    is_offset = abs(beta) > 2.0 * offset_sigma * max(abs(alpha) / _MAX_RATIO, 1.0)  # another unit is one of the bias as well
+    is_offset = abs(beta) > 2.0 * offset_sigma * max(abs(alpha) / MAX_RATIO, 1.0)  # another unit is one of the bias as well
     return 0 if is_offset else n, complex(alpha), math.sqrt(variance * information / determinant)
 
 
@@ -162,7 +162,7 @@ def _fit_ways(rows: FloatArray, offset_sigma: float, noise: float, min_noise: fl
     C = invert(N)
     x, y, slide_x, slide_y = (C * g).sum(axis=1)
     scale = math.hypot(x, y)
-    is_offset = math.hypot(slide_x, slide_y) > 2.0 * offset_sigma * max(scale / _MAX_RATIO, 1.0)
+    is_offset = math.hypot(slide_x, slide_y) > 2.0 * offset_sigma * max(scale / MAX_RATIO, 1.0)
     if is_offset or not 1.0 <= _MAX_WAY_RATIO * scale <= _MAX_WAY_RATIO**2:
         return 0, complex(x, y), 0.0
     variance = max((square - x * g[0] - y * g[1] - slide_x * g[2] - slide_y * g[3]) / max(equations - 4, 1), min_noise**2)

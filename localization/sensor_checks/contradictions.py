@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.sensor_checks.comparison import OPPOSITE_RAD, SLIDE_RAD, TURN, UNKNOWN, WAY, Comparison, Gain, Quantity, Sensor
+from localization.sensor_checks.comparison import MAX_RATIO, OPPOSITE_RAD, SLIDE_RAD, TURN, UNKNOWN, WAY, Comparison, Gain, Quantity, Sensor
 from localization.sensor_checks.faults import MEMORY_S, Evidence, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.window import WINDOW_BINS, Bins, Window
@@ -77,6 +77,9 @@ class Symptom(NamedTuple):
     comparison: Comparison
     beyond: float = OPPOSITE_RAD
     """Direction that shows it [rad]."""
+    least: float = 0.5 / MAX_RATIO
+    """Scale below which no direction shows it: a gyro that turns the other way by a tenth of the wheels is no reversed one. Half of the
+    window may be of before the fault."""
     ratios: tuple[float, float] | None = None
     """Scale that shows it, in place of the direction."""
     are_wheels_outvoted: bool | None = None
@@ -91,7 +94,7 @@ class Symptom(NamedTuple):
             return False
         if self.ratios is not None:
             return gain.bound <= math.pi - OPPOSITE_RAD and self.ratios[0] <= gain.scale <= self.ratios[1]
-        return abs(gain.angle) - gain.bound > self.beyond
+        return abs(gain.angle) - gain.bound > self.beyond and gain.scale > self.least
 
 
 SYMPTOMS = (

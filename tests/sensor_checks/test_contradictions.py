@@ -46,6 +46,11 @@ def test_gyro_that_contradicts_wheels_is_left_out(gyro, fault: SensorFault, has_
     assert "gyro" in warning
 
 
+def test_gyro_that_turns_a_tenth_the_other_way_is_no_reversed_one() -> None:
+    """It is wrong, as something else: reversed it would turn as much. Wheels whose turns jitter on a straight way look like that."""
+    assert GYRO_OPPOSITE not in CheckedDrive(gyro=lambda w: -0.1 * w).drive().found
+
+
 def test_gyro_below_wheels_and_lidar_has_another_unit() -> None:
     """Its driver converts to radians twice."""
     robot = CheckedDrive(gyro=lambda w: math.radians(w))
