@@ -57,7 +57,7 @@ def test_check_compares_gps_where_the_first_minute_is_too_even(tmp_path: Path) -
     found = check(tmp_path, DATA / "husky-outdoor-gps" / "test1.bag", "--robot", "husky_a200")
     (row,) = (row for row in found["rows"] if row["quantity"] == "reference")
     assert row["verdict"] == "ok"
-    assert 0.95 < float(row["second_source"].split("way ")[1].split()[0]) < 1.05
+    assert 0.95 < float(row["second_source"].split("distance ")[1].split()[0]) < 1.05
 
 
 def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
