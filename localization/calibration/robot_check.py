@@ -253,7 +253,7 @@ def _radius(robot: Robot, set_up: SetUp) -> tuple[CheckRow | None, Robot]:
         return CheckRow("wheel radius", f"{radius:.4g} m", "", "cannot be seen", advice), robot
     measured, sigma = radius * math.exp(-way[0]), radius * way[1]
     second = f"{measured:.4g} +- {sigma:.2g} m by the distances of the other sources"
-    if abs(way[0]) <= _SAME_SCALE + _SIGMAS * way[1] or set_up.sentences:
+    if abs(way[0]) <= math.hypot(_SAME_SCALE, _SIGMAS * way[1]) or set_up.sentences:  # independent: both add by squares
         return CheckRow("wheel radius", f"{radius:.4g} m", second, "ok"), robot
     advice = f"write {part}.wheel_radius_m = {measured:.4g}, or check units, gear and the LiDAR's ranges."
     changed = replace(getattr(robot, part), wheel_radius_m=float(f"{measured:.4g}"))
