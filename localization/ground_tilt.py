@@ -46,7 +46,7 @@ class GroundTilt:
     def __init__(self) -> None:
         self._means = np.zeros((len(_MOUNTS), 4))
         self._covs = np.array([np.diag([mount.sigma**2] * 2 + [_GROUND_SIGMA**2] * 2) for mount in _MOUNTS])
-        self._log_odds = np.log([mount.prior for mount in _MOUNTS])
+        self._log_weights = np.log([mount.prior for mount in _MOUNTS])
         self._mean, self._cov = np.zeros(4), np.zeros((4, 4))
         self._mix()
         self.is_certain = False
@@ -75,8 +75,8 @@ class GroundTilt:
     @property
     def probabilities(self) -> FloatArray:
         """(2,) of `_MOUNTS`."""
-        odds = np.exp(self._log_odds - self._log_odds.max())
-        return np.asarray(odds / odds.sum())
+        weights = np.exp(self._log_weights - self._log_weights.max())
+        return np.asarray(weights / weights.sum())
 
     def restart(self) -> None:
         """The ground is another one: nothing is known of its tilt."""
@@ -88,7 +88,7 @@ class GroundTilt:
         """Update by the measured ``downhill`` slope (2,) of mount and ground together and its ``cov`` (2, 2), after ``turn`` [rad] and
         ``way`` [m]."""
         for i in range(len(_MOUNTS)):
-            self._log_odds[i] += _separate(self._means[i], self._covs[i], downhill, cov, turn, way) / _LASTING
+            self._log_weights[i] += _separate(self._means[i], self._covs[i], downhill, cov, turn, way) / _LASTING
         self._mix()
         square = float(self.ground @ np.linalg.solve(self.ground_cov, self.ground))
         is_shown = bool(np.hypot(*self.ground) > _LEVEL and square > _CERTAIN**2)

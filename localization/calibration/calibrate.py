@@ -260,11 +260,8 @@ def calibrated(model: MotionModel, cuts: Sequence[Cut], robot: Robot, free: Sequ
     return Calibrated(model, found, before, inside, group, _position_known(maneuvers), heldout, systematic, noise, clock_offset_s)
 
 
-def heading_error(found: Calibrated, maneuvers: Sequence[Maneuver], model: MotionModel | None = None) -> float:
-    """Root mean square of the heading errors over ``maneuvers`` that the fit was not fitted to, or of another ``model`` as its robot file
-    has it, with the clock of the fit [rad]. NaN where none was held out."""
-    if model is None:
-        return math.nan if found.heldout is None else float(np.sqrt(found.heldout.squared_angle.mean()))
+def heading_error(found: Calibrated, maneuvers: Sequence[Maneuver], model: MotionModel) -> float:
+    """Root mean square heading error over ``maneuvers`` of a ``model`` as its robot file has it, by the clock of the fit [rad]."""
     return float(np.sqrt(np.mean(dataclasses.replace(found.fit, model=model, params=model.nominal).residuals(maneuvers)[:, 2] ** 2)))
 
 

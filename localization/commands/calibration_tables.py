@@ -54,10 +54,11 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
 def print_better_model(console: Console, found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> None:
     """That the model which describes ``robot`` best predicts these maneuvers better than the fit of another, where it does."""
     best = recommended_model(robot)
-    if best == found.model.name:
-        return
     maneuvers = [m for each in cuts for m in each.maneuvers]
-    fitted, other = heading_error(found, maneuvers), heading_error(found, maneuvers, make_model(best, robot))
+    if best == found.model.name or found.heldout is None or any(m.middle for m in maneuvers):  # chords of positions have no headings
+        return
+    fitted = math.sqrt(float(found.heldout.squared_angle.mean()))
+    other = heading_error(found, maneuvers, make_model(best, robot))
     if other < fitted:
         print_line(
             console,

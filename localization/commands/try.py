@@ -81,10 +81,9 @@ class Try:
             )
             found = self._parts(runner)
             write_try_page(folder / "index.html", found)
-            write_json(
-                folder / "summary.json", {"sentences": summarize(found), "parts": [part.name for part in found.parts if part.is_done]}
-            )
-        for sentence in summarize(found):
+            sentences = summarize(found)
+            write_json(folder / "summary.json", {"sentences": sentences, "parts": [part.name for part in found.parts if part.is_done]})
+        for sentence in sentences:
             print_line(console, sentence)
         print_line(console, f"page: {self.out / 'index.html'}")
 

@@ -314,7 +314,7 @@ class PublisherSeparator:
         """The publisher of a reading; the one before, where it is another, is the other one."""
         changes, other = _changes(values, current.values), self._other
         back = changes if other is None else _changes(values, other.values)
-        for found in (changes, back):
+        for found in (changes,) if other is None else (changes, back):
             self._steps = [min(step, change) if change > _RESOLUTION else step for step, change in zip(self._steps, found, strict=True)]
         cost, of_one = self._cost(changes), self._cost_of_one(values, changes)
         if other is not None:
