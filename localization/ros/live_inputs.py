@@ -78,17 +78,18 @@ class LiveInputs:
         urgent = [source.topic for source in (*sources.lidars, sources.wheels if is_predicting else None) if source is not None]
         self._transport.restrict([*others, *self.topics, *commands], [*urgent, *commands])
 
-    def without_overtaken(self, messages: Sequence[Received], now_ns: int) -> Sequence[Received]:
+    def without_overtaken(self, messages: Sequence[Received], now_ns: int, since_ns: int = 0) -> Sequence[Received]:
         """``messages`` without the scans that have waited for more than `_MAX_WAIT_S` while a newer one came.
 
-        Where the processor is too slow for all, the newest counts; messages of wheels and gyro are all integrated.
+        Where the processor is too slow for all, the newest counts; messages of wheels and gyro are all integrated. What came before
+        ``since_ns``, when the node itself was ready, has not waited for the processor until then.
         """
         if len(messages) < 2:
             return messages
         lidars = {source.topic for source in self.sources.lidars}
         newest, kept = {received.topic: received for received in messages if received.topic in lidars}, list[Received]()
         for received in messages:
-            has_waited_s = (now_ns - received.received_ns) * 1e-9
+            has_waited_s = (now_ns - max(received.received_ns, since_ns)) * 1e-9
             if received.topic in lidars and received is not newest[received.topic] and has_waited_s > _MAX_WAIT_S:
                 self.stream.topic_rates[received.topic].count(received.received_ns)
                 self.stats.count(received.topic, Oddity.OVERTAKEN)

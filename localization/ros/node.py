@@ -211,7 +211,7 @@ class Node:
             is_behind = self._waiting is not None and self._waiting.is_ready()
             messages: Sequence[Received] = self._transport.take(0.0 if is_behind else _POLL_S, self.batch_s())
             if self._waiting is None and not self._run.node.use_sim_time:  # by that clock nothing waits for the processor
-                messages = self.inputs.without_overtaken(messages, self._transport.now_ns())
+                messages = self.inputs.without_overtaken(messages, self._transport.now_ns(), self._times.caught_up_ns or 0)
             for received in messages:
                 has_estimate |= self._receive(received)
             has_estimate |= self._catch_up(time.monotonic() + _CATCH_UP_S)

