@@ -69,6 +69,8 @@ class Scan:
     """(N,) time of each point after `stamp_ns` [s], or (0,) where the log has none."""
     frame_id: str = ""
     is_planar: bool = True
+    beside: tuple[Scan, ...] = ()
+    """The last scan of each other planar LiDAR of the robot, in its own frame and with its own times."""
 
     @cached_property
     def middle_s(self) -> float:

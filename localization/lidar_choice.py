@@ -1,12 +1,11 @@
-"""Which of several LiDARs is used, as of a front and a rear scanner: one until it is silent, then one that sends; and the health of each.
-
-Scans of two scanners in one estimate take mounts that agree to a tenth of a degree. With one degree between them, on a simulated lap, one
-submap of both gave an ATE of .078 m (.008 m by the turned scanner alone), and a submap for each false verdicts on wheels and gyro.
+"""Which of several LiDARs gives the steps, as of a front and a rear scanner: one until it is silent, then one that sends; the scans of the
+others that belong to each of its scans; and the health of each.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field, replace
 
 from localization.events import Scan
 
@@ -18,6 +17,10 @@ _NEWEST = 0.1
 """Weight of the newest period in the mean."""
 _REPORTED_SHARE = 0.05
 """Share of the time without one of the LiDARs that is reported."""
+_MAX_AGE = 1.5
+"""Periods of a LiDAR, before which its last scan is too old for a sweep of several: one is lost."""
+_KEPT_SCANS = 8
+"""Last scans of a LiDAR that may belong to one of another that comes late."""
 
 
 @dataclass(eq=False)
@@ -31,9 +34,13 @@ class LidarHealth:
     scans: int = 1
     silent_s: float = 0.0
     """Time without its scans, so far [s]."""
+    newest: deque[Scan] = field(default_factory=lambda: deque(maxlen=_KEPT_SCANS))
+    """Its last scans, while another LiDAR gives the steps."""
 
-    def add(self, stamp_ns: int) -> None:
+    def add(self, scan: Scan) -> None:
         """Its next scan."""
+        self.newest.append(scan)
+        stamp_ns = scan.stamp_ns
         gap_s = (stamp_ns - self.last_ns) * 1e-9
         if self.scans > 1 and self.is_silent(stamp_ns):
             self.silent_s += gap_s
@@ -45,6 +52,15 @@ class LidarHealth:
     def is_silent(self, now_ns: int) -> bool:
         """Whether its next scan is overdue at ``now_ns``."""
         return (now_ns - self.last_ns) * 1e-9 > _SILENT * self.period_s
+
+    def before(self, end_ns: int) -> Scan | None:
+        """Its last scan that was complete by ``end_ns``; None where one is missing."""
+        scan = next((scan for scan in reversed(self.newest) if _end_ns(scan) <= end_ns), None)
+        return None if scan is None or (end_ns - _end_ns(scan)) * 1e-9 > _MAX_AGE * self.period_s else scan
+
+
+def _end_ns(scan: Scan) -> int:
+    return scan.stamp_ns + round(2e9 * scan.middle_s)
 
 
 class LidarChoice:
@@ -58,22 +74,26 @@ class LidarChoice:
         self._newest_ns = 0
         self._changes = 0
 
-    def admit(self, scan: Scan) -> bool:
-        """Whether ``scan`` is of the LiDAR in use."""
+    def admit(self, scan: Scan) -> Scan | None:
+        """``scan`` with those of the other LiDARs beside it; None where it is not of the LiDAR in use."""
         frame, stamp_ns = scan.frame_id, scan.stamp_ns
         self.used = self.used or frame
         if not self.lidars:
             if frame == self.used:
-                return True
+                return scan
             self.lidars[self.used] = LidarHealth(stamp_ns, stamp_ns)
         self._newest_ns = max(self._newest_ns, stamp_ns)
-        if frame in self.lidars:
-            self.lidars[frame].add(stamp_ns)
-        else:
+        if frame not in self.lidars:
             self.lidars[frame] = LidarHealth(stamp_ns, stamp_ns)
+        else:
+            self.lidars[frame].add(scan)
         if self.lidars[self.used].is_silent(stamp_ns):
             self.used, self._changes = frame, self._changes + 1
-        return frame == self.used
+        return self._with_others(scan) if frame == self.used else None
+
+    def _with_others(self, scan: Scan) -> Scan:
+        others = [lidar.before(_end_ns(scan)) for frame, lidar in self.lidars.items() if frame != scan.frame_id]
+        return replace(scan, beside=tuple(other for other in others if other is not None and other.is_planar)) if scan.is_planar else scan
 
     def silent(self) -> dict[str, float]:
         """LiDARs that send no scans while another does: for how long, by frame [s]."""

@@ -111,8 +111,10 @@ class ScanQueue:
         going back would count the motion since then twice."""
         if not self.frames.admit(scan):
             return
-        if (scan.frame_id != self.choice.used or self.choice.lidars) and self.frames.problem is None and not self.choice.admit(scan):
-            return
+        if (scan.frame_id != self.choice.used or self.choice.lidars) and self.frames.problem is None:
+            if (admitted := self.choice.admit(scan)) is None:
+                return
+            scan = admitted
         self.faulty.empty += not len(scan.points)
         middle_ns = scan.middle_ns
         if used_until_ns is not None and middle_ns < used_until_ns:

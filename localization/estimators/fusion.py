@@ -302,7 +302,8 @@ class EkfFusion(Estimator):
         if self._sensor is not None or self._has_gyro:
             names["wheel_clock_offset_s"] = "clock"
         found = {name: (self.state.number(key), math.sqrt(self.state.variance(key))) for name, key in names.items()}
-        return {**found, **{learned.name: (learned.value, learned.sigma) for learned in self.learned_parameters()}}
+        of_mounts = {} if self._sensor is None else self._sensor.merged.parameters()
+        return {**found, **{learned.name: (learned.value, learned.sigma) for learned in self.learned_parameters()}, **of_mounts}
 
     def counts(self) -> Mapping[str, int]:
         """Number of occurrences by name: scans, matched, searched, and those of lost scans by cause."""

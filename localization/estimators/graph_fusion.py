@@ -245,8 +245,7 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
     @property
     def enu_T_map(self) -> Pose2 | None:
         """(3,) pose of the map in the plane of the positions; None before these have given it."""
-        alignment = self.graph.alignment()
-        return None if alignment is None else alignment[0]
+        return self.graph.enu_T_map
 
     def finish(self, filtered: Trajectory | None = None) -> Trajectory | None:
         """The smoothed trajectory at the stamps of ``filtered``; None unless smoothing, or with fewer than two keyframes."""

@@ -98,6 +98,7 @@ class PoseGraph:
         params.setRelinearizeThreshold(_RELINEARIZE)
         params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
         self._isam, self.count, self._epochs = gtsam.ISAM2(params), 0, 0
+        self._values = gtsam.Values()
         updates, self.updates = self.updates, []
         for update in updates:
             self.apply(update)
@@ -143,11 +144,15 @@ class PoseGraph:
             return self.lever, LEVER_SIGMA_M**2 * np.eye(2)
         return np.asarray(self._values.atPoint2(_LEVER)), np.asarray(self._isam.marginalCovariance(_LEVER))
 
+    @property
+    def enu_T_map(self) -> Pose2 | None:
+        """(3,) of the map in the plane of the positions; None without positions."""
+        return _array(self._values.atPose2(_ALIGNMENT)) if self._values.exists(_ALIGNMENT) else None
+
     def alignment(self) -> tuple[Pose2, Cov3] | None:
         """``enu_T_map`` (3,) and the covariance (3, 3) of its right perturbation; None without positions."""
-        if not self._values.exists(_ALIGNMENT):
-            return None
-        return _array(self._values.atPose2(_ALIGNMENT)), np.asarray(self._isam.marginalCovariance(_ALIGNMENT))
+        pose = self.enu_T_map
+        return None if pose is None else (pose, np.asarray(self._isam.marginalCovariance(_ALIGNMENT)))
 
     def position_errors(self) -> FloatArray:
         """(n,) normalised errors [sigma] of the positions by the present estimates."""

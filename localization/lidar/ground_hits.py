@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 from localization.events import Scan
 from motion_models.robot import Mount
@@ -30,8 +31,8 @@ class GroundHits:
         self._nearest_m, self._frame = math.inf, ""
 
     def leave_out(self, scan: Scan, curvature: float) -> Scan:
-        """``scan`` without the points that ground of this root mean square ``curvature`` [1/m] may reach. Clouds stay as they are: of them
-        walls are matched."""
+        """``scan``, and those beside it, without the points that ground of this root mean square ``curvature`` [1/m] may reach. Clouds stay
+        as they are: of them walls are matched."""
         if not scan.is_planar:
             return scan
         self._points += len(scan.points)
@@ -39,7 +40,7 @@ class GroundHits:
             return scan
         mount, rise = self._mounts.get(scan.frame_id, Mount()), 0.5 * _SIGMAS * curvature
         x, y, z = (scan.points @ mount.rotation.T + (mount.x, mount.y, mount.z)).T
-        above = scan.select(z > rise * (x * x + y * y))
+        above = replace(scan.select(z > rise * (x * x + y * y)), beside=tuple(self.leave_out(other, curvature) for other in scan.beside))
         self._left_out += len(scan.points) - len(above.points)
         self._nearest_m, self._frame = min(self._nearest_m, math.sqrt(max(mount.z, 0.0) / rise)), scan.frame_id
         return above

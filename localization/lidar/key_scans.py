@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from localization.lidar.correlative_search import LikelihoodImage, draw_image
 from localization.lidar.submap import VoxelGrid, make_grid, measure_shares
@@ -14,6 +16,8 @@ from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _MAX_OLD_SUBMAPS = 3
 """Key scans older than the last ones, at most, in units of their number."""
+_SEEN_POINTS = 60
+"""Points of a scan, by which the key scans that have drawn its surroundings are found."""
 _MAPPED_INFORMATION = 1e2
 """Information of a key scan along a direction, from which on its noise moves its surfaces along it [1/m^2, 1/rad^2]."""
 
@@ -46,10 +50,14 @@ class KeyScan:
     map_cov: Cov3
     """(3, 3) covariance of the submap's error around it, before it was drawn; a right perturbation."""
 
+    def drift_cov(self, pose: Pose2, map_cov: Cov3) -> Cov3:
+        """(3, 3) of the drift from this scan to the submap around ``pose`` (3,), whose error has covariance ``map_cov`` (3, 3)."""
+        A = se2.adjoint(se2.inverse(se2.between(self.pose, pose)))
+        return np.asarray(map_cov - A @ self.map_cov @ A.T)
+
     def drift_variance(self, pose: Pose2, map_cov: Cov3, range_m: float) -> float:
         """Variance [m^2] by which points at ``range_m`` have drifted from this scan to the submap around ``pose`` (3,)."""
-        A = se2.adjoint(se2.inverse(se2.between(self.pose, pose)))
-        grown = map_cov - A @ self.map_cov @ A.T
+        grown = self.drift_cov(pose, map_cov)
         return float(grown[0, 0] + grown[1, 1] + range_m**2 * grown[2, 2])
 
 
@@ -75,6 +83,18 @@ class KeyScans:
     def points(self) -> FloatArray:
         """(M, 2) in the odometry frame [m]."""
         return np.vstack([key.points for key in self.keys]) if self.keys else np.empty((0, 2))
+
+    def drift_cov(self, points: Points2, pose: Pose2, map_cov: Cov3) -> tuple[Cov3, float]:
+        """(3, 3) mean drift up to ``pose`` (3,) of the key scans that have drawn the surfaces nearest to ``points`` (N, 2) of the body, and
+        how far these were drawn from there, in the mean [m]."""
+        seen = np.asarray(se2.transform(pose, points[:: max(len(points) // _SEEN_POINTS, 1)]))
+        of_key = np.repeat(np.arange(len(self.keys)), [len(key.points) for key in self.keys])
+        _, nearest = cKDTree(self.points()).query(seen)
+        counts = np.bincount(of_key[nearest], minlength=len(self.keys))
+        grown = sum(n * key.drift_cov(pose, map_cov) for n, key in zip(counts, self.keys, strict=True) if n)
+        values, vectors = np.linalg.eigh(grown / counts.sum())
+        far_m = sum(n * math.dist(key.pose[:2], pose[:2]) for n, key in zip(counts, self.keys, strict=True)) / counts.sum()
+        return np.asarray(vectors * np.maximum(values, 0.0) @ vectors.T), float(far_m)
 
     def insert(self, pose: Pose2, points: Points2, map_cov: Cov3 | None) -> tuple[float, float]:
         """Draw the scan ``points`` (N, 2) of the body frame from ``pose`` (3,); returns its shares, as `measure_shares` does.

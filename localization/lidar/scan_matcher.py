@@ -126,6 +126,15 @@ class ScanMatcher:
         fit = align_points(self.submap.grid, points, prior, cov + match.outlier_cov, match.pose, 0.0)
         return None if fit.overlap < self._config.lost_below else self._result(fit, match.outlier_cov)
 
+    def locate(self, points: Points2, prior: Pose2, cov: Cov3) -> tuple[Pose2, Cov3] | None:
+        """The pose that ``points`` alone give near ``prior`` (3,) of covariance ``cov`` (3, 3), and its covariance with errors that
+        neighbouring beams share; None where too few fit. What `match` has learned of residuals stays as it is."""
+        fit = align_points(self.submap.grid, points, prior, cov, prior)
+        if fit.overlap < self._config.search_below:
+            return None
+        R = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION), dtype=float)
+        return se2.retract(fit.pose, -R @ fit.gradient), R * self._block_variance
+
     def intra_scan_slip_cov(self, points: Points2, times: FloatArray, pose: Pose2, slip_rate: Cov3) -> Cov3:
         """(3, 3) covariance of the match of a scan that is bent: it was deskewed with one twist, while the body's motion is a random walk w
         about it, of covariance ``slip_rate`` (3, 3) a second. ``times`` (N,) of the ``points`` are from the middle of the sweep, where w is

@@ -13,6 +13,7 @@ from localization.lidar.deskew import Sweep
 from localization.lidar.key_scans import KeyScanError
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
+from localization.lidar.merged_sweep import MergedSweeps
 from localization.lidar.registration import prior_error_at_points
 from localization.lidar.scan_matcher import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.lidar.scan_policies import MovedRobot, StaleScans
@@ -52,8 +53,11 @@ class ScanMatchingSensor:
         self._matcher: ScanMatcher | None = None
         self._kiss: KissIcp | None = None
         self._scan: _Scan | None = None
+        self._match_cov: Cov3 | None = None  # of the last scan; None where it was not matched
         self._frame = ""  # of the last scan
         self._stale, self.moved, self.lost = StaleScans(), MovedRobot(config), LostScans()
+        self.merged = MergedSweeps(mounts, config)
+        """Scans of several LiDARs."""
 
     def measure(self, step: Step, prior: Pose2, cov: Cov3, offset: Tangent2) -> ScanMatch | None:
         """Match the scan of ``step`` near ``prior`` (3,) with its covariance (3, 3) against the submap; None where it is lost.
@@ -62,6 +66,7 @@ class ScanMatchingSensor:
         """
         self._scan = None
         found, cause = self._measure(step, prior, cov, offset)
+        self._match_cov = None if found is None else found.cov
         self.lost.add(step.end_ns, cause)
         return found
 
@@ -69,12 +74,14 @@ class ScanMatchingSensor:
         """The match, and why the scan is lost; "" where it is not, also of the first scan."""
         scan = step.scan
         assert scan is not None
-        if scan.frame_id != self._frame:  # another LiDAR: its mount may be off against the one that drew the submap
+        if scan.frame_id != self._frame and not self.merged.is_aligned(scan.frame_id):  # its mount may be off against the submap
             self.begin_submap()
+            self.merged.begin()
         self._frame = scan.frame_id
         if self._stale.is_stale(scan, step.is_standing):
             return None, "stale"
-        sweep = Sweep.from_scan(scan, self._mount(scan.frame_id), self._config.min_range_m, self._config.max_range_m)
+        self._require_mount(scan.frame_id)
+        sweep = self.merged.sweep(scan)
         deskewed = self._deskew(sweep, step.twist, prior, cov)
         if len(deskewed.planar) < MIN_POINTS:
             return None, "sparse"
@@ -128,6 +135,8 @@ class ScanMatchingSensor:
         """Draw the scan at hand from ``pose`` (3,), where the submap's error has covariance ``map_cov`` (3, 3)."""
         assert self._scan is not None
         assert self._matcher is not None
+        if self._match_cov is not None:
+            self.merged.measure(self._matcher, pose, (self._match_cov, map_cov), self._scan.twist)
         if self._kiss is not None:
             self._kiss.insert(self._scan.points, pose)
         return self._matcher.insert_key_scan(pose, self._scan.planar, map_cov)
@@ -170,10 +179,9 @@ class ScanMatchingSensor:
         if c.matcher == "kiss" or not scan.sweep.is_planar:
             self._kiss = KissIcp(c.voxel_size_m or choose_voxel_size(scan.points), c.max_range_m)
 
-    def _mount(self, frame: str) -> Mount:
-        """Where ``frame`` is mounted. A submap that was drawn before its mount was given is dropped."""
-        mount = self._mounts.get(frame)
-        if mount is not None and not self._is_placed:
+    def _require_mount(self, frame: str) -> None:
+        """Drop a submap that was drawn before the mount of ``frame`` was given."""
+        is_known = frame in self._mounts
+        if is_known and not self._is_placed:
             self.begin_submap()
-        self._is_placed = mount is not None
-        return mount or Mount()
+        self._is_placed = is_known

@@ -214,16 +214,21 @@ class Health:
         return Status("wheels", values=values)
 
 
+_BESIDE = "ready: its points are used as well once its mount is known"
+
+
 def _of_lidars(pipeline: Pipeline) -> list[Status]:
     """A status for each of several LiDARs."""
     choice, found = pipeline.synchronizer.scans.choice, list[Status]()
-    silent = choice.silent()
+    silent, offsets = choice.silent(), pipeline.estimator.parameters()
     for frame, lidar in choice.lidars.items():
         values = {"rate_hz": f"{1.0 / lidar.period_s:.1f}", "scans": str(lidar.scans)}
         if frame in silent:
             found.append(Status(f"lidar {frame}", ERROR, f"no scans for {silent[frame]:.1f} s: check its driver.", values))
         else:
-            found.append(Status(f"lidar {frame}", OK, "in use" if frame == choice.used else "ready, not in use", values))
+            if (yaw := offsets.get(f"{frame}_offset_yaw_rad")) is not None:
+                values["turned_against_its_mount_deg"] = f"{math.degrees(yaw[0]):.2f} +- {math.degrees(yaw[1]):.2f}"
+            found.append(Status(f"lidar {frame}", OK, "in use" if frame == choice.used else _BESIDE, values))
     return found
 
 

@@ -1,21 +1,27 @@
-"""GNSS while the robot drives: sensor_msgs/NavSatFix in, positions in a plane out, and where that plane is in UTM."""
+"""GNSS while the robot drives: sensor_msgs/NavSatFix in, positions in a plane out; where that plane is in UTM, and what the latitude and
+longitude of places in the map are.
+"""
 
 from __future__ import annotations
 
 import importlib
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from localization.errors import SettingError
 from localization.events import PositionSample
 from localization.logs.decode import MessageStats, UnusableError, stamp_ns
-from localization.logs.reference_topics import position_sample, reference_decoder
+from localization.logs.reference_topics import east_north, geodetic_to_ecef, position_sample, reference_decoder
 from localization.logs.serialization import decoder
 from localization.ros.transports.transport import Received
-from motion_models.se2 import FloatArray, Pose2
+from motion_models import se2
+from motion_models.se2 import Cov3, FloatArray, Pose2
 
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+_STEPS = 4
+"""Steps with the slopes of a sphere, from a plane to latitude and longitude: each leaves a hundredth, 6 um of 22 km after four."""
 
 
 class GnssReceiver:
@@ -68,3 +74,42 @@ def utm_pose(datum: FloatArray) -> Pose2:
     project = pyproj.Proj(proj="utm", zone=zone, ellps="WGS84", south=latitude < 0.0)
     easting, northing = project(longitude, latitude)
     return np.array([easting, northing, math.radians(project.get_factors(longitude, latitude).meridian_convergence)])
+
+
+@dataclass(frozen=True)
+class GeodeticMap:
+    """A map whose place on the earth is known, on the WGS84 ellipsoid."""
+
+    datum: FloatArray
+    """(2,) latitude and longitude of the plane's origin [deg]."""
+    enu_T_map: Pose2
+    """(3,) of the map in the plane east and north of it."""
+
+    def from_geodetic(self, degrees: FloatArray) -> FloatArray:
+        """(2,) in the map [m], of latitude and longitude (2,) [deg]."""
+        return np.asarray(se2.transform(se2.inverse(self.enu_T_map), self._east_north(degrees)[None])[0])
+
+    def to_geodetic(self, point: FloatArray) -> FloatArray:
+        """(2,) latitude and longitude [deg] of ``point`` (2,) in the map [m]."""
+        wanted, degrees = se2.transform(self.enu_T_map, point[None])[0], self.datum
+        per_m = math.degrees(1.0 / float(np.linalg.norm(_earth_centred(self.datum))))
+        for _ in range(_STEPS):
+            east, north = wanted - self._east_north(degrees)
+            degrees = degrees + per_m * np.array([north, east / math.cos(math.radians(float(degrees[0])))])
+        return degrees
+
+    def _east_north(self, degrees: FloatArray) -> FloatArray:
+        latitude, longitude = np.radians(self.datum).tolist()
+        return np.asarray(east_north(latitude, longitude) @ (_earth_centred(degrees) - _earth_centred(self.datum)))
+
+    def covariance(self, cov: Cov3, yaw: float) -> FloatArray:
+        """(2, 2) east and north [m^2], of a pose with ``yaw`` in the map whose right perturbation has covariance ``cov`` (3, 3)."""
+        c, s = math.cos(yaw + self.enu_T_map[2]), math.sin(yaw + self.enu_T_map[2])
+        R = np.array([[c, -s], [s, c]])
+        return np.asarray(R @ cov[:2, :2] @ R.T)
+
+
+def _earth_centred(degrees: FloatArray) -> FloatArray:
+    """(3,) earth-centred position [m] of latitude and longitude (2,) [deg] on the ellipsoid."""
+    latitude, longitude = np.radians(degrees).tolist()
+    return geodetic_to_ecef(latitude, longitude, 0.0)

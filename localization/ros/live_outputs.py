@@ -9,7 +9,7 @@ from localization.estimators import Estimate, GraphFusion
 from localization.events import Event, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
 from localization.ros.continuous_odometry import ContinuousOdometry
-from localization.ros.gnss import utm_pose
+from localization.ros.gnss import GeodeticMap, utm_pose
 from localization.ros.interim_odometry import InterimOdometry
 from localization.ros.live_inputs import LiveInputs
 from localization.ros.live_stream import LiveStream
@@ -48,6 +48,7 @@ class LiveOutputs:
             has_map_frame=has_map_frame,
             has_path=bool(config.path_period_s),
             has_map=bool(config.map_period_s) and self._inputs.has_lidar,
+            has_fix=self._inputs.gnss is not None,
         )
 
     def begin_interim(self, wheels: WheelBuffer, start: Estimate | None = None) -> None:
@@ -101,12 +102,13 @@ class LiveOutputs:
             return False
         return self.publisher.are_predictions_read and self._predictor.is_due(event.stamp_ns)
 
-    def publish_estimate(self, event: Event, estimate: Estimate, pipeline: Pipeline, *, is_current: bool) -> None:
+    def publish_estimate(self, event: Event, estimate: Estimate, session: Session, *, is_current: bool) -> None:
         """Publish ``estimate``, which ``event`` has completed; predictions go on from it, if it ``is_current``: no messages wait."""
         by_lidar = estimate.nis is not None or isinstance(event, Scan)
         stamp_ns = self._inputs.stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=by_lidar)
         self.publisher.publish_estimate(estimate, stamp_ns)
-        self.go_on_from(estimate, pipeline, is_current=is_current)
+        self.publish_fix(estimate, session, stamp_ns)
+        self.go_on_from(estimate, session.pipeline, is_current=is_current)
         if self._interim is None:
             self._publish_in_order(estimate, stamp_ns)
 
@@ -149,11 +151,20 @@ class LiveOutputs:
             else:
                 self.publisher.publish_grid(grid, stamp_ns, session.state.start.map_T_start)
 
+    def geodetic_map(self, session: Session) -> GeodeticMap | None:
+        """Where the map is on the earth; None until positions have shown it."""
+        estimator, gnss = session.pipeline.estimator, self._inputs.gnss
+        if gnss is None or gnss.datum is None or not isinstance(estimator, GraphFusion) or (enu_T_map := estimator.enu_T_map) is None:
+            return None
+        return GeodeticMap(gnss.datum, np.asarray(se2.compose(enu_T_map, se2.inverse(session.state.start.map_T_start))))
+
+    def publish_fix(self, estimate: Estimate, session: Session, stamp_ns: int) -> None:
+        """The pose of ``estimate`` as a fix, once positions have shown where the map is."""
+        if estimate.covariance is not None and (found := self.geodetic_map(session)) is not None:
+            cov = found.covariance(estimate.covariance, float(estimate.pose[2]))
+            self.publisher.publish_fix(found.to_geodetic(estimate.pose[:2]), cov, stamp_ns)
+
     def publish_utm(self, session: Session, stamp_ns: int) -> None:
         """Where the map is in UTM, once positions have given that."""
-        estimator, frame, gnss = session.pipeline.estimator, self._run.node.utm_frame, self._inputs.gnss
-        if gnss is None or gnss.datum is None or not frame or not isinstance(estimator, GraphFusion):
-            return
-        if (enu_T_map := estimator.enu_T_map) is not None:
-            enu_T_published = se2.compose(enu_T_map, se2.inverse(session.state.start.map_T_start))
-            self.publisher.publish_map_frame(frame, np.asarray(se2.compose(utm_pose(gnss.datum), enu_T_published)), stamp_ns)
+        if (frame := self._run.node.utm_frame) and (found := self.geodetic_map(session)) is not None:
+            self.publisher.publish_map_frame(frame, np.asarray(se2.compose(utm_pose(found.datum), found.enu_T_map)), stamp_ns)

@@ -378,7 +378,7 @@ class Node:
         is_predictable = self.outputs.is_prediction_due(event)
 
         def publish(estimate: Estimate) -> None:
-            self.outputs.publish_estimate(event, estimate, self.session.pipeline, is_current=self._waiting is None)
+            self.outputs.publish_estimate(event, estimate, self.session, is_current=self._waiting is None)
             if isinstance(event, Scan) and not self._times.is_backlog(received):
                 self.session.health.add_latency((self._transport.now_ns() - received.received_ns) * 1e-9)
 

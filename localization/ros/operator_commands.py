@@ -39,6 +39,9 @@ RESET, PAUSE, TARE_PAYLOAD, PAYLOAD = "~/reset", "~/pause", "~/tare_payload", "~
 RELOCALIZE, SAVE_MAP, LOAD_MAP = "~/relocalize", "~/save_map", "~/load_map"
 _GLOBAL_LOCALIZATION, _SERIALIZE_MAP, _DESERIALIZE_MAP = "reinitialize_global_localization", "~/serialize_map", "~/deserialize_map"
 """Services by the names of AMCL and slam_toolbox."""
+_FROM_LL, _TO_LL = "fromLL", "toLL"
+"""Services by the names of robot_localization."""
+_NOT_ON_EARTH = "where the map is on the earth is not known: it takes --node.positions, and a drive that gives the map its heading"
 _TOPIC_TYPES = {
     SET_POSE: POSE_TYPE,
     INITIAL_POSE: POSE_TYPE,
@@ -109,6 +112,8 @@ class OperatorCommands:
         transport.offer_service(names.resolve(_SERIALIZE_MAP), "slam_toolbox/srv/SerializePoseGraph", self.save_map)
         transport.offer_service(names.resolve(LOAD_MAP), "nav2_msgs/srv/LoadMap", self.load_map)
         transport.offer_service(names.resolve(_DESERIALIZE_MAP), "slam_toolbox/srv/DeserializePoseGraph", self.load_map)
+        transport.offer_service(names.resolve(_FROM_LL), "robot_localization/srv/FromLL", self.from_ll)
+        transport.offer_service(names.resolve(_TO_LL), "robot_localization/srv/ToLL", self.to_ll)
 
     def execute(self, received: Received) -> bool:
         """Execute the command that ``received`` holds; False where it is of another topic."""
@@ -251,6 +256,24 @@ class OperatorCommands:
                 self._report(f"load_map: '{path}': {error} The present map stays.")
             else:
                 self._report(f"load_map: the whole map of '{path}' is searched.")
+
+    def from_ll(self, place: Any) -> ServiceReply:
+        """Where in the map latitude and longitude of ``place`` (geographic_msgs/GeoPoint) are; not a number where that is not known."""
+        found = self._node.outputs.geodetic_map(self._node.session)
+        if found is None:
+            self._report(f"{_FROM_LL}: {_NOT_ON_EARTH}.")
+            return ServiceReply(False, _NOT_ON_EARTH, point=dict.fromkeys(("x", "y", "z"), math.nan))
+        x, y = found.from_geodetic(np.array([place.latitude, place.longitude])).tolist()
+        return ServiceReply(True, "", point={"x": x, "y": y, "z": 0.0})
+
+    def to_ll(self, point: Any) -> ServiceReply:
+        """Latitude and longitude of ``point`` (geometry_msgs/Point) in the map; not a number where that is not known."""
+        found = self._node.outputs.geodetic_map(self._node.session)
+        if found is None:
+            self._report(f"{_TO_LL}: {_NOT_ON_EARTH}.")
+            return ServiceReply(False, _NOT_ON_EARTH, point=dict.fromkeys(("latitude", "longitude", "altitude"), math.nan))
+        latitude, longitude = found.to_geodetic(np.array([point.x, point.y])).tolist()
+        return ServiceReply(True, "", point={"latitude": latitude, "longitude": longitude, "altitude": math.nan})
 
     def pause(self, is_paused: bool) -> ServiceReply:
         """Use no messages and publish no estimates, or continue. Motion meanwhile is a gap in the wheels' data."""

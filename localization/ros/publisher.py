@@ -23,7 +23,7 @@ from motion_models.se2 import FloatArray
 
 ODOMETRY, PREDICTED_ODOMETRY, POSE = "~/odometry", "~/odometry_predicted", "~/pose"
 CORRECTIONS, DIAGNOSTICS, PATH, MAP = "~/corrections", "/diagnostics", "~/path", "~/map"
-LOCALIZATION = "~/localization_state"
+LOCALIZATION, FIX = "~/localization_state", "~/fix"
 
 _NEW_KEYFRAMES = 500  # 10 s at 50 Hz: those of a start's backlog come back only after all of them
 _TYPES = {
@@ -36,10 +36,15 @@ _TYPES = {
     PATH: "nav_msgs/msg/Path",
     MAP: "nav_msgs/msg/OccupancyGrid",
     LOCALIZATION: "std_msgs/msg/String",
+    FIX: "sensor_msgs/msg/NavSatFix",
 }
 _LATCHED = (POSE, PATH, MAP, LOCALIZATION)
 _MAX_PATH_POSES, _PATH_SPACING_M = 500, 0.05
 """A path is thinned to so many poses: rosbags takes 15 us for each, and no scan shall wait for it for more than 10 ms."""
+_STATUS_FIX, _SERVICE_GPS, _COVARIANCE_KNOWN = 0, 1, 3
+"""Constants of NavSatStatus and NavSatFix: a fix, of GPS, with a covariance of all axes."""
+_UNKNOWN_HEIGHT_VARIANCE = 1e6
+"""[m^2]"""
 _CELL_M, _MAX_CELLS = 0.1, 4_000_000
 """Edge of the map's cells [m]; it doubles until the map has at most so many."""
 
@@ -72,10 +77,11 @@ class EstimatePublisher:
         for topic in (ODOMETRY, CORRECTIONS, DIAGNOSTICS, *((TF,) if with_tf else ())):
             self._advertise(topic)
 
-    def advertise_optional(self, *, has_predictions: bool, has_map_frame: bool, has_path: bool, has_map: bool) -> None:
+    def advertise_optional(self, *, has_predictions: bool, has_map_frame: bool, has_path: bool, has_map: bool, has_fix: bool) -> None:
         """Open the topics that not every node fills."""
         self._has_predictions = has_predictions
-        for topic, is_used in ((PREDICTED_ODOMETRY, has_predictions), (POSE, has_map_frame), (PATH, has_path), (MAP, has_map)):
+        optional = {PREDICTED_ODOMETRY: has_predictions, POSE: has_map_frame, PATH: has_path, MAP: has_map, FIX: has_fix}
+        for topic, is_used in optional.items():
             if is_used:
                 self._advertise(topic)
 
@@ -132,6 +138,23 @@ class EstimatePublisher:
         fused = FusedEstimate(stamp_ns, estimate.pose, np.zeros(3), estimate.covariance, in_space=estimate.in_map)
         pose = make("geometry_msgs/msg/PoseWithCovariance", pose=_placed(*fused.place()), covariance=fused.pose_covariance())
         self._publish(POSE, make(_TYPES[POSE], header=self._header(stamp_ns, self._frames.map_frame), pose=pose))
+
+    def publish_fix(self, degrees: FloatArray, cov: FloatArray, stamp_ns: int) -> None:
+        """sensor_msgs/NavSatFix of the body: latitude and longitude (2,) [deg], covariance (2, 2) east and north [m^2]; the height is not
+        known."""
+        covariance = np.zeros((3, 3))
+        covariance[:2, :2], covariance[2, 2] = cov, _UNKNOWN_HEIGHT_VARIANCE
+        fix = make(
+            _TYPES[FIX],
+            header=self._header(stamp_ns, self._frames.base_link_frame),
+            status=make("sensor_msgs/msg/NavSatStatus", status=_STATUS_FIX, service=_SERVICE_GPS),
+            latitude=float(degrees[0]),
+            longitude=float(degrees[1]),
+            altitude=math.nan,
+            position_covariance=covariance.ravel(),
+            position_covariance_type=_COVARIANCE_KNOWN,
+        )
+        self._publish(FIX, fix)
 
     def publish_localization(self, state: str) -> None:
         """std_msgs/String, where ``state`` of the localization in a saved map is another than before."""

@@ -9,7 +9,8 @@ differ without a fault, 0 +- `Quantity.offset_sigma` a priori: the gyro's bias i
 3.4).
 
 Along the walls of a corridor no scan measures a way: there the equation counts across them alone. That shows the direction of a robot that
-drives along them, and no scale, for which there is a prior of 1.
+drives along them, but not whether it goes on or back, and no scale, for which there is a prior of 1. That a robot goes back is shown by the
+bins that measure a way ahead alone: one scan at a wrong place is one of these, however many show that nothing moves across the walls.
 """
 
 from __future__ import annotations
@@ -136,8 +137,8 @@ def _fit_turns(
 def _fit_ways(rows: FloatArray, offset_sigma: float, noise: float, min_noise: float) -> tuple[int, complex, float]:
     """Number of bins that count, alpha of the ways by wheels and LiDAR in ``rows`` (n, 12) of `Bins`, and its standard error across its own
     direction. 0 bins where beta is farther from 0 than two of its sigmas, or alpha beyond `_MAX_WAY_RATIO`: what differs then is no
-    direction."""
-    N, g, square, n, equations = np.zeros((4, 4)), np.zeros(4), 0.0, 0, 0
+    direction. Where alpha is one of a robot that goes back, bins without a way ahead do not count."""
+    N, g, square, n, ahead, equations = np.zeros((4, 4)), np.zeros(4), 0.0, 0, 0, 0
     for k in range(rows.shape[0]):
         ax, ay, turn, across, nx, ny = rows[k, 1], rows[k, 2], rows[k, 3], rows[k, 9], rows[k, 10], rows[k, 11]
         size, way = math.hypot(ax, ay), math.hypot(rows[k, 5], rows[k, 6])
@@ -146,6 +147,7 @@ def _fit_ways(rows: FloatArray, offset_sigma: float, noise: float, min_noise: fl
         if math.isnan(size + across) or shorter < _MIN_WAY_M or longer > _MAX_WAY_RATIO * shorter:
             continue
         n, equations = n + 1, equations + 1 + has_both
+        ahead += has_both or abs(nx * ax + ny * ay) >= _MIN_WAY_M
         square += across**2
         _add_equation(N, g, (nx * ax + ny * ay, ny * ax - nx * ay, nx * turn, ny * turn), across)
         if has_both:
@@ -167,7 +169,7 @@ def _fit_ways(rows: FloatArray, offset_sigma: float, noise: float, min_noise: fl
         return 0, complex(x, y), 0.0
     variance = max((square - x * g[0] - y * g[1] - slide_x * g[2] - slide_y * g[3]) / max(equations - 4, 1), min_noise**2)
     u, v = -y / scale, x / scale
-    return n, complex(x, y), math.sqrt(variance * (u * u * C[0, 0] + 2.0 * u * v * C[0, 1] + v * v * C[1, 1]))
+    return n if x > 0.0 else ahead, complex(x, y), math.sqrt(variance * (u * u * C[0, 0] + 2.0 * u * v * C[0, 1] + v * v * C[1, 1]))
 
 
 @subroutine

@@ -231,8 +231,8 @@ class MovingObjects:
 
 
 def _with_still(step: Step, is_still: BoolArray) -> Step:
-    """``step`` whose scan has the points ``is_still`` (N,) alone; without it where these are too few."""
+    """``step`` whose scan has the points ``is_still`` (N,) alone, without those of other LiDARs; without it where these are too few."""
     scan = step.scan
     if scan is None or is_still.sum() < _MIN_POINTS:
         return step.without_scan()
-    return replace(step, scan=scan.select(is_still), is_scan_partial=True)
+    return replace(step, scan=replace(scan.select(is_still), beside=()), is_scan_partial=True)

@@ -110,8 +110,17 @@ class OwnBody:
         c, s = math.cos(yaw), math.sin(yaw)
         self._way_m, self._pose = self._way_m + math.hypot(x, y), (px + c * x - s * y, py + s * x + c * y, yaw + turn)
         scan = step.scan
-        if scan is None or not scan.is_planar or not len(scan.points):
+        if scan is None:
             return step
+        kept, beside = self._without_own(scan), tuple(self._without_own(other) for other in scan.beside)
+        if kept is scan and all(a is b for a, b in zip(beside, scan.beside, strict=True)):
+            return step
+        return replace(step, scan=replace(kept, beside=beside))
+
+    def _without_own(self, scan: Scan) -> Scan:
+        """``scan``, at the pose at hand, without these points."""
+        if not scan.is_planar or not len(scan.points):
+            return scan
         if (lidar := self._lidars.get(scan.frame_id)) is None:
             lidar = self._lidars[scan.frame_id] = _Lidar(self._way_m)
         is_own = np.zeros(len(scan.points), dtype=bool)
@@ -125,12 +134,12 @@ class OwnBody:
             lidar.views.append(_View(self._pose, self._pose_by_gyro, scan))
         share = own / len(scan.points)
         if share < _MIN_BODY_SHARE:
-            return step
+            return scan
         if share > self._share:
             ranges = np.where(lidar.bearings[:, 4] == 1.0, lidar.bearings[:, 0], np.nan)
             self._share, self._seen = share, (scan.frame_id, ranges)
         self.is_found = True
-        return replace(step, scan=scan.select(~is_own))
+        return scan.select(~is_own)
 
     def _compare_views(self, lidar: _Lidar, scan: Scan) -> None:
         """Find ranges that stay the same, and through whose place in the world other beams go."""

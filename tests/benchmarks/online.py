@@ -1,8 +1,9 @@
 """The estimator live: how long after a scan its estimate is out, what part of a core it takes, and whether its memory stays flat.
 
-python -m tests.benchmarks.online [steps | latency | parts | start | quarter | dashboard | soak [HOURS [BEAMS]]]
+python -m tests.benchmarks.online [steps | latency | parts | start | quarter | starved [COMMIT] | dashboard | soak [HOURS [BEAMS]]]
 
-`quarter` confines the node to a quarter of a core by a cgroup (as root), as a computer of the Raspberry Pi's class would.
+`quarter` confines the node to a quarter of a core by a cgroup (as root), as a computer of the Raspberry Pi's class would; `starved` gives
+it 25, 15 and 10 % of a core while all cores are busy, this tree beside that of a COMMIT.
 """
 
 from __future__ import annotations
@@ -42,6 +43,8 @@ from tests.benchmarks.online_soak import soak
 from tests.studies.buildings import BUILDINGS
 
 BEAMS = 760
+_TREE, _PERIOD_S = Path(__file__).parents[2], 0.08
+"""This tree, and the scans' period [s]."""
 _DASHBOARD_S, _PARTS_S = 40.0, 25.0
 _READER = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1]).read()"
 _SETTLED_S = 3.0
@@ -125,11 +128,11 @@ def play(peer: subprocess.Popen[str], seconds: int) -> None:
     peer.stdin.flush()
 
 
-def start_node(domain: str, *options: str) -> subprocess.Popen[str]:
-    """The node on DDS."""
+def start_node(domain: str, *options: str, tree: Path = _TREE) -> subprocess.Popen[str]:
+    """The node on DDS, by the code of a ``tree``."""
     command = (sys.executable, "-m", "localization.cli", "online", "--robot", "vaultbot", "--transport", "dds", "--domain", domain)
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    return subprocess.Popen([*command, *options], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+    return subprocess.Popen([*command, *options], cwd=tree, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
 
 class OverDds(NamedTuple):
@@ -144,15 +147,21 @@ class OverDds(NamedTuple):
     answered: int
     sent: int
     """Scans."""
+    predicted: int
+    """Predicted odometry."""
+    reports: Sequence[str]
+    """What the node has printed since the robot began to drive."""
 
 
 _DOMAIN = "97"
+_SHARES = (0.25, 0.15, 0.10)
+"""Parts of a core that `starved` gives."""
 
 
-def over_dds(path: Path, estimator: str, folder: Path, share: float = 1.0) -> OverDds:
-    """A minute of ``path`` on DDS, with the node, once it has compiled, confined to a ``share`` of a core."""
+def over_dds(path: Path, estimator: str, folder: Path, share: float = 1.0, tree: Path = _TREE) -> OverDds:
+    """A minute of ``path`` on DDS, with the node of ``tree``, once it has compiled, confined to a ``share`` of a core."""
     peer = start_peer(path, _DOMAIN)
-    node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(folder / f"{estimator}.state"))
+    node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(folder / f"{estimator}.state"), tree=tree)
     assert node.stdout is not None
     for _ in ("listening", "waiting for topics, with everything compiled"):
         node.stdout.readline()
@@ -179,10 +188,10 @@ def _measure(peer: subprocess.Popen[str], node: subprocess.Popen[str], share: fl
         cpu = (_cpu_seconds(node.pid) - before) / (time.monotonic() - begin)
     heard = json.loads(peer.communicate()[0])
     node.terminate()
-    node.communicate()
+    reports = [line for line in node.communicate()[0].splitlines() if line.startswith("warning: ")]
     settled = int(_SETTLED_S * 12.5)
     out_s, heard_s = (np.array(heard[name])[settled:] for name in ("out_s", "latencies_s"))
-    return OverDds(out_s, heard_s, cpu, len(heard["out_s"]), len(heard["scans"]))
+    return OverDds(out_s, heard_s, cpu, len(heard["out_s"]), len(heard["scans"]), len(heard["predicted_stamps"]), reports)
 
 
 _PERIOD_US = 100_000
@@ -220,6 +229,43 @@ def quarter() -> None:
     print(f"{BEAMS} beams at 12.5 Hz, a quarter of a core            p50 ms    p99 ms    max ms    part of a core")
     _print("ekf: scan sent, odometry sent, over DDS", found.out_s, found.cpu)
     print(f"{found.answered} of {found.sent} scans answered. wanted: all but those of the last moment, p99 <= 40 ms\n")
+
+
+@contextmanager
+def _busy_cores() -> Iterator[None]:
+    """Inside, each core has a process that never waits."""
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def starved(commit: str = "") -> None:
+    """The node on a part of a core, all of which are busy: which scans are answered, how late, and what it reports; beside the tree of
+    ``commit``, if one is given."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path, trees = write_laps(folder / "laps.mcap"), {"this tree": _TREE}
+        if commit:
+            trees[commit] = folder / "tree"
+            subprocess.run(["git", "worktree", "add", "--detach", str(folder / "tree"), commit], cwd=_TREE, check=True, capture_output=True)
+        try:
+            for share, (shown, tree) in itertools.product(_SHARES, trees.items()):
+                with _busy_cores():
+                    found = over_dds(path, "ekf", folder, share, tree)
+                in_time, rate_hz = float(np.mean(found.out_s <= _PERIOD_S)), found.predicted / 60.0
+                _print(f"{shown}, {share:.0%} of a core", found.out_s, found.cpu)
+                answered = f"{found.answered} of {found.sent} scans answered, {in_time:.1%} of these within a period"
+                print(f"    {answered}; {rate_hz:.0f} predictions a second")
+                for line in found.reports:
+                    print(f"    {line}", flush=True)
+        finally:
+            if commit:
+                subprocess.run(["git", "worktree", "remove", "--force", str(folder / "tree")], cwd=_TREE, check=True)
+    print("wanted at 15 %: 99 % of the scans that are answered within a period, and no verdict about a sensor\n")
 
 
 def start() -> None:
@@ -342,6 +388,8 @@ def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
         start()
     if part in ("all", "quarter"):
         quarter()
+    if part in ("all", "starved"):
+        starved(hours if part == "starved" and hours != "10" else "")
     if part in ("all", "dashboard"):
         dashboard()
     if part in ("all", "soak"):

@@ -23,7 +23,7 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.discovery import TF
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
-from localization.ros.publisher import DIAGNOSTICS, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
+from localization.ros.publisher import DIAGNOSTICS, FIX, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files, View
 from localization.ros.settings import LiveRun, Names, NodeConfig
 from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler
@@ -185,6 +185,7 @@ def published(transport: LogTransport, topic: str) -> list:
         POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
         PATH: "nav_msgs/msg/Path",
         MAP: "nav_msgs/msg/OccupancyGrid",
+        FIX: "sensor_msgs/msg/NavSatFix",
     }
     return [
         store.deserialize_cdr(data, kinds.get(topic, "sensor_msgs/msg/JointState")) for data in transport.published[Names().resolve(topic)]

@@ -609,7 +609,7 @@ def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
     """Odometry and its transform are those that never jump; what the graph corrects is a transform of its own (REP-105)."""
     transport = LogTransport(drive_log(scans_hz=6.25))
     publisher = EstimatePublisher(transport, Names(), frames, with_tf=True)
-    publisher.advertise_optional(has_predictions=False, has_map_frame=True, has_path=False, has_map=False)
+    publisher.advertise_optional(has_predictions=False, has_map_frame=True, has_path=False, has_map=False, has_fix=False)
     in_odom, map_T_odom = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.25, -0.1])
     cov, cov_in_map = 0.01 * np.eye(3), 0.04 * np.eye(3)
     pose = se2.compose(map_T_odom, in_odom)
@@ -845,3 +845,12 @@ def _offer_map_services(transport, fake, monkeypatch: pytest.MonkeyPatch) -> Non
     for name, is_saved, code in (("good", True, 0), ("bad", False, 255)):
         assert by_nav2(types.SimpleNamespace(map_url=name), types.SimpleNamespace(result=False)).result is is_saved
         assert by_toolbox(types.SimpleNamespace(filename=name), types.SimpleNamespace(result=0)).result == code
+    of_robot_localization = types.ModuleType("robot_localization.srv")
+    of_robot_localization.FromLL = type("FromLL", (), {})
+    monkeypatch.setitem(sys.modules, "robot_localization.srv", of_robot_localization)
+    assert transport.offer_service("/fromLL", "robot_localization/srv/FromLL", lambda at: ServiceReply(True, "", point={"x": at.latitude}))
+    request, response = (
+        types.SimpleNamespace(ll_point=types.SimpleNamespace(latitude=48.0)),
+        types.SimpleNamespace(map_point=types.SimpleNamespace()),
+    )
+    assert fake.services["/fromLL"](request, response).map_point.x == 48.0

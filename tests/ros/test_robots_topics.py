@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from localization.errors import SettingError
+from localization.logs import open_log
 from localization.logs.reference_topics import east_north, geodetic_to_ecef
 from localization.logs.topic_roles import TopicOverrides
 from localization.ros.discovery import TF
 from localization.ros.gnss import parse_datum, utm_pose
-from localization.ros.publisher import ODOMETRY
+from localization.ros.publisher import FIX, ODOMETRY
 from localization.ros.settings import NodeConfig, OnlineSettings
 from localization.simulation.experiments import Experiment, OpenLoop, Rest, constant
 from localization.simulation.sensors import GpsConfig, SensorConfig
@@ -126,6 +129,31 @@ def test_live_fixes_give_the_map_its_heading_and_place_in_utm(outdoor_log, monke
     assert in_utm[-1].child_frame_id == "map"
     expected = se2.compose(utm_T_enu, np.array([x, y, yaw]))
     assert np.hypot(in_utm[-1].transform.translation.x - expected[0], in_utm[-1].transform.translation.y - expected[1]) < 1e-6
+
+
+def test_filtered_fixes_and_services_place_the_map_on_the_earth(outdoor_log):
+    """The last fix is the true place within its own covariance; what is asked by fromLL is answered back by toLL."""
+    transport = LogTransport(outdoor_log)
+    run_node(transport, "graph", config=NodeConfig(wait_s=0.0, predict=False, positions="fix", path_period_s=0.0, map_period_s=0.0))
+    last = published(transport, FIX)[-1]
+    truth = list(open_log(outdoor_log, ROBOT).references("/ground_truth/odom"))[-1]
+    centre, axes = np.radians([GpsConfig().latitude_deg, GpsConfig().longitude_deg]), np.radians([last.latitude, last.longitude])
+    off = east_north(*centre) @ (geodetic_to_ecef(*axes, 0.0) - geodetic_to_ecef(*centre, 0.0)) - truth.position
+    cov = last.position_covariance.reshape(3, 3)[:2, :2]
+    assert off @ np.linalg.solve(cov, off) < 9.2  # 99 % of chi-squared of two
+    assert np.sqrt(np.trace(cov)) < 0.3
+    assert math.isnan(last.altitude)
+    here = SimpleNamespace(latitude=last.latitude, longitude=last.longitude, altitude=0.0)
+    in_map = transport.services["/fromLL"](here).point
+    back = transport.services["/toLL"](SimpleNamespace(**in_map)).point
+    assert [back["latitude"], back["longitude"]] == pytest.approx([last.latitude, last.longitude], abs=1e-9)
+
+
+def test_place_on_the_earth_is_no_number_without_positions():
+    transport = LogTransport(drive_log())
+    _, reports = run_node(transport)
+    assert math.isnan(transport.services["/fromLL"](SimpleNamespace(latitude=48.0, longitude=7.8, altitude=0.0)).point["x"])
+    assert any("fromLL: where the map is on the earth is not known" in text for text in reports)
 
 
 @pytest.mark.parametrize(("datum", "error"), [("48.0", "LATITUDE,LONGITUDE"), ("7.8,248.0", "LATITUDE,LONGITUDE"), ("a,b", "'a,b'")])

@@ -102,3 +102,14 @@ def test_gain_is_unknown_where_the_difference_is_an_offset() -> None:
     """A gyro whose bias is 6 deg/s: no scale and no direction."""
     turns = 0.05 * np.sin(0.25 * np.arange(24.0))
     assert math.isinf(_gain_of_turns(turns, turns + 0.25 * 0.1).bound)
+
+
+def test_one_scan_at_a_wrong_place_in_a_corridor_does_not_show_a_robot_that_goes_back():
+    """Bins across the walls fit both directions of travel; a bin with a way ahead is evidence, one alone is none."""
+    rows = np.full((16, 12), np.nan)
+    rows[:, 0], rows[:, 1:4], rows[:, 7], rows[:, 9:] = 0.3, (0.19, 0.0, 0.0), 0.0, (0.0, 0.0, 1.0)
+    rows[3, 5:7] = -0.32, 0.0
+    assert Comparison(WAY, "wheels", "LiDAR").gain(Bins.of(rows)).bound == math.inf
+    rows[:8, 5:7] = -0.19, 0.0
+    turned = Comparison(WAY, "wheels", "LiDAR").gain(Bins.of(rows))
+    assert abs(turned.angle) - turned.bound > OPPOSITE_RAD

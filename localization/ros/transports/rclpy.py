@@ -16,8 +16,10 @@ _MAX_WAITED_NS = 60_000_000_000
 """Longest wait in the middleware's queue that is taken as one [ns]: its times are of the wall clock, which may be set."""
 _MESSAGE_PACKAGES = ("std_msgs", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "tf2_msgs")
 _SERVICE_PACKAGES = ("std_srvs",)
-_REQUEST_FIELDS = ("data", "filename", "map_url")
-"""What a handler is given: of std_srvs/SetBool, slam_toolbox's (De)SerializePoseGraph, and nav2_msgs/SaveMap and LoadMap."""
+_POINT_FIELDS = ("ll_point", "map_point")
+_REQUEST_FIELDS = ("data", "filename", "map_url", *_POINT_FIELDS)
+"""What a handler is given: of std_srvs/SetBool, slam_toolbox's (De)SerializePoseGraph, nav2_msgs/SaveMap and LoadMap, and
+robot_localization's FromLL and ToLL."""
 
 
 def import_rclpy(*parts: str) -> list[Any]:
@@ -105,6 +107,9 @@ class RclpyTransport(MonotonicTime):
             elif hasattr(response, "result"):
                 is_flag = isinstance(response.result, bool)
                 response.result = reply.is_success if is_flag else (0 if reply.is_success else reply.code)
+            for point in (getattr(response, name) for name in _POINT_FIELDS if hasattr(response, name)):
+                for name, value in reply.point.items():
+                    setattr(point, name, value)
             return response
 
         self._services.append(self._node.create_service(_interface_class(kind), name, answer))

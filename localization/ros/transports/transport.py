@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 from localization.errors import TransportError
@@ -44,10 +45,12 @@ class ServiceReply(NamedTuple):
     message: str
     code: int = 255
     """`result` of what failed, where that is a number: as nav2_msgs/LoadMap has them, 255 for all other failures."""
+    point: Mapping[str, float] = MappingProxyType({})
+    """Fields of the point that was asked for, as robot_localization/FromLL and ToLL do."""
 
 
 ServiceHandler = Callable[[Any], ServiceReply]
-"""Given the `data` of a SetBool request, or the name of a file in others; True for Empty and Trigger."""
+"""Given the `data` of a SetBool request, or the name of a file or the point in others; True for Empty and Trigger."""
 
 
 class Transport(Protocol):
