@@ -19,8 +19,11 @@ from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount
 
-_MAX_WAIT_S = 0.5
-"""For how long a scan waits for the processor, where a newer one is here [s]: slam_toolbox takes one per half second at all."""
+_MAX_WAIT_PERIODS = 1.0
+"""For how long a scan waits for the processor where a newer one is here [periods of its topic]: its estimate would be older than the newer
+scan's."""
+_FIRST_WAIT_S = 0.5
+"""The same of a topic whose period is not known yet [s]."""
 
 
 class LiveInputs:
@@ -79,7 +82,7 @@ class LiveInputs:
         self._transport.restrict([*others, *self.topics, *commands], [*urgent, *commands])
 
     def without_overtaken(self, messages: Sequence[Received], now_ns: int, since_ns: int = 0) -> Sequence[Received]:
-        """``messages`` without the scans that have waited for more than `_MAX_WAIT_S` while a newer one came.
+        """``messages`` without the scans that have waited for more than `_MAX_WAIT_PERIODS` while a newer one came.
 
         Where the processor is too slow for all, the newest counts; messages of wheels and gyro are all integrated. What came before
         ``since_ns``, when the node itself was ready, has not waited for the processor until then.
@@ -90,12 +93,15 @@ class LiveInputs:
         newest, kept = {received.topic: received for received in messages if received.topic in lidars}, list[Received]()
         for received in messages:
             has_waited_s = (now_ns - max(received.received_ns, since_ns)) * 1e-9
-            if received.topic in lidars and received is not newest[received.topic] and has_waited_s > _MAX_WAIT_S:
+            if received.topic in lidars and received is not newest[received.topic] and has_waited_s > self._longest_wait_s(received.topic):
                 self.stream.topic_rates[received.topic].count(received.received_ns)
                 self.stats.count(received.topic, Oddity.OVERTAKEN)
                 continue
             kept.append(received)
         return kept
+
+    def _longest_wait_s(self, topic: str) -> float:
+        return _MAX_WAIT_PERIODS * self.stream.topic_rates[topic].period_s or _FIRST_WAIT_S
 
     def lacking(self) -> list[tuple[str, ...]]:
         """Groups of roles without a topic."""

@@ -161,7 +161,8 @@ _SHARES = (0.25, 0.15, 0.10)
 def over_dds(path: Path, estimator: str, folder: Path, share: float = 1.0, tree: Path = _TREE) -> OverDds:
     """A minute of ``path`` on DDS, with the node of ``tree``, once it has compiled, confined to a ``share`` of a core."""
     peer = start_peer(path, _DOMAIN)
-    node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(folder / f"{estimator}.state"), tree=tree)
+    state = folder / f"{estimator}_{len(list(folder.iterdir()))}.state"
+    node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(state), tree=tree)
     assert node.stdout is not None
     for _ in ("listening", "waiting for topics, with everything compiled"):
         node.stdout.readline()

@@ -147,10 +147,10 @@ def test_newest_scan_wins_where_the_processor_is_too_slow():
         return [Received("/scan", begin_ns + round(seconds * 1e9), b"") for seconds in after_s]
 
     waited, wheels = scans(0.0, 0.16, 0.32, 0.64), [Received("/joint_states", begin_ns + round(0.2 * i * 1e9), b"") for i in (1, 2)]
-    assert inputs.without_overtaken([*waited, *wheels], begin_ns + 740_000_000) == [*waited[2:], *wheels]
-    assert inputs.stats.of("/scan", Oddity.OVERTAKEN) == 2
-    assert inputs.without_overtaken(waited, begin_ns + 740_000_000, since_ns=begin_ns + 500_000_000) == waited
-    in_time = scans(0.8, 0.96)
+    assert inputs.without_overtaken([*waited, *wheels], begin_ns + 740_000_000) == [waited[3], *wheels]
+    assert inputs.stats.of("/scan", Oddity.OVERTAKEN) == 3
+    assert inputs.without_overtaken(waited, begin_ns + 740_000_000, since_ns=begin_ns + 600_000_000) == waited
+    in_time = scans(0.84, 0.96)
     assert inputs.without_overtaken(in_time, begin_ns + 970_000_000) == in_time
 
 
@@ -188,9 +188,6 @@ def test_mount_is_measured_as_well_as_its_sigma():
 def test_mount_that_changes_is_measured_anew_and_one_misfit_is_none():
     R, zero = np.diag([2e-3, 2e-3, 5e-4]) ** 2, np.zeros((3, 3))
     correction = MountCorrection()
-    for _ in range(10):
-        correction.update(np.zeros(3), R, zero, (np.zeros(3), 1.0))
-    assert not correction.is_known
     for _ in range(10):
         correction.update(np.zeros(3), R, zero, (np.zeros(3), 1.0))
     assert correction.is_known
