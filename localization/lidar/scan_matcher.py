@@ -132,8 +132,8 @@ class ScanMatcher:
         fit = align_points(self.submap.grid, points, prior, cov, prior)
         if fit.overlap < self._config.search_below:
             return None
-        R = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION), dtype=float)
-        return se2.retract(fit.pose, -R @ fit.gradient), R * self._block_variance
+        cov = np.asarray(np.linalg.inv(fit.information + OPEN_INFORMATION), dtype=float)
+        return se2.retract(fit.pose, -cov @ fit.gradient), cov * self._block_variance
 
     def intra_scan_slip_cov(self, points: Points2, times: FloatArray, pose: Pose2, slip_rate: Cov3) -> Cov3:
         """(3, 3) covariance of the match of a scan that is bent: it was deskewed with one twist, while the body's motion is a random walk w

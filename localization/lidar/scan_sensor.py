@@ -81,7 +81,11 @@ class ScanMatchingSensor:
         if self._stale.is_stale(scan, step.is_standing):
             return None, "stale"
         self._require_mount(scan.frame_id)
-        sweep = self.merged.sweep(scan)
+        if scan.beside or self.merged.corrections:
+            sweep = self.merged.sweep(scan)
+        else:
+            mount = self._mounts.get(scan.frame_id, Mount())
+            sweep = Sweep.from_scan(scan, mount, self._config.min_range_m, self._config.max_range_m)
         deskewed = self._deskew(sweep, step.twist, prior, cov)
         if len(deskewed.planar) < MIN_POINTS:
             return None, "sparse"

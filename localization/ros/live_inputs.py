@@ -19,11 +19,11 @@ from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount
 
-_MAX_WAIT_PERIODS = 1.0
-"""For how long a scan waits for the processor where a newer one is here [periods of its topic]: its estimate would be older than the newer
-scan's."""
+_MAX_WAIT_PERIODS = 1.5
+"""For how long a scan waits for the processor where a newer one is here [periods of its topic]: its estimate would be as old as the newer
+scan's. Half a period is for those that come in one reading."""
 _FIRST_WAIT_S = 0.5
-"""The same of a topic whose period is not known yet [s]."""
+"""For how long one of a topic waits whose period is not known yet [s]."""
 
 
 class LiveInputs:

@@ -112,10 +112,10 @@ class OwnBody:
         scan = step.scan
         if scan is None:
             return step
-        kept, beside = self._without_own(scan), tuple(self._without_own(other) for other in scan.beside)
-        if kept is scan and all(a is b for a, b in zip(beside, scan.beside, strict=True)):
-            return step
-        return replace(step, scan=replace(kept, beside=beside))
+        kept = self._without_own(scan)
+        if scan.beside:
+            kept = replace(kept, beside=tuple(self._without_own(other) for other in scan.beside))
+        return step if kept is scan else replace(step, scan=kept)
 
     def _without_own(self, scan: Scan) -> Scan:
         """``scan``, at the pose at hand, without these points."""

@@ -189,7 +189,7 @@ def _measure(peer: subprocess.Popen[str], node: subprocess.Popen[str], share: fl
         cpu = (_cpu_seconds(node.pid) - before) / (time.monotonic() - begin)
     heard = json.loads(peer.communicate()[0])
     node.terminate()
-    reports = [line for line in node.communicate()[0].splitlines() if line.startswith("warning: ")]
+    reports = [line for line in node.communicate()[0].splitlines() if line.startswith("!")]
     settled = int(_SETTLED_S * 12.5)
     out_s, heard_s = (np.array(heard[name])[settled:] for name in ("out_s", "latencies_s"))
     return OverDds(out_s, heard_s, cpu, len(heard["out_s"]), len(heard["scans"]), len(heard["predicted_stamps"]), reports)

@@ -16,6 +16,7 @@ from localization.estimators.estimator import Estimator
 from localization.estimators.fusion import EkfFusion
 from localization.events import Scan, Step, Turn
 from localization.lidar import LidarConfig, LostScans, ScanMatch
+from localization.lidar.merged_sweep import MergedSweeps
 from localization.lidar.scan_policies import MovedRobot
 from motion_models import se2
 from motion_models.motion import Motion
@@ -54,6 +55,7 @@ class PoseSensor:
     def __init__(self) -> None:
         self.next: ScanMatch | None = None
         self.lost, self.moved = LostScans(), MovedRobot(LidarConfig())
+        self.merged = MergedSweeps({}, LidarConfig())
 
     def measure(self, step, prior, cov, offset):
         return self.next
