@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -26,7 +27,6 @@ from localization.output import fingerprint
 from localization.pipeline import Pipeline
 from localization.ros.diagnostics import ERROR, OK, WARN, Status
 from localization.ros.node import Node, StopSignal
-from localization.ros.quiet_process import QuietProcess
 from localization.ros.session import Session, SessionState, View, made_by, shared_of
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports import TransportName, open_transport
@@ -159,7 +159,7 @@ class OnlineCommand(OnlineSettings):
         if run.node.use_sim_time:
             transport = SimTimeTransport(transport)
         console.print(f"listening in {transport.place}, compiling meanwhile", markup=False, soft_wrap=True)
-        answers = QuietProcess()
+        answers = ThreadPoolExecutor(1, "set-up")
         try:
             node = Node.start(transport, run, report, stop.is_set, view, answers)
             text = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"

@@ -8,12 +8,12 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from localization.errors import SettingError
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node, StopSignal
-from localization.ros.quiet_process import QuietProcess
 from localization.ros.settings import LiveRun, ManagedNodeSettings, Names, make_settings, nearest, parameters
 from localization.ros.transports.rclpy import RclpyTransport, import_rclpy
 from localization.ros.transports.transport import SimTimeTransport, Transport
@@ -106,7 +106,7 @@ class ManagedNode:
         def is_over() -> bool:
             return stop.is_set() or not self._is_active
 
-        answers = QuietProcess()
+        answers = ThreadPoolExecutor(1, "set-up")
         try:
             with files.claimed():
                 self._estimator = Node.start(transport, self._live_run, self._log.warning, is_over, executor=answers)

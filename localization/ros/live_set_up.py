@@ -155,27 +155,24 @@ class LiveSetUp:
         self._is_last = now_ns >= moving_ns + _LAST_NS
         self._next_ns = moving_ns + min(round((now_ns - moving_ns) * _LONGER), _LAST_NS)
         readings = _Readings(self._readings.wheels.copy(), self._readings.gyro.copy(), self._readings.scans.copy())
+        sensors = self._sensors
+
+        def answer() -> SetUp:
+            return infer(readings.sources(sensors), sensors.robot)
+
         if self._executor is not None:
-            self._asked = self._executor.submit(_answer, readings, self._sensors)
+            self._asked = self._executor.submit(answer)
             return
         self._asked = Future()
-        self._asked.set_result(_answer(readings, self._sensors))
+        self._asked.set_result(answer())
         self._take_answer()
 
     def _take_answer(self) -> None:
         if self._asked is None or not self._asked.done():
             return
-        if self._asked.cancelled():  # the node ends
-            self._asked = None
-            return
         self.found, self._asked = self._asked.result(), None
         is_settled = self.found.verdict == "consistent" and self.found.by_file > _SETTLED
         self.is_done = self.found.verdict == "certain" or is_settled or self._is_last
-
-
-def _answer(readings: _Readings, sensors: LiveSensors) -> SetUp:
-    """The set-up by the ``readings`` so far."""
-    return infer(readings.sources(sensors), sensors.robot)
 
 
 class EntranceChecks:

@@ -218,7 +218,8 @@ def _confined(pid: int, share: float) -> Iterator[None]:
         throttled = dict(line.split() for line in (group / "cpu.stat").read_text().splitlines())["nr_throttled"]
         print(f"confined to {share:g} of a core: throttled in {throttled} periods of {_PERIOD_US // 1000} ms")
     finally:
-        (group.parent / "cgroup.procs").write_text(str(pid))
+        for member in (group / "cgroup.procs").read_text().split():  # with the node's own processes
+            (group.parent / "cgroup.procs").write_text(member)
         group.rmdir()
 
 
