@@ -19,7 +19,7 @@ _REPORTED_SHARE = 0.05
 """Share of the time without one of the LiDARs that is reported."""
 _MAX_AGE = 1.5
 """Periods of a LiDAR, before which its last scan is too old for a sweep of several: one is lost."""
-_KEPT_SCANS = 8
+_KEPT_SCANS = 4
 """Last scans of a LiDAR that may belong to one of another that comes late."""
 
 
@@ -37,10 +37,8 @@ class LidarHealth:
     newest: deque[Scan] = field(default_factory=lambda: deque(maxlen=_KEPT_SCANS))
     """Its last scans, while another LiDAR gives the steps."""
 
-    def add(self, scan: Scan) -> None:
+    def add(self, stamp_ns: int) -> None:
         """Its next scan."""
-        self.newest.append(scan)
-        stamp_ns = scan.stamp_ns
         gap_s = (stamp_ns - self.last_ns) * 1e-9
         if self.scans > 1 and self.is_silent(stamp_ns):
             self.silent_s += gap_s
@@ -86,10 +84,13 @@ class LidarChoice:
         if frame not in self.lidars:
             self.lidars[frame] = LidarHealth(stamp_ns, stamp_ns)
         else:
-            self.lidars[frame].add(scan)
+            self.lidars[frame].add(stamp_ns)
         if self.lidars[self.used].is_silent(stamp_ns):
             self.used, self._changes = frame, self._changes + 1
-        return self._with_others(scan) if frame == self.used else None
+        if frame == self.used:
+            return self._with_others(scan)
+        self.lidars[frame].newest.append(scan)
+        return None
 
     def _with_others(self, scan: Scan) -> Scan:
         others = [lidar.before(_end_ns(scan)) for frame, lidar in self.lidars.items() if frame != scan.frame_id]

@@ -3,7 +3,7 @@
 python -m tests.benchmarks.online [steps | latency | parts | start | quarter | starved [COMMIT] | dashboard | soak [HOURS [BEAMS]]]
 
 `quarter` confines the node to a quarter of a core by a cgroup (as root), as a computer of the Raspberry Pi's class would; `starved` gives
-it 25, 15 and 10 % of a core while all cores are busy, this tree beside that of a COMMIT.
+it the weight of 25, 15 and 10 % of a core while all cores are busy, this tree beside that of a COMMIT.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
@@ -158,15 +159,17 @@ _SHARES = (0.25, 0.15, 0.10)
 """Parts of a core that `starved` gives."""
 
 
-def over_dds(path: Path, estimator: str, folder: Path, share: float = 1.0, tree: Path = _TREE) -> OverDds:
-    """A minute of ``path`` on DDS, with the node of ``tree``, once it has compiled, confined to a ``share`` of a core."""
+def over_dds(
+    path: Path, estimator: str, folder: Path, around: Callable[[int], AbstractContextManager[None]] | None = None, tree: Path = _TREE
+) -> OverDds:
+    """A minute of ``path`` on DDS, with the node of ``tree``, once it has compiled; ``around`` gives the context for its process."""
     peer = start_peer(path, _DOMAIN)
     state = folder / f"{estimator}_{len(list(folder.iterdir()))}.state"
     node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(state), tree=tree)
     assert node.stdout is not None
     for _ in ("listening", "waiting for topics, with everything compiled"):
         node.stdout.readline()
-    return _measure(peer, node, share)
+    return _measure(peer, node, None if around is None else around(node.pid))
 
 
 def without_estimator(path: Path) -> OverDds:
@@ -178,10 +181,10 @@ def without_estimator(path: Path) -> OverDds:
     return _measure(peer, relay)
 
 
-def _measure(peer: subprocess.Popen[str], node: subprocess.Popen[str], share: float = 1.0) -> OverDds:
-    """Play a minute, and end both processes."""
+def _measure(peer: subprocess.Popen[str], node: subprocess.Popen[str], inside: AbstractContextManager[None] | None = None) -> OverDds:
+    """Play a minute ``inside`` of a context, and end both processes."""
     assert peer.stdout is not None
-    with _confined(node.pid, share) if share < 1.0 else nullcontext():
+    with inside or nullcontext():
         before, begin = _cpu_seconds(node.pid), time.monotonic()
         play(peer, 60)
         peer.stdout.readline()  # matched
@@ -200,34 +203,47 @@ _PERIOD_US = 100_000
 
 
 @contextmanager
-def _confined(pid: int, share: float) -> Iterator[None]:
-    """Inside, all threads of a process have a ``share`` of a core, by a cgroup (v2, else v1). Raises `OSError` where there is none."""
+def _in_group(pid: int, settings: Mapping[str, str], settings_v1: Mapping[str, str]) -> Iterator[Path]:
+    """Inside, a process and its threads are in a cgroup with ``settings`` by file (v2, else v1). Raises `OSError` where there is none."""
     root = Path("/sys/fs/cgroup")
     is_v2 = (root / "cgroup.controllers").exists()
     group = (root if is_v2 else root / "cpu") / "skidloc-benchmark"
     group.mkdir(exist_ok=True)
-    quota_us = round(share * _PERIOD_US)
-    if is_v2:
-        (group / "cpu.max").write_text(f"{quota_us} {_PERIOD_US}")
-    else:
-        (group / "cpu.cfs_period_us").write_text(str(_PERIOD_US))
-        (group / "cpu.cfs_quota_us").write_text(str(quota_us))
+    for name, value in (settings if is_v2 else settings_v1).items():
+        (group / name).write_text(value)
     try:
         (group / "cgroup.procs").write_text(str(pid))
-        yield
-        throttled = dict(line.split() for line in (group / "cpu.stat").read_text().splitlines())["nr_throttled"]
-        print(f"confined to {share:g} of a core: throttled in {throttled} periods of {_PERIOD_US // 1000} ms")
+        yield group
     finally:
         for member in (group / "cgroup.procs").read_text().split():  # with the node's own processes
             (group.parent / "cgroup.procs").write_text(member)
         group.rmdir()
 
 
+@contextmanager
+def _confined(pid: int, share: float) -> Iterator[None]:
+    """Inside, all threads of a process have a ``share`` of a core, whatever others do."""
+    quota_us = round(share * _PERIOD_US)
+    v1 = {"cpu.cfs_period_us": str(_PERIOD_US), "cpu.cfs_quota_us": str(quota_us)}
+    with _in_group(pid, {"cpu.max": f"{quota_us} {_PERIOD_US}"}, v1) as group:
+        yield
+        throttled = dict(line.split() for line in (group / "cpu.stat").read_text().splitlines())["nr_throttled"]
+        print(f"confined to {share:g} of a core: throttled in {throttled} periods of {_PERIOD_US // 1000} ms")
+
+
+@contextmanager
+def _beside_load(pid: int, share: float) -> Iterator[None]:
+    """Inside, a process that wants it has a ``share`` of a core beside another one that never waits there."""
+    weight = share / (1.0 - share)
+    with _in_group(pid, {"cpu.weight": f"{100.0 * weight:.0f}"}, {"cpu.shares": f"{1024.0 * weight:.0f}"}):
+        yield
+
+
 def quarter() -> None:
     """The node on a quarter of a core: whether each scan is answered, and how late."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        found = over_dds(write_laps(folder / "laps.mcap"), "ekf", folder, share=0.25)
+        found = over_dds(write_laps(folder / "laps.mcap"), "ekf", folder, lambda pid: _confined(pid, 0.25))
     print(f"{BEAMS} beams at 12.5 Hz, a quarter of a core            p50 ms    p99 ms    max ms    part of a core")
     _print("ekf: scan sent, odometry sent, over DDS", found.out_s, found.cpu)
     print(f"{found.answered} of {found.sent} scans answered. wanted: all but those of the last moment, p99 <= 40 ms\n")
@@ -246,8 +262,8 @@ def _busy_cores() -> Iterator[None]:
 
 
 def starved(commit: str = "") -> None:
-    """The node on a part of a core, all of which are busy: which scans are answered, how late, and what it reports; beside the tree of
-    ``commit``, if one is given."""
+    """The node beside processes that keep all cores busy, with the weight of a part of a core: which scans are answered, how late, and what
+    it reports; beside the tree of ``commit``, if one is given."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path, trees = write_laps(folder / "laps.mcap"), {"this tree": _TREE}
@@ -257,7 +273,7 @@ def starved(commit: str = "") -> None:
         try:
             for share, (shown, tree) in itertools.product(_SHARES, trees.items()):
                 with _busy_cores():
-                    found = over_dds(path, "ekf", folder, share, tree)
+                    found = over_dds(path, "ekf", folder, partial(_beside_load, share=share), tree)
                 in_time, rate_hz = float(np.mean(found.out_s <= _PERIOD_S)), found.predicted / 60.0
                 _print(f"{shown}, {share:.0%} of a core", found.out_s, found.cpu)
                 answered = f"{found.answered} of {found.sent} scans answered, {in_time:.1%} of these within a period"
