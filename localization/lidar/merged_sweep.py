@@ -24,13 +24,13 @@ MOUNT_COV = np.diag([0.02, 0.02, math.radians(1.0)]) ** 2
 """Covariance of a mount that was measured by hand, about the body's origin [m^2, m^2, rad^2]; by judgement."""
 
 _SHARED = 3.0
-"""Variance of measurements of a mount over that of independent ones, as successive ones see some of the same surfaces: the mean square of
-the normalised error of yaw on 13 simulated drives with views of 90 to 270 deg. With it, it is 1.0 on six others."""
+"""Variance of measurements of a mount over that of independent ones, as successive ones share surfaces: the mean square of the normalised
+error of yaw on 13 simulated drives with views of 90 to 270 deg. With it, it is 1.0 on six others."""
 _KNOWN = 0.2
 """Variance of a mount over that of two scans, from where on all draw the map. At 1 the errors of mounts, which are the same in all scans,
 take a drive with a wide view from .0025 to .006 m."""
 _OTHER_VIEW_RAD = 1.0
-"""Turn after which a scanner sees other surfaces."""
+"""Turn after which a scanner measures other surfaces."""
 
 
 @dataclass(eq=False)
@@ -51,7 +51,7 @@ class MountCorrection:
     """Measurements in a row that are far off."""
 
     def is_due(self, pose: Pose2) -> bool:
-        """Whether other surfaces are seen from ``pose`` (3,) than at the last measurement: until the robot has come to where it drew these,
+        """Whether a measurement from ``pose`` (3,) is of other surfaces than the last one: until the robot has come to where it drew those,
         or has turned, the drift of the map since is the same."""
         if self._measured_at is None:
             return True
@@ -67,10 +67,10 @@ class MountCorrection:
     def update(self, off: FloatArray, R: Cov3, drift: Cov3, seen_from: tuple[Pose2, float]) -> None:
         """The points, already moved, were measured to be ``off`` (3,): a Kalman filter's update.
 
-        ``R`` (3, 3) is the covariance by the scans of both LiDARs, ``drift`` (3, 3) that of the map since it drew what is seen,
-        ``seen_from`` a pose (3,) and how far from there it was drawn [m].
+        ``R`` (3, 3) is the covariance by the scans of both LiDARs, ``drift`` (3, 3) that of the map since it drew these surfaces,
+        ``seen_from`` a pose (3,) and how far from there they were drawn [m].
 
-        One that is far beyond these covariances is a scan that fits at a wrong place; two in a row, which see other surfaces, are a mount
+        One that is far beyond these covariances is a scan that fits at a wrong place; two in a row, of different surfaces, are a mount
         that has changed, and it is measured anew. What is known is not measured again, as it has drawn the map.
         """
         R, drift = _SHARED * R, _SHARED * drift
@@ -96,11 +96,11 @@ class MergedSweeps:
 
     def begin(self) -> None:
         """Another LiDAR draws the map from here on."""
-        self.corrections = {}
+        self.corrections, self._beside = {}, {}
 
     def is_aligned(self, frame: str) -> bool:
-        """Whether the map can be continued by the scans of ``frame``."""
-        return frame in self.corrections
+        """Whether the map can be continued by the scans of ``frame``: its mount is known against the LiDAR that has drawn it so far."""
+        return frame in self.corrections and self.corrections[frame].is_known
 
     def parameters(self) -> dict[str, tuple[float, float]]:
         """Mean and sigma of the corrections of mounts so far, by name [m, m, rad]."""
@@ -131,9 +131,10 @@ class MergedSweeps:
         """Where the scans beside the last one fit the map, of a body at ``pose`` (3,). ``covs``: its covariance (3, 3) against the map, and
         that of the map's own error there, (3, 3)."""
         for frame, sweep in self._beside.items():
-            correction, points = self.corrections[frame], sweep.project(sweep.deskew(twist))
+            correction = self.corrections[frame]
             if not correction.is_due(pose):
                 continue
+            points = sweep.project(sweep.deskew(twist))
             drift, far_m = matcher.submap.drift_cov(points, pose, covs[1])
             found = matcher.locate(points, pose, correction.cov + covs[0] + drift)
             if found is not None:

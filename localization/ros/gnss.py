@@ -15,6 +15,7 @@ from localization.events import PositionSample
 from localization.logs.decode import MessageStats, UnusableError, stamp_ns
 from localization.logs.reference_topics import east_north, geodetic_to_ecef, position_sample, reference_decoder
 from localization.logs.serialization import decoder
+from localization.logs.writer import odom_axes
 from localization.ros.transports.transport import Received
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Pose2
@@ -78,7 +79,7 @@ def utm_pose(datum: FloatArray) -> Pose2:
 
 @dataclass(frozen=True)
 class GeodeticMap:
-    """A map whose place on the earth is known, on the WGS84 ellipsoid."""
+    """A map whose place on the earth is known, on the WGS84 ellipsoid: h metres above it, distances are longer by h / 6.4e6."""
 
     datum: FloatArray
     """(2,) latitude and longitude of the plane's origin [deg]."""
@@ -104,9 +105,7 @@ class GeodeticMap:
 
     def covariance(self, cov: Cov3, yaw: float) -> FloatArray:
         """(2, 2) east and north [m^2], of a pose with ``yaw`` in the map whose right perturbation has covariance ``cov`` (3, 3)."""
-        c, s = math.cos(yaw + self.enu_T_map[2]), math.sin(yaw + self.enu_T_map[2])
-        R = np.array([[c, -s], [s, c]])
-        return np.asarray(R @ cov[:2, :2] @ R.T)
+        return odom_axes(cov, yaw + float(self.enu_T_map[2]))[:2, :2]
 
 
 def _earth_centred(degrees: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,6 +23,7 @@ from localization.logs.writer import odom_axes
 from localization.maps import KeyframeMap, SavedMap, SpaceMap, load_map, save_map
 from localization.maps.space_places import Places, make_places
 from localization.output import versions
+from localization.ros.gnss import GeodeticMap
 from localization.ros.payloads import Load, Payloads
 from localization.ros.settings import Names
 from localization.ros.start_pose import StartPose
@@ -259,21 +260,21 @@ class OperatorCommands:
 
     def from_ll(self, place: Any) -> ServiceReply:
         """Where in the map latitude and longitude of ``place`` (geographic_msgs/GeoPoint) are; not a number where that is not known."""
-        found = self._node.outputs.geodetic_map(self._node.session)
-        if found is None:
-            self._report(f"{_FROM_LL}: {_NOT_ON_EARTH}.")
-            return ServiceReply(False, _NOT_ON_EARTH, point=dict.fromkeys(("x", "y", "z"), math.nan))
-        x, y = found.from_geodetic(np.array([place.latitude, place.longitude])).tolist()
-        return ServiceReply(True, "", point={"x": x, "y": y, "z": 0.0})
+        degrees = np.array([place.latitude, place.longitude])
+        return self._on_earth(_FROM_LL, ("x", "y", "z"), lambda found: (*found.from_geodetic(degrees).tolist(), 0.0))
 
     def to_ll(self, point: Any) -> ServiceReply:
         """Latitude and longitude of ``point`` (geometry_msgs/Point) in the map; not a number where that is not known."""
+        at, names = np.array([point.x, point.y]), ("latitude", "longitude", "altitude")
+        return self._on_earth(_TO_LL, names, lambda found: (*found.to_geodetic(at).tolist(), math.nan))
+
+    def _on_earth(self, service: str, names: Sequence[str], convert: Callable[[GeodeticMap], Sequence[float]]) -> ServiceReply:
+        """What ``convert`` gives of the map's place on the earth, by ``names``."""
         found = self._node.outputs.geodetic_map(self._node.session)
         if found is None:
-            self._report(f"{_TO_LL}: {_NOT_ON_EARTH}.")
-            return ServiceReply(False, _NOT_ON_EARTH, point=dict.fromkeys(("latitude", "longitude", "altitude"), math.nan))
-        latitude, longitude = found.to_geodetic(np.array([point.x, point.y])).tolist()
-        return ServiceReply(True, "", point={"latitude": latitude, "longitude": longitude, "altitude": math.nan})
+            self._report(f"{service}: {_NOT_ON_EARTH}.")
+            return ServiceReply(False, _NOT_ON_EARTH, point=dict.fromkeys(names, math.nan))
+        return ServiceReply(True, "", point=dict(zip(names, convert(found), strict=True)))
 
     def pause(self, is_paused: bool) -> ServiceReply:
         """Use no messages and publish no estimates, or continue. Motion meanwhile is a gap in the wheels' data."""

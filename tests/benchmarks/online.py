@@ -164,7 +164,7 @@ def over_dds(
 ) -> OverDds:
     """A minute of ``path`` on DDS, with the node of ``tree``, once it has compiled; ``around`` gives the context for its process."""
     peer = start_peer(path, _DOMAIN)
-    state = folder / f"{estimator}_{len(list(folder.iterdir()))}.state"
+    state = Path(tempfile.mkdtemp(dir=folder)) / "state"
     node = start_node(_DOMAIN, "--estimator", estimator, "--node.wait-s", "1", "--state", str(state), tree=tree)
     assert node.stdout is not None
     for _ in ("listening", "waiting for topics, with everything compiled"):
@@ -395,7 +395,7 @@ def run_steps(log: Log, events: Sequence[Event], view: Dashboard | None) -> floa
     return time.process_time() - begin
 
 
-def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
+def main(part: str = "all", *options: str) -> None:
     if part in ("all", "steps"):
         steps()
     if part in ("all", "latency"):
@@ -407,10 +407,11 @@ def main(part: str = "all", hours: str = "10", beams: str = str(BEAMS)) -> None:
     if part in ("all", "quarter"):
         quarter()
     if part in ("all", "starved"):
-        starved(hours if part == "starved" and hours != "10" else "")
+        starved(*options)
     if part in ("all", "dashboard"):
         dashboard()
     if part in ("all", "soak"):
+        hours, beams = (*options, *("10", str(BEAMS))[len(options) :])
         soak(float(hours), int(beams))
 
 

@@ -137,8 +137,8 @@ def test_filtered_fixes_and_services_place_the_map_on_the_earth(outdoor_log):
     run_node(transport, "graph", config=NodeConfig(wait_s=0.0, predict=False, positions="fix", path_period_s=0.0, map_period_s=0.0))
     last = published(transport, FIX)[-1]
     truth = list(open_log(outdoor_log, ROBOT).references("/ground_truth/odom"))[-1]
-    centre, axes = np.radians([GpsConfig().latitude_deg, GpsConfig().longitude_deg]), np.radians([last.latitude, last.longitude])
-    off = east_north(*centre) @ (geodetic_to_ecef(*axes, 0.0) - geodetic_to_ecef(*centre, 0.0)) - truth.position
+    datum, place = np.radians([GpsConfig().latitude_deg, GpsConfig().longitude_deg]), np.radians([last.latitude, last.longitude])
+    off = east_north(*datum) @ (geodetic_to_ecef(*place, 0.0) - geodetic_to_ecef(*datum, 0.0)) - truth.position
     cov = last.position_covariance.reshape(3, 3)[:2, :2]
     assert off @ np.linalg.solve(cov, off) < 9.2  # 99 % of chi-squared of two
     assert np.sqrt(np.trace(cov)) < 0.3

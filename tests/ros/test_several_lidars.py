@@ -12,7 +12,8 @@ from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import reference_track
 from localization.events import Scan
 from localization.evidence.entrance import infer_set_up
-from localization.lidar.merged_sweep import MOUNT_COV, MountCorrection
+from localization.lidar import LidarConfig
+from localization.lidar.merged_sweep import MOUNT_COV, MergedSweeps, MountCorrection
 from localization.lidar_choice import LidarChoice
 from localization.log_replay import replay
 from localization.logs import TopicOverrides, open_log
@@ -198,6 +199,27 @@ def test_mount_that_changes_is_measured_anew_and_one_misfit_is_none():
     for _ in range(2):
         correction.update(turned, R, zero, (np.zeros(3), 1.0))
     assert not correction.is_known
+
+
+def test_points_of_a_known_mount_are_part_of_the_sweep_at_their_own_times():
+    """The rear scanner is described 1 deg off: its points come to where they are, 20 ms before those of the front one. Before its mount is
+    known they are left out, and it may not go on with the map of the other."""
+    points, front, rear = np.column_stack([np.linspace(1.0, 2.0, 20), np.full(20, 0.5), np.zeros(20)]), Mount(x=0.4), Mount(x=-0.4, yaw=3.0)
+    beside = Scan(980_000_000, points, np.zeros(20), "rear")
+    scan = Scan(1_000_000_000, points, np.zeros(20), "front", beside=(beside,))
+    merged = MergedSweeps({"front": front, "rear": rear}, LidarConfig())
+    np.testing.assert_allclose(merged.sweep(scan).points, np.add(points, [0.4, 0.0, 0.0]))
+    assert not merged.is_aligned("rear")
+    off, R = np.array([0.0, 0.0, math.radians(1.0)]), np.diag([1e-4, 1e-4, 1e-5]) ** 2
+    correction = merged.corrections["rear"]
+    correction.update(off, R, np.zeros((3, 3)), (np.zeros(3), 1.0))
+    while not correction.is_known:
+        correction.update(np.zeros(3), R, np.zeros((3, 3)), (np.zeros(3), 1.0))
+    assert merged.is_aligned("rear")
+    sweep, in_body = merged.sweep(scan), points @ rear.rotation.T + [-0.4, 0.0, 0.0]
+    np.testing.assert_allclose(sweep.times, np.repeat([0.0, -0.02], 20), atol=1e-12)
+    np.testing.assert_allclose(sweep.points[20:, :2], se2.transform(correction.pose, in_body[:, :2]))
+    assert correction.pose[2] == pytest.approx(math.radians(1.0), rel=0.3)
 
 
 @pytest.mark.extended
