@@ -78,6 +78,8 @@ class Residuals(NamedTuple):
     """Innovation of the matched scan's yaw by what all other measurements predict, and its variance [rad, rad^2]; None without a scan."""
     scan_way: tuple[float, float] | None = None
     """Innovation of the matched scan's way ahead, and its variance [m, m^2]."""
+    bias_sigma: float = 0.0
+    """Standard deviation of the gyro's bias by a prior that no rest has tested [rad/s]; 0 once one has."""
 
 
 class GyroCalibration(NamedTuple):

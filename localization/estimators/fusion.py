@@ -281,7 +281,8 @@ class EkfFusion(Estimator):
         by_corrections = last.motion.d_params @ self.noise.corrections.directions @ last.corrections
         file_delta = se2.retract(last.motion.delta, -by_corrections)
         turn, scan = None if last.turn is None else last.turn.component(0), last.scan
-        return Residuals(turn, file_delta, *((None, None) if scan is None else (scan.component(2), scan.component(0))))
+        scan_turn, scan_way = (None, None) if scan is None else (scan.component(2), scan.component(0))
+        return Residuals(turn, file_delta, scan_turn, scan_way, self._policies.standstill.bias_sigma)
 
     def learned_parameters(self) -> Sequence[LearnedParameter]:
         """The motion model's parameters that are corrected, and the wheels' radius where scans measure it, against the robot file."""

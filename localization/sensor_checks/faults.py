@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ _MIN_CONTRADICTING = 2.0 / 3.0
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
 _NS = 1e-9
+FAULT_LOG_ODDS, CERTAIN_LOG_ODDS = math.log(1e-3), math.log(99.0)
+"""Logarithms of the prior odds of a fault within a window, and of the posterior odds from which on it is reported."""
 
 
 class SensorFault(NamedTuple):

@@ -19,7 +19,7 @@ from motion_models.se2 import FloatArray
 
 BIN_S = 0.5
 WINDOWS_S = (2.0, 10.0, 60.0)
-_SLIP_S = 5.0
+SLIP_S = 5.0
 """Time for which half of what healthy sensors err by lasts, as slip does; the other half is of the whole window, as a floor is [s]."""
 _MIN_FILLED = 0.9
 """Part of a window that must have been measured."""
@@ -40,6 +40,11 @@ class Pair(NamedTuple):
     quantity: Literal["turns", "ways"]
     floor: float
     """Standard deviation over a window of what no model has [rad, m]."""
+
+    @property
+    def is_of_gyro(self) -> bool:
+        """Whether one of them is the gyro."""
+        return "gyro" in (self.first, self.second)
 
 
 class Cause(NamedTuple):
@@ -99,7 +104,7 @@ class InnovationWindow(NamedTuple):
         X = np.array([b.regressors for b in self.bins[1:]])
         end_s = np.array([b.end_s for b in self.bins[1:]])
         C = np.diag(variance) + (pair.floor / len(X)) ** 2
-        lasting = 0.5 + 0.5 * np.exp(-np.abs(end_s[:, None] - end_s) / _SLIP_S)
+        lasting = 0.5 + 0.5 * np.exp(-np.abs(end_s[:, None] - end_s) / SLIP_S)
         for regressor, sigma in usual.items():
             C += sigma**2 * np.outer(X[:, regressor], X[:, regressor]) * lasting
         weighted = np.linalg.solve(C, np.column_stack([X, innovation]))

@@ -25,13 +25,13 @@ _FLOOR_RAD = 0.01
 """Turn of a standing robot that no model has: tyres that relax, someone who leans on it [rad]."""
 _FLOOR_M = 0.02
 """Way of a standing robot that no model has, and by which a submap is off [m]: the noise of a range."""
-_K_SIGMA, _ROLLING_SIGMA = 0.4, 0.08
+K_SIGMA, _ROLLING_SIGMA = 0.4, 0.08
 """Sigma of the share by which a skid-steer's turns change with floor, speed and load, and of that by which rolling wheels' do with their
 radii and track: as where set-ups are inferred (`localization.evidence`)."""
 _SIDE_SLIP = 0.03
 """Sigma of the share by which the wheels of one side slip, for seconds: fr079's and ACES' turns err by .03 and .04 rad per metre (track .33
 and .5 m: 1 %), those of robots that skid by .12 (Husky, .57 m: 5 %)."""
-_WAY_SLIP, _CENTER_M = 0.05, 0.05
+WAY_SLIP, _CENTER_M = 0.05, 0.05
 """Sigma of the share by which both sides slip, and of the centre of rotation's place [m]: a way ahead of a LiDAR as the robot turns."""
 _OTHER = {"left": "right", "right": "left"}
 
@@ -92,9 +92,9 @@ def usual_errors(robot: Robot | None) -> Mapping[Pair, Mapping[int, float]]:
     """
     if robot is None:
         return {}
-    share = _ROLLING_SIGMA if robot.drive == DIFF_DRIVE else _K_SIGMA
+    share = _ROLLING_SIGMA if robot.drive == DIFF_DRIVE else K_SIGMA
     turns = {TURN: share, WAY: math.sqrt(2.0) * _SIDE_SLIP / robot.geometry.track_width_m}
-    return {GYRO_WHEELS: turns, LIDAR_WHEELS_TURNS: turns, LIDAR_WHEELS_WAYS: {WAY: _WAY_SLIP, TURN: _CENTER_M}}
+    return {GYRO_WHEELS: turns, LIDAR_WHEELS_TURNS: turns, LIDAR_WHEELS_WAYS: {WAY: WAY_SLIP, TURN: _CENTER_M}}
 
 
 CAUSES: Mapping[Pair, Causes] = {

@@ -16,7 +16,8 @@ from dataclasses import replace
 
 from localization.estimators import LearnedParameter
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.pairs import LIDAR_WHEELS_WAYS, NAMED
+from localization.sensor_checks.innovations import SLIP_S
+from localization.sensor_checks.pairs import LIDAR_WHEELS_WAYS, NAMED, WAY_SLIP
 
 SCALES_APART = SensorFault(
     "ways by the LiDAR are {percent:.0f} % {longer} than those by the wheels with this robot file's radius: its ranges are that much too"
@@ -40,8 +41,9 @@ class ScaleCheck:
     def __init__(self, faults: FaultLog) -> None:
         self._faults, self._most, self._reported = faults, math.inf, 0.0
 
-    def compare(self, radius: LearnedParameter) -> None:
-        """Take the wheels' ``radius`` as it is learned."""
+    def compare(self, radius: LearnedParameter, driven_s: float) -> None:
+        """Take the wheels' ``radius`` as it is learned in ``driven_s`` of driving [s]. Slip that lasts for seconds, which the filter takes
+        for white noise, moves it as well: what that explains is not reported."""
         if self._faults.declared and any(fault in self._faults.declared for fault in NAMED[LIDAR_WHEELS_WAYS]):
             self._faults.path = replace(self._faults.path, scale=0.0)
             self._faults.retract(SCALES_APART)
@@ -55,7 +57,8 @@ class ScaleCheck:
         is_off = max(_MIN_PRIOR_SIGMAS * radius.prior_sigma, _MIN_SIGMAS * sigma) < scale < _MAX_SCALE
         error = scale if is_off else _error_of_ranges(share * scale, radius)
         self._faults.path = replace(self._faults.path, scale=error)
-        if is_off and scale > _MIN_REPORTED_SIGMAS * sigma and round(scale, 2) != self._reported:
+        slip = WAY_SLIP * math.sqrt(0.5 * min(1.0, 2.0 * SLIP_S / max(driven_s, SLIP_S)))
+        if is_off and scale > _MIN_REPORTED_SIGMAS * math.hypot(sigma, slip) and round(scale, 2) != self._reported:
             self._reported = round(scale, 2)
             words = ("longer", "long", "larger") if off > 0.0 else ("shorter", "short", "smaller")
             numbers = dict(zip(("longer", "long", "larger"), words, strict=True))

@@ -12,9 +12,18 @@ from typing import NamedTuple
 
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
-from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.innovations import NO_REGRESSORS, TURN, TURN_CHANGE, InnovationWindows, Pair, add_step
-from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_TURNS, LIDAR_WHEELS_WAYS, NAMED, usual_errors
+from localization.sensor_checks.faults import CERTAIN_LOG_ODDS, FAULT_LOG_ODDS, DetectedFault, FaultLog, SensorFault
+from localization.sensor_checks.innovations import NO_REGRESSORS, SECONDS, TURN, TURN_CHANGE, InnovationWindows, Pair, add_step
+from localization.sensor_checks.pairs import (
+    CAUSES,
+    GYRO_WHEELS,
+    K_SIGMA,
+    LIDAR_GYRO,
+    LIDAR_WHEELS_TURNS,
+    LIDAR_WHEELS_WAYS,
+    NAMED,
+    usual_errors,
+)
 from localization.sensor_checks.reckoning import FILE, FILE_GYRO
 from localization.sensor_checks.scales import RADIUS, ScaleCheck
 from motion_models.robot import Robot
@@ -41,16 +50,9 @@ _NAMED_WITHIN_S = 10.0
 _MAX_SIGMAS = 4.5
 """Largest sum of innovations over a window, in sigmas: 7e-6 by chance, one of 60 hours. Largest of healthy drives: gyro and wheels 4.0 (six
 simulated robots; Husky outdoors 1.0), LiDAR and gyro 3.3, ways by LiDAR and wheels 3.1 (ACES), turns by both 1.0 (ACES)."""
-_FAULT_ODDS, _CERTAIN_ODDS = math.log(1e-3), math.log(99.0)
-"""Logarithms of the prior odds of a fault within a window, and of the posterior odds from which on it is reported."""
-_MIN_LEARNED_SIGMAS = 4.0
-"""Distance of a learned parameter from the robot file's, in its own sigmas."""
-_MIN_PRIOR_SIGMAS = 3.0
-"""Distance of a learned parameter from the robot file's, in sigmas of its prior."""
-_MIN_TURNING_SIGMAS, _MIN_TURNING_SHARE = 1.4, 0.18
-"""Factors on turns stand for the gyro's scale as well, whose prior is far narrower: they count from so many sigmas of the prior
-on, and from this share of the file's value. ACES, fr079, CSAIL and the Husky outdoors have 0.2 sigmas and 3 %, simulated robots 11 %
-(two wheels, and a caster that drags)."""
+_DOUBTED_SIGMAS, _FAULT_FACTOR = 1.645, 10.0
+"""A robot file's value outside of its prior's 90 % interval is not relied on. Where something is wrong with a learned parameter, it is off
+by ten times what it is off by in healthy robots."""
 _CENTER_X = "x_cr"
 """Centre of rotation ahead of base_link, which in turns moves a LiDAR to the side as its own place ahead does."""
 _MULTIPLIER = "wheel_separation_multiplier"
@@ -96,12 +98,12 @@ class SensorConsistency:
     def __init__(self, faults: FaultLog, robot: Robot | None = None) -> None:
         """``robot``: whose wheels slip as its drive's do, and whose file may not have all parameters; None where nothing is unknown."""
         self._faults, self._clipping, self._scales = faults, _Clipping(), ScaleCheck(faults)
-        self._models = None if robot is None else {name: list(values) for name, values in robot.models.items()}
         self._usual = usual_errors(robot)
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._reckoning = faults.inflation.reckoning
         self._totals = NO_REGRESSORS
         self._has_moved = False
+        self._driven_s = self._bias_sigma = 0.0
         self._matched_s = -math.inf
         self._episodes: dict[SensorFault, _Episode] = {}
         self._reported: dict[SensorFault, _Reported] = {}
@@ -109,6 +111,8 @@ class SensorConsistency:
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
         self._has_moved |= not step.is_standing
+        self._driven_s += 0.0 if step.is_standing else step.duration
+        self._bias_sigma = residuals.bias_sigma
         self._totals = add_step(self._totals, step)
         if not self._has_moved:
             return  # before the first motion, the bias is measured
@@ -159,10 +163,13 @@ class SensorConsistency:
         if self._is_explained(fault, NAMED[pair]) or worst is None or worst.sigmas < (_MAX_CLIPPED_SIGMAS if is_clipped else _MAX_SIGMAS):
             self._end(fault)
             return
-        best = worst.explain(pair, CAUSES[pair], self._usual.get(pair, {}))
+        usual = dict(self._usual.get(pair, {}))
+        if self._bias_sigma and pair.is_of_gyro:
+            usual[SECONDS] = self._bias_sigma
+        best = worst.explain(pair, CAUSES[pair], usual)
         regressor, cause = best.regressor, best.sentence
         if regressor == TURN:
-            unset = [p for p in learned() if p.name == _MULTIPLIER and not self._is_declared(p)]
+            unset = [p for p in learned() if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value]
             cause += "".join(_PLAIN_MODEL.format(model=p.owner) for p in unset)
         if is_clipped:
             regressor, cause = TURN, self._clipping.describe()
@@ -173,32 +180,38 @@ class SensorConsistency:
         episode = self._episodes[fault] = _Episode(begin_s, poses, row, is_by_lidar)
         unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
         numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
-        if is_clipped or best.log_odds + _FAULT_ODDS > _CERTAIN_ODDS:  # what floors do as well is no fault of a sensor
+        if is_clipped or best.log_odds + FAULT_LOG_ODDS > CERTAIN_LOG_ODDS:  # what floors do as well is no fault of a sensor
             self._report(fault, episode, worst.sigmas if is_clipped else best.sigmas, numbers)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
         """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""
         if learned and learned[0].name == RADIUS:
-            self._scales.compare(learned[0])
+            self._scales.compare(learned[0], self._driven_s)
             learned = learned[1:]
-        off = _farthest([p for p in learned if self._is_declared(p)])
-        if off is None or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
+        doubted = [p for p in learned if _is_doubted(p)]
+        if not doubted or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
             self._end(PARAMETER_FAR)
             return
         bins = next(window.bins for window in self._windows.values() if window.bins)
         episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
+        off = max(doubted, key=self._evidence)
+        if self._evidence(off) + FAULT_LOG_ODDS < CERTAIN_LOG_ODDS:  # floors and loads do as much
+            return
         numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
         ahead_m = off.value - off.file_value
         far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
         numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
         self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
 
-    def _is_declared(self, parameter: LearnedParameter) -> bool:
-        """Whether the robot file has a value that what was learned contradicts. Without one, factors on turns are what is to be learned."""
-        name = parameter.name
-        if name == _MULTIPLIER:  # 1 where nobody has set it, of a robot that slides as it turns
-            return not parameter.file_value == 1.0 < parameter.value
-        return self._models is None or name not in _TURNING or name in self._models.get(parameter.owner, [])
+    def _evidence(self, p: LearnedParameter) -> float:
+        """Logarithm of the evidence that something is wrong with ``p``, over that for a healthy robot: Bayes factor of two normal
+        distributions of what is measured. Turns vary with the floor by what is usual for the drive, and with a multiplier of 1,
+        which nobody has set, by that of any drive."""
+        off, noise = _measured(p)
+        usual = K_SIGMA if p.name == _MULTIPLIER and p.file_value == 1.0 else self._usual.get(GYRO_WHEELS, {}).get(TURN, 0.0)
+        healthy = max(p.prior_sigma, usual * abs(p.file_value) if p.name in _TURNING else 0.0) ** 2
+        ratio = (healthy + noise) / (_FAULT_FACTOR**2 * healthy + noise)
+        return 0.5 * off**2 / (healthy + noise) * (1.0 - ratio) + 0.5 * math.log(ratio)
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
@@ -246,17 +259,16 @@ def _innovations(step: Step, residuals: Residuals) -> Sequence[tuple[Pair, tuple
     return (GYRO_WHEELS, residuals.turn if step.has_wheels else None), (LIDAR_GYRO, residuals.scan_turn), ways
 
 
-def _farthest(learned: Sequence[LearnedParameter]) -> LearnedParameter | None:
-    """The parameter that is farthest from the robot file, if it is too far by its own sigma and by that of its prior."""
+def _measured(p: LearnedParameter) -> tuple[float, float]:
+    """Difference of ``p`` from the robot file by the measurements alone, without its prior, and its variance."""
+    share = 1.0 - (p.sigma / p.prior_sigma) ** 2 if p.prior_sigma else 0.0  # of its information
+    return ((p.value - p.file_value) / share, p.sigma**2 / share) if share > 0.0 else (0.0, math.inf)
 
-    def distance(p: LearnedParameter) -> float:
-        least = max(_MIN_PRIOR_SIGMAS * p.prior_sigma, _MIN_LEARNED_SIGMAS * p.sigma)
-        if p.name in _TURNING:
-            least = max(_MIN_TURNING_SIGMAS * p.prior_sigma, _MIN_TURNING_SHARE * abs(p.file_value), _MIN_LEARNED_SIGMAS * p.sigma)
-        return abs(p.value - p.file_value) / least if least else 0.0
 
-    far = max(learned, key=distance, default=None)
-    return far if far is not None and distance(far) > 1.0 else None
+def _is_doubted(p: LearnedParameter) -> bool:
+    """Whether the robot file's value is not within its prior's 90 % interval of what is measured."""
+    off, noise = _measured(p)
+    return abs(off) > _DOUBTED_SIGMAS * math.sqrt(p.prior_sigma**2 + noise)
 
 
 class _Clipping:

@@ -14,13 +14,13 @@ from tests.helpers.event_faults import change_wheels, multiply_wheels, scale_ran
 from tests.helpers.extended import cases
 from tests.helpers.fault_drives import in_room, run, without_lidar
 
-PRIOR = 0.03
+PRIOR, LONG_S = 0.03, 7200.0
 
 
-def learn(check: ScaleCheck, truth: float, sigma: float) -> None:
+def learn(check: ScaleCheck, truth: float, sigma: float, driven_s: float = LONG_S) -> None:
     """A radius measured as ``truth`` with ``sigma``, and the prior."""
     variance = 1.0 / (1.0 / PRIOR**2 + 1.0 / sigma**2)
-    check.compare(LearnedParameter("wheel_radius_scale", truth * variance / sigma**2, float(np.sqrt(variance)), 0.0, PRIOR))
+    check.compare(LearnedParameter("wheel_radius_scale", truth * variance / sigma**2, float(np.sqrt(variance)), 0.0, PRIOR), driven_s)
 
 
 @pytest.fixture
@@ -57,6 +57,13 @@ def test_radius_that_changes_on_the_way_is_no_scale_of_ranges(faults: FaultLog) 
         learn(check, truth, 0.01)
     assert faults.path.scale < 0.01  # what was possible before
     assert SCALES_APART not in faults.found
+
+
+@pytest.mark.parametrize(("driven_s", "is_found"), [(10.0, False), (300.0, True)])
+def test_slip_of_seconds_is_no_scale_of_ranges(faults: FaultLog, driven_s: float, is_found: bool) -> None:
+    """Both sides slip by 5 % for seconds: a way of a few such spells is off by some percent, that of many is not."""
+    learn(ScaleCheck(faults), 0.08, 0.01, driven_s)
+    assert (SCALES_APART in faults.found) == is_found
 
 
 def test_scale_that_a_named_fault_explains_is_reported_no_more(faults: FaultLog) -> None:

@@ -15,16 +15,17 @@ BIAS_CHANGE_COV = np.diag([1e-12, 1e-16])
 """Covariance of "bias_change", a variable that is what the bias has changed by since the last rest, as a constant and a slope. It is small
 against that of any gyro's bias, and the variable is never estimated: its correlations are what a change does to the other variables
 [rad^2/s^2, rad^2/s^4]."""
-_BIAS_PRIORS = ((0.8, 1.0, 0.0), (0.2, 0.0, 1.75e-2))
+_BIAS_PRIORS = ((0.8, 1.0, 0.0), (0.15, 0.0, 1.75e-2), (0.05, 0.0, 4.4e-2))
 """Hypotheses on a bias that no rest has measured: prior probability, sigma over that of the robot file, and sigma [rad/s]. Drivers that
-zero their gyro at switch-on have the robot file's; the others the sensor's own, 1 deg/s in data sheets of MEMS gyros (BMI088)."""
+zero their gyro at switch-on have the robot file's; the others the sensor's own: 1 deg/s in data sheets of MEMS gyros (BMI088), and a
+tolerance of 5 deg/s, taken for two sigmas, in those of the cheapest (MPU-9250)."""
 _AT_REST = 0.97
 """Prior probability that a robot whose wheels read zero is at rest, and least posterior to use that."""
 _CHANGE = 0.1, 3.5e-2
 """Prior probability that the bias has changed since the rest before, beyond its random walk, and sigma of the change [rad/s]: twice a MEMS
 gyro's offset."""
 _MIN_REPORTED = 3.0
-"""A change is a fault from this many of the robot file's sigmas of the bias on: drivers that zero their gyro leave less."""
+"""A change may be a fault from this many of the robot file's sigmas of the bias on: drivers that zero their gyro leave less."""
 _MAX_RATE_RAD_S, _CONSTANT = 1.0, 0.1
 """Rates of a robot that is turned with its wheels at rest are uniform up to this [rad/s]. Those on a turntable are constant, which is this
 share of them; those of one that rolls or is carried vary."""
@@ -55,12 +56,26 @@ class BiasChange(NamedTuple):
     """Stamp at which it is found."""
     rate: float
     """By how much [rad/s]."""
+    log_evidence: float
+    """Logarithm of the likelihood of a change over that of none."""
+
+
+class _Bias(NamedTuple):
+    """A hypothesis on the bias."""
+
+    share: float
+    """Prior probability."""
+    mean: float
+    """[rad/s]"""
+    variance: float
+    """[rad^2/s^2]"""
 
 
 class StandstillTest:
     """`add` each step. A standstill is a time of zero wheels; by Bayes' rule on the gyro's turns in it, with their own scatter for noise:
 
-    - at rest, the turns are those of one bias, which has the filter's variance, in the first rest one of `_BIAS_PRIORS`, or has changed;
+    - at rest, the turns are those of one bias, which has the filter's variance, in the first rest one of `_BIAS_PRIORS`, or has changed, or
+      is what the gyro read in the last standstill, as probably as that was a rest;
     - moved, they are those of any rate, constant as on a turntable, or varying as of a robot that rolls or is carried.
 
     A gyro that never scatters tells nothing about its noise: the robot file's is taken. Vibration scatters, and is no motion.
@@ -74,8 +89,11 @@ class StandstillTest:
         self.change: BiasChange | None = None
         """The last one that is a fault."""
         self._priors = [(share, factor * bias_sigma + sigma) for share, factor, sigma in _BIAS_PRIORS]
+        self.bias_sigma = math.sqrt(sum(share * sigma**2 for share, sigma in self._priors))
+        """Standard deviation of the bias by a prior that no rest has tested [rad/s]; 0 once one has."""
         self._turns: list[tuple[float, float, float]] = []  # angle, time, variance of each step of the standstill
         self._bias = 0.0, 0.0  # mean and variance at its begin
+        self._unsure: _Bias | None = None  # of the last standstill, where that may have been a rest
         self._stood_s = 0.0
         self._is_prior_tested = False
         self._rest = 0.0  # probability
@@ -105,8 +123,8 @@ class StandstillTest:
         ``state``: at the start of the step."""
         self.since_rest_s = 0.0 if self.is_at_rest else self.since_rest_s + step.duration
         if not step.is_standing or not step.has_wheels or step.turn is None or step.duration <= 0.0:
-            self._is_prior_tested |= self.is_at_rest
-            self._turns.clear()
+            if self._turns:
+                self._end_standstill()
             self._rest = self._stood_s = self._angle = 0.0
             self._is_moved = False
             return step, None
@@ -130,29 +148,50 @@ class StandstillTest:
         """Set the probability of rest; return the bias, where rest is found now, or another prior holds than the filter has."""
         if not self._is_long:
             return None
-        angle, seconds, _ = np.array(self._turns).sum(axis=0).tolist()
-        rate, noise = angle / seconds, self._density() / seconds
-        (mean, variance), (share, sigma) = self._bias, _CHANGE
-        biases = [(1.0 - share, mean, variance), (share, mean, variance + sigma**2)]
-        if not self._is_prior_tested:
-            (share, _), *others = self._priors
-            biases = [(share, *self._bias), *((share, 0.0, sigma**2) for share, sigma in others)]
-        likelihoods = [share * _normal(rate - mean, cov + noise) for share, mean, cov in biases]
+        rate, noise = self._rate()
+        biases = self._biases()
+        likelihoods = [b.share * _normal(rate - b.mean, b.variance + noise) for b in biases]
         at_rest = _AT_REST * sum(likelihoods)
         moved = (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S * (_CONSTANT + (1.0 - _CONSTANT) * math.exp(self._variation(rate)))
         was_at_rest, self._rest = self.is_at_rest, at_rest / (at_rest + moved)
         best = int(np.argmax(likelihoods))
         if not self.is_at_rest or (was_at_rest and best == 0):
             return None
+        self.bias_sigma = 0.0
         if not best:
             return BiasAtRest(0.0, 0.0, rate, noise)
         is_first, change = not self._is_prior_tested, rate - self._bias[0]
         self._is_prior_tested, self._bias = True, (rate, noise)
         if is_first:
-            return BiasAtRest(biases[best][2], 0.0, rate, noise)
+            return BiasAtRest(max(biases[best].variance, change**2), 0.0, rate, noise)
         if abs(change) > _MIN_REPORTED * self._bias_sigma:
-            self.change = BiasChange(now_ns, change)
+            evidence = likelihoods[best] / biases[best].share * biases[0].share / max(likelihoods[0], 1e-300)
+            self.change = BiasChange(now_ns, change, math.log(evidence))
         return BiasAtRest(0.0, change**2, rate, noise)
+
+    def _biases(self) -> list[_Bias]:
+        """Hypotheses on the bias in this standstill, that of the filter first."""
+        share, sigma = _CHANGE
+        mean, variance = self._bias
+        biases = [_Bias(1.0 - share, mean, variance), _Bias(share, mean, variance + sigma**2)]
+        if not self._is_prior_tested:
+            (share, _), *others = self._priors
+            biases = [_Bias(share, mean, variance), *(_Bias(share, 0.0, sigma**2) for share, sigma in others)]
+        unsure = self._unsure
+        return biases if unsure is None else [*(b._replace(share=b.share * (1.0 - unsure.share)) for b in biases), unsure]
+
+    def _end_standstill(self) -> None:
+        """Keep what a standstill that may have been a rest would know of the bias."""
+        if self._is_long:
+            self._is_prior_tested |= self.is_at_rest
+            is_unsure = 1.0 - _AT_REST < self._rest <= _AT_REST
+            self._unsure = _Bias(self._rest, *self._rate()) if is_unsure else None
+        self._turns.clear()
+
+    def _rate(self) -> tuple[float, float]:
+        """Mean of the gyro's rate in this standstill [rad/s], and its variance [rad^2/s^2]."""
+        angle, seconds, _ = np.array(self._turns).sum(axis=0).tolist()
+        return angle / seconds, self._density() / seconds
 
     def _density(self) -> float:
         """Variance of the turns of this standstill, by the scatter in all of it [rad^2/s]."""
