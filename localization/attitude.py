@@ -152,6 +152,11 @@ class AttitudeFilter:
         return self._ground.is_certain
 
     @property
+    def is_open(self) -> bool:
+        """Whether the ground may tilt, or an IMU that sits askew makes it look so."""
+        return self._ground.is_open
+
+    @property
     def up(self) -> FloatArray:
         """(3,) the vertical in body axes; the body's z axis where it is not known."""
         return self._sums.state[:3].copy() if self.has_attitude else np.array([0.0, 0.0, 1.0])

@@ -2,8 +2,8 @@
 
 A mount that is off looks like a slope, but stays with the body, while a slope turns against it and changes with the way: both are the
 states of a slow filter, whose measurement is their sum, the tilt by the attitude. Mounts in robot files are right within a degree or two,
-or the IMU sits askew and the file does not have it: a bank of two filters, whose measurements decide between them (Bar-Shalom, Li and
-Kirubarajan 2001, sec. 11.6, the static multiple-model estimator).
+or the IMU sits askew and the file does not have it; and floors are level, while hills are not: a bank of four filters, whose measurements
+decide between them (Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6, the static multiple-model estimator).
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ _LEVEL = math.tan(math.radians(3.0))
 """Tilt up to which the ground counts as level: a Husky outdoors is level within 1.8 deg, and mounts are known to a degree or two."""
 _CERTAIN = 3.5
 """Sigmas at which the ground counts as tilted."""
-_GROUND_SIGMA = math.radians(6.0)
-"""Sigma of the slope of hills (median 5.8 deg, 95 % below 10.7)."""
 _HILL_M = 5.0
 """Way over which a slope changes."""
 _LASTING = 2.0
 """For how many windows errors of the vertical last."""
 
 
-class _Mount(NamedTuple):
-    """How far the IMU's mount may be off [rad], and the probability of that before anything is measured."""
+class _Sigma(NamedTuple):
+    """How large a slope is [rad], and the probability of that before anything is measured."""
 
     sigma: float
     prior: float
 
 
-_MOUNTS = (_Mount(math.radians(1.2), 0.95), _Mount(math.radians(10.0), 0.05))
-"""One that is as the robot file has it, and one that is not, of one robot in twenty by judgement."""
+_MOUNTS = (_Sigma(math.radians(1.2), 0.95), _Sigma(math.radians(10.0), 0.05))
+"""Errors of an IMU's mount that is as the robot file has it, and of one that is not, of one robot in twenty by judgement."""
+_GROUNDS = (_Sigma(math.radians(1.0), 0.5), _Sigma(math.radians(6.0), 0.5))
+"""Slopes of floors and yards, and of hills (median 5.8 deg, 95 % below 10.7), on which every second robot drives by judgement."""
+_BANK = [(mount, ground) for mount in _MOUNTS for ground in _GROUNDS]
 
 
 class GroundTilt:
     """`restart` with each first vertical, then `update` by each measured one."""
 
     def __init__(self) -> None:
-        self._means = np.zeros((len(_MOUNTS), 4))
-        self._covs = np.array([np.diag([mount.sigma**2] * 2 + [_GROUND_SIGMA**2] * 2) for mount in _MOUNTS])
-        self._log_weights = np.log([mount.prior for mount in _MOUNTS])
+        self._means = np.zeros((len(_BANK), 4))
+        self._covs = np.array([np.diag([mount.sigma**2] * 2 + [ground.sigma**2] * 2) for mount, ground in _BANK])
+        self._log_weights = np.log([mount.prior * ground.prior for mount, ground in _BANK])
         self._mean, self._cov = np.zeros(4), np.zeros((4, 4))
         self._mix()
         self.is_certain = False
@@ -74,38 +75,43 @@ class GroundTilt:
 
     @property
     def probabilities(self) -> FloatArray:
-        """(2,) of `_MOUNTS`."""
+        """(2, 2) of `_MOUNTS` and `_GROUNDS`."""
         weights = np.exp(self._log_weights - self._log_weights.max())
-        return np.asarray(weights / weights.sum())
+        return np.asarray(weights / weights.sum()).reshape(len(_MOUNTS), len(_GROUNDS))
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the ground may tilt, and whether it does is not certain."""
+        return not self.is_certain and bool(np.hypot(*self.ground) > _LEVEL)
 
     def restart(self) -> None:
         """The ground is another one: nothing is known of its tilt."""
         self._covs[:, 2:] = self._covs[:, :, 2:] = 0.0
-        self._covs[:, 2, 2] = self._covs[:, 3, 3] = _GROUND_SIGMA**2
+        self._covs[:, 2, 2] = self._covs[:, 3, 3] = [ground.sigma**2 for _, ground in _BANK]
         self._mix()
 
     def update(self, downhill: FloatArray, cov: FloatArray, turn: float, way: float) -> None:
         """Update by the measured ``downhill`` slope (2,) of mount and ground together and its ``cov`` (2, 2), after ``turn`` [rad] and
         ``way`` [m]."""
-        for i in range(len(_MOUNTS)):
-            self._log_weights[i] += _separate(self._means[i], self._covs[i], downhill, cov, turn, way) / _LASTING
+        for i, (_, ground) in enumerate(_BANK):
+            self._log_weights[i] += _separate(ground.sigma, self._means[i], self._covs[i], downhill, cov, turn, way) / _LASTING
         self._mix()
         square = float(self.ground @ np.linalg.solve(self.ground_cov, self.ground))
         is_shown = bool(np.hypot(*self.ground) > _LEVEL and square > _CERTAIN**2)
-        self.is_certain = is_shown or (self.is_certain and bool(self.probabilities[0] > 0.5))
+        self.is_certain = is_shown or (self.is_certain and bool(self.probabilities[0].sum() > 0.5))
 
     def _mix(self) -> None:
         """Mean and covariance of the mixture."""
-        p = self.probabilities
+        p = self.probabilities.ravel()
         self._mean = p @ self._means
         off = self._means - self._mean
         self._cov = np.einsum("h,hij->ij", p, self._covs + off[:, :, None] * off[:, None, :])
 
 
 @kernel
-def _separate(mean: FloatArray, cov: FloatArray, downhill: FloatArray, own: FloatArray, turn: float, way: float) -> float:
-    """See `GroundTilt.update`: ``mean`` (4,) and ``cov`` (4, 4) change in place; ``own`` (2, 2) is the measurement's. Returns the log
-    likelihood of the measurement."""
+def _separate(sigma: float, mean: FloatArray, cov: FloatArray, downhill: FloatArray, own: FloatArray, turn: float, way: float) -> float:
+    """See `GroundTilt.update`: ``sigma`` is of the ground's slope [rad]; ``mean`` (4,) and ``cov`` (4, 4) change in place; ``own`` (2, 2)
+    is the measurement's. Returns the log likelihood of the measurement."""
     c, s = math.cos(turn), math.sin(turn)
     fade = math.exp(-way / _HILL_M)
     move = np.eye(4)
@@ -114,7 +120,7 @@ def _separate(mean: FloatArray, cov: FloatArray, downhill: FloatArray, own: Floa
     mean[2] = move[2, 2] * before[2] + move[2, 3] * before[3]
     mean[3] = move[3, 2] * before[2] + move[3, 3] * before[3]
     propagate_in_place(move, cov)
-    new = _GROUND_SIGMA * _GROUND_SIGMA * (1.0 - fade * fade)
+    new = sigma * sigma * (1.0 - fade * fade)
     cov[2, 2] += new
     cov[3, 3] += new
     found, gain, log_likelihood = np.zeros(4), np.empty(4), 0.0

@@ -29,6 +29,10 @@ class GroundHits:
         self._mounts = mounts
         self._points, self._left_out = 0, 0
         self._nearest_m, self._frame = math.inf, ""
+        self.has_begun = False
+        """Whether points were left out so far: scans before that may have drawn the ground."""
+        self.held = 0
+        """Scans that were left out, as it was not known whether the ground tilts."""
 
     def leave_out(self, scan: Scan, curvature: float) -> Scan:
         """``scan``, and those beside it, without the points that ground of this root mean square ``curvature`` [1/m] may reach. Clouds stay
@@ -40,17 +44,25 @@ class GroundHits:
             return scan
         mount, rise = self._mounts.get(scan.frame_id, Mount()), 0.5 * _SIGMAS * curvature
         x, y, z = (scan.points @ mount.rotation.T + (mount.x, mount.y, mount.z)).T
+        self.has_begun = True
         above = replace(scan.select(z > rise * (x * x + y * y)), beside=tuple(self.leave_out(other, curvature) for other in scan.beside))
         self._left_out += len(scan.points) - len(above.points)
         self._nearest_m, self._frame = min(self._nearest_m, math.sqrt(max(mount.z, 0.0) / rise)), scan.frame_id
         return above
 
     def warnings(self) -> list[str]:
-        """A sentence where many points were left out."""
+        """Sentences where scans, or many points, were left out."""
+        found = []
+        if self.held:
+            found.append(
+                f"{self.held} scans of a planar LiDAR were left out, until the way had shown whether the ground tilts or the IMU sits "
+                "askew. Publish how the IMU is mounted in /tf_static, or begin on level ground."
+            )
         if self._left_out <= _REPORTED_SHARE * self._points:
-            return []
+            return found
         return [
+            *found,
             f"on hills the beams of the planar scanner '{self._frame}' may hit the ground from {self._nearest_m:.1f} m on: since "
             f"the ground was found to tilt, {100.0 * self._left_out / self._points:.0f} % of its points are not used. Use a 3D "
-            "LiDAR there, or mount the scanner higher."
+            "LiDAR there, or mount the scanner higher.",
         ]

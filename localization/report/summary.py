@@ -61,7 +61,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         return [*contradictions, ending, *losses]
     if reference is None or best is None:
         line = _most_informed(lines)
-        return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}")]
+        return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}"), *_doubts(lines)]
     of_point = ""
     if (lever := _lever(lines, reference)) is not None and isinstance(reference, ReferenceTrack):
         of_base = best.error
@@ -78,6 +78,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         *_coverage(best),
         *_consistency(best),
         *(_left_out(best.result) or _exactness(best, reference)),
+        *_doubts(lines),
         *_visibility(best, reference),
         *_by_errors(best, reference),
         *_advice(lines, best, equals, reference),
@@ -242,6 +243,11 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
         return [f"Part of the way is without the LiDAR in {join_words(parts)}; the errors include that.", *advice]
     parts = [f"{line.words}: {losses.summary}" for line, losses in lost if losses is not None]
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
+
+
+def _doubts(lines: Sequence[PlottedRun]) -> list[str]:
+    """Why covariances are wide, without a fault."""
+    return [f"{line.words}: {doubt}" for line in lines for doubt in line.result.run.doubts]
 
 
 def _as_published(best: PlottedRun) -> list[str]:

@@ -194,6 +194,10 @@ class SensorChecks:
         """Problems so far."""
         return [*self._steps.tilt.warnings(), *self._faults.warnings()]
 
+    def doubts(self) -> list[str]:
+        """See `SensorConsistency.doubts`."""
+        return self._consistency.doubts()
+
     @property
     def found(self) -> Mapping[SensorFault, DetectedFault]:
         """Faults so far."""

@@ -25,14 +25,18 @@ _FLOOR_RAD = 0.01
 """Turn of a standing robot that no model has: tyres that relax, someone who leans on it [rad]."""
 _FLOOR_M = 0.02
 """Way of a standing robot that no model has, and by which a submap is off [m]: the noise of a range."""
-K_SIGMA, _ROLLING_SIGMA = 0.4, 0.08
-"""Sigma of the share by which a skid-steer's turns change with floor, speed and load, and of that by which rolling wheels' do with their
-radii and track: as where set-ups are inferred (`localization.evidence`)."""
+K_SIGMA = 0.4
+"""Sigma of the share by which a skid-steer's turns change with floor, speed and load: as where set-ups are inferred
+(`localization.evidence`)."""
+_ROLLING_SIGMA = 0.08
+"""Sigma of the share by which rolling wheels' turns change with their radii and track: as there."""
 _SIDE_SLIP = 0.03
 """Sigma of the share by which the wheels of one side slip, for seconds: fr079's and ACES' turns err by .03 and .04 rad per metre (track .33
 and .5 m: 1 %), those of robots that skid by .12 (Husky, .57 m: 5 %)."""
-WAY_SLIP, _CENTER_M = 0.05, 0.05
-"""Sigma of the share by which both sides slip, and of the centre of rotation's place [m]: a way ahead of a LiDAR as the robot turns."""
+WAY_SLIP = 0.05
+"""Sigma of the share by which both sides slip."""
+_CENTER_M = 0.05
+"""Sigma of the centre of rotation's place [m]: a way ahead of a LiDAR as the robot turns."""
 _OTHER = {"left": "right", "right": "left"}
 
 

@@ -41,6 +41,15 @@ PARAMETER_FAR = SensorFault(
     "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or"
     " load, {cause}. {use} Fit the file with `skidloc calibrate`.",
 )
+_DOUBT = "From t = {at_s:.1f} s on the covariance has the distance from the dead reckoning by the robot file: {what}."
+_PAIR_IN_DOUBT = (
+    "{quantity} by the {first} and those by the {second} differ by {difference} in {seconds:.0f} s, as on some floors, and no scan shows"
+    " which are right"
+)
+_PARAMETER_IN_DOUBT = (
+    "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, where the file has {file:.3g}, and no scan shows whether another floor or"
+    " load does that, or a gyro or encoders of another scale"
+)
 _TURNING_CAUSE = (
     "a wrong scale of the gyro, encoders that lose counts, or a driver's odometry with another track or wheel_separation_multiplier than in"
     " [driver]"
@@ -107,6 +116,12 @@ class SensorConsistency:
         self._matched_s = -math.inf
         self._episodes: dict[SensorFault, _Episode] = {}
         self._reported: dict[SensorFault, _Reported] = {}
+        self._doubts: dict[SensorFault, tuple[float, str]] = {}
+
+    def doubts(self) -> list[str]:
+        """Why the covariance has more than the sensors' noise, though no fault is probable enough to be reported."""
+        reported = self._faults.found
+        return [_DOUBT.format(at_s=max(at_s, 0.0), what=what) for fault, (at_s, what) in self._doubts.items() if fault not in reported]
 
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
@@ -182,6 +197,9 @@ class SensorConsistency:
         numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
         if is_clipped or best.log_odds + FAULT_LOG_ODDS > CERTAIN_LOG_ODDS:  # what floors do as well is no fault of a sensor
             self._report(fault, episode, worst.sigmas if is_clipped else best.sigmas, numbers)
+        elif self._is_inflating(episode):
+            words = {"quantity": pair.quantity, "first": pair.first, "second": pair.second}
+            self._doubts[fault] = begin_s, _PAIR_IN_DOUBT.format(**words, difference=unit, seconds=worst.seconds)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
         """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""
@@ -195,23 +213,24 @@ class SensorConsistency:
         bins = next(window.bins for window in self._windows.values() if window.bins)
         episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
         off = max(doubted, key=self._evidence)
-        if self._evidence(off) + FAULT_LOG_ODDS < CERTAIN_LOG_ODDS:  # floors and loads do as much
-            return
         numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
         ahead_m = off.value - off.file_value
         far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
         numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
-        self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
+        if self._evidence(off) + FAULT_LOG_ODDS > CERTAIN_LOG_ODDS:
+            self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
+        elif self._is_inflating(episode):
+            self._doubts[PARAMETER_FAR] = episode.begin_s, _PARAMETER_IN_DOUBT.format(**numbers)
 
     def _evidence(self, p: LearnedParameter) -> float:
         """Logarithm of the evidence that something is wrong with ``p``, over that for a healthy robot: Bayes factor of two normal
-        distributions of what is measured. Turns vary with the floor by what is usual for the drive, and with a multiplier of 1,
-        which nobody has set, by that of any drive."""
-        off, noise = _measured(p)
+        distributions of what was learned, which the prior keeps near the file. Turns vary with the floor by what is usual for the drive,
+        and with a multiplier of 1, which nobody has set, by that of any drive."""
         usual = K_SIGMA if p.name == _MULTIPLIER and p.file_value == 1.0 else self._usual.get(GYRO_WHEELS, {}).get(TURN, 0.0)
         healthy = max(p.prior_sigma, usual * abs(p.file_value) if p.name in _TURNING else 0.0) ** 2
+        noise = p.sigma**2
         ratio = (healthy + noise) / (_FAULT_FACTOR**2 * healthy + noise)
-        return 0.5 * off**2 / (healthy + noise) * (1.0 - ratio) + 0.5 * math.log(ratio)
+        return 0.5 * (p.value - p.file_value) ** 2 / (healthy + noise) * (1.0 - ratio) + 0.5 * math.log(ratio)
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
@@ -259,16 +278,9 @@ def _innovations(step: Step, residuals: Residuals) -> Sequence[tuple[Pair, tuple
     return (GYRO_WHEELS, residuals.turn if step.has_wheels else None), (LIDAR_GYRO, residuals.scan_turn), ways
 
 
-def _measured(p: LearnedParameter) -> tuple[float, float]:
-    """Difference of ``p`` from the robot file by the measurements alone, without its prior, and its variance."""
-    share = 1.0 - (p.sigma / p.prior_sigma) ** 2 if p.prior_sigma else 0.0  # of its information
-    return ((p.value - p.file_value) / share, p.sigma**2 / share) if share > 0.0 else (0.0, math.inf)
-
-
 def _is_doubted(p: LearnedParameter) -> bool:
-    """Whether the robot file's value is not within its prior's 90 % interval of what is measured."""
-    off, noise = _measured(p)
-    return abs(off) > _DOUBTED_SIGMAS * math.sqrt(p.prior_sigma**2 + noise)
+    """Whether the robot file's value is not within its prior's 90 % interval of what was learned."""
+    return abs(p.value - p.file_value) > _DOUBTED_SIGMAS * math.hypot(p.prior_sigma, p.sigma)
 
 
 class _Clipping:

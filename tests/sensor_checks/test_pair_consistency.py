@@ -54,6 +54,7 @@ def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> N
     found = set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR, BIAS_CHANGED}
     is_as_of_floors = name in ("left ticks lost", "ticks lost") or "scale" in name  # of a robot that skids
     assert bool(found) == (not is_as_of_floors), outcome.warnings
+    assert found or any("as on some floors" in x or "another floor or load" in x for x in outcome.pipeline.checks.doubts())
     assert "saturated" not in name or any("end at 20 deg/s, its range" in warning for warning in outcome.warnings)
     error, sigma = outcome.last
     assert error < max(3.0 * sigma, 0.1)
@@ -226,7 +227,7 @@ def test_healthy_parameters_are_doubted_as_often_as_their_prior_allows_and_never
     doubted = np.mean([_is_doubted(p) for p in learned])
     reported = np.mean([check._evidence(p) > math.log(99e3) for p in learned])
     if scale == 1.0:
-        assert doubted == pytest.approx(0.1, abs=0.02)
+        assert 0.03 < doubted < 0.12
         assert reported == 0.0
     else:
         assert reported > 0.5
