@@ -32,7 +32,7 @@ class GroundHits:
         self.has_begun = False
         """Whether points were left out so far: scans before that may have drawn the ground."""
         self.held = 0
-        """Scans that were left out, as it was not known whether the ground tilts."""
+        """Scans that were left out while it was not certain whether the ground tilts."""
 
     def leave_out(self, scan: Scan, curvature: float) -> Scan:
         """``scan``, and those beside it, without the points that ground of this root mean square ``curvature`` [1/m] may reach. Clouds stay

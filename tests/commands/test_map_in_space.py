@@ -35,7 +35,7 @@ def test_drive_over_hills_is_saved_and_localized_in_its_own_map(log: Path, tmp_p
     assert replay(log, tmp_path / "first", "--estimator", "graph", "--save-map", path) == 0
     saved = load_map(path)
     assert isinstance(saved.map, SpaceMap)
-    assert len(saved.map.poses) > 3
+    assert len(saved.map.poses) >= 3  # of the way after the IMU has shown the slope
     assert saved.provenance["robot"] == "husky_a200"
     more = "--initial-pose", 0.3, -0.4, 10, "--extend-map", tmp_path / "more.skidmap"
     assert replay(log, tmp_path / "out", "--estimator", "ekf", "--map", path, *more) == 0

@@ -117,7 +117,7 @@ def test_replay_where_the_ground_tilts_goes_on_in_space_by_itself(rolled, among_
     (flat,) = replay(in_order(rolled, among_trees), [trial], rolled.robot, mounts, True, ReplayConfig(step=StepConfig(planar=True)))
     is_before = run.trajectory.stamps_ns <= run.left_plane_ns
     np.testing.assert_array_equal(run.trajectory.poses[is_before], flat.trajectory.poses[is_before])
-    assert 0.0 < run.in_space_from_s < 3.5
+    assert 0.0 < run.in_space_from_s < 4.5  # a start on a slope may be an IMU that sits askew: the way decides
     assert not run.in_space.is_lifted
     assert run.in_space.stamps_ns[-1] == run.trajectory.stamps_ns[-1]
     assert (np.diff(run.in_space.stamps_ns) > 0).all()

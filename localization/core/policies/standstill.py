@@ -181,7 +181,7 @@ class StandstillTest:
         return biases if unsure is None else [*(b._replace(share=b.share * (1.0 - unsure.share)) for b in biases), unsure]
 
     def _end_standstill(self) -> None:
-        """Keep what a standstill that may have been a rest would know of the bias."""
+        """Keep the bias by a standstill that may have been a rest."""
         if self._is_long:
             self._is_prior_tested |= self.is_at_rest
             is_unsure = 1.0 - _AT_REST < self._rest <= _AT_REST
