@@ -152,9 +152,9 @@ class AttitudeFilter:
         return self._ground.is_certain
 
     @property
-    def is_open(self) -> bool:
-        """Whether the ground may tilt, or an IMU that sits askew makes it look so."""
-        return self._ground.is_open
+    def is_tilt_ambiguous(self) -> bool:
+        """Whether the ground may tilt, or an IMU that sits askew measures the same."""
+        return self._ground.is_ambiguous
 
     @property
     def up(self) -> FloatArray:

@@ -80,7 +80,7 @@ class GroundTilt:
         return np.asarray(weights / weights.sum()).reshape(len(_MOUNTS), len(_GROUNDS))
 
     @property
-    def is_open(self) -> bool:
+    def is_ambiguous(self) -> bool:
         """Whether the ground may tilt, and whether it does is not certain."""
         return not self.is_certain and bool(np.hypot(*self.ground) > _LEVEL)
 

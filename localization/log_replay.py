@@ -64,7 +64,7 @@ class Run:
     """(K, 3) stamp [s], mean and sigma of each of ``parameters``, every two seconds."""
     left_plane_ns: int | None = None
     """Stamp after which poses are in space because the IMU shows that the ground tilts; None where that was not found, or not asked."""
-    doubts: Sequence[str] = ()
+    inflation_reasons: Sequence[str] = ()
     """Why the covariance has more than the sensors' noise, though no fault is probable enough to be reported."""
 
     @property
@@ -203,5 +203,5 @@ class _Replay:
             in_space,
             {name: np.array(rows) for name, rows in self._parameters.items()},
             None if choice is None else choice.left_ns,
-            self._pipeline.checks.doubts(),
+            self._pipeline.checks.inflation_reasons(),
         )

@@ -170,10 +170,8 @@ class Synchronizer:
         window = self.wheels.buffer.window(start_ns + shift, end_ns + shift, self.config.max_hold_s)
         rates, missing = window.rates, window.missing
         tilt = None if attitude is None else attitude.advance(end_ns, window.dt, rates)
-        ground = self.scans.ground
-        has_drawn_ground = not ground.has_begun
         if scan is not None and attitude is not None and tilt is not None:
-            scan = ground.leave_out(scan, attitude.curvature)
+            scan = self.scans.ground.leave_out(scan, attitude.curvature)
         motion, d_clock, last = self.wheels.integrate(start_ns + shift, window, tilt)
         if start_ns == end_ns:  # the first scan of a drive: its sweep needs a twist
             rates, last = self.wheels.twist_at(end_ns + shift)
@@ -191,11 +189,8 @@ class Synchronizer:
             self.scans.faulty.has_turned |= bool(motion.delta[2])
         twist = last if has_wheels else turn_twist(turn)
         cg_cov = self.wheels.buffer.cg_cov
-        restarts = has_drawn_ground and ground.has_begun
-        step = Step(
-            start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, cg_cov, body_turn, gravity, restarts_map=restarts
-        )
-        if attitude is None or not attitude.is_open or is_standing or scan is None or not scan.is_planar:
+        step = Step(start_ns, end_ns, motion, d_clock, twist, is_standing, has_wheels, turn, scan, cg_cov, body_turn, gravity)
+        if attitude is None or not attitude.is_tilt_ambiguous or is_standing or scan is None or not scan.is_planar:
             return step
-        ground.held += 1
+        self.scans.ground.held += 1
         return step.without_scan()  # its beams may be on the ground

@@ -32,7 +32,7 @@ def test_mount_error_is_separate_from_a_plane():
     assert np.degrees(np.hypot(*off)) < 1.0
 
 
-@pytest.mark.parametrize("degrees", [0.0, 1.0])
+@pytest.mark.parametrize("degrees", [0.0, 1.0, 2.0])
 def test_level_ground_under_a_mount_that_is_off_is_never_tilted(degrees):
     assert not any(turn_on_a_plane(degrees, (1.5, 1.5), seed).is_certain for seed in range(20))
 

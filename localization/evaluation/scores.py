@@ -85,7 +85,7 @@ class Result:
             "moments": None if self.live is None else self.live.numbers(),
             "real_time_factor": duration_s / self.run.seconds if with_timing and self.run.seconds > 0 else None,
             "parameters": {name: list(value) for name, value in self.run.parameters.items()},
-            "doubts": list(self.run.doubts),
+            "inflation_reasons": list(self.run.inflation_reasons),
             "counts": dict(self.run.counts),
             "lidar": None if self.run.lidar is None else self.run.lidar.numbers(),
             **({} if self.run.in_space_from_s is None else {"in_space_from_s": self.run.in_space_from_s}),

@@ -29,8 +29,6 @@ class GroundHits:
         self._mounts = mounts
         self._points, self._left_out = 0, 0
         self._nearest_m, self._frame = math.inf, ""
-        self.has_begun = False
-        """Whether points were left out so far: scans before that may have drawn the ground."""
         self.held = 0
         """Scans that were left out while it was not certain whether the ground tilts."""
 
@@ -44,7 +42,6 @@ class GroundHits:
             return scan
         mount, rise = self._mounts.get(scan.frame_id, Mount()), 0.5 * _SIGMAS * curvature
         x, y, z = (scan.points @ mount.rotation.T + (mount.x, mount.y, mount.z)).T
-        self.has_begun = True
         above = replace(scan.select(z > rise * (x * x + y * y)), beside=tuple(self.leave_out(other, curvature) for other in scan.beside))
         self._left_out += len(scan.points) - len(above.points)
         self._nearest_m, self._frame = min(self._nearest_m, math.sqrt(max(mount.z, 0.0) / rise)), scan.frame_id

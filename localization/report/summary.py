@@ -61,7 +61,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         return [*contradictions, ending, *losses]
     if reference is None or best is None:
         line = _most_informed(lines)
-        return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}"), *_doubts(lines)]
+        return [*_unscored(lines), *losses, *_consistency(line, f"The covariances of {line.words}"), *_inflation_reasons(lines)]
     of_point = ""
     if (lever := _lever(lines, reference)) is not None and isinstance(reference, ReferenceTrack):
         of_base = best.error
@@ -78,7 +78,7 @@ def verdict_sentences(results: Sequence[Result], reference: ReferenceTrack | Rel
         *_coverage(best),
         *_consistency(best),
         *(_left_out(best.result) or _exactness(best, reference)),
-        *_doubts(lines),
+        *_inflation_reasons(lines),
         *_visibility(best, reference),
         *_by_errors(best, reference),
         *_advice(lines, best, equals, reference),
@@ -245,9 +245,9 @@ def _losses(lines: Sequence[PlottedRun]) -> list[str]:
     return [f"Not recommended are {'; '.join(parts)}." if len(parts) > 1 else f"Not recommended is {parts[0]}.", *advice]
 
 
-def _doubts(lines: Sequence[PlottedRun]) -> list[str]:
+def _inflation_reasons(lines: Sequence[PlottedRun]) -> list[str]:
     """Why covariances are wide, without a fault."""
-    return [f"{line.words}: {doubt}" for line in lines for doubt in line.result.run.doubts]
+    return [f"{line.words}: {reason}" for line in lines for reason in line.result.run.inflation_reasons]
 
 
 def _as_published(best: PlottedRun) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from localization.estimators import Estimator
-from localization.sensor_checks.faults import CERTAIN_LOG_ODDS, FAULT_LOG_ODDS, FaultLog, SensorFault
+from localization.sensor_checks.faults import FaultLog, SensorFault, is_certain
 
 BIAS_CHANGED = SensorFault(
     "the gyro's bias has changed by {degrees:+.1f} deg/s between this rest and the one before. The covariance of what was driven between"
@@ -26,5 +26,5 @@ class BiasChangeCheck:
         if change is None or change.end_ns == self._reported_ns:
             return
         self._reported_ns = change.end_ns
-        if change.log_evidence + FAULT_LOG_ODDS > CERTAIN_LOG_ODDS:
+        if is_certain(change.log_evidence):
             self._faults.update(BIAS_CHANGED, 1e-9 * change.end_ns - self._faults.start_s, {"degrees": math.degrees(change.rate)})

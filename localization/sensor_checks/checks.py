@@ -194,9 +194,9 @@ class SensorChecks:
         """Problems so far."""
         return [*self._steps.tilt.warnings(), *self._faults.warnings()]
 
-    def doubts(self) -> list[str]:
-        """See `SensorConsistency.doubts`."""
-        return self._consistency.doubts()
+    def inflation_reasons(self) -> list[str]:
+        """See `SensorConsistency.inflation_reasons`."""
+        return self._consistency.inflation_reasons()
 
     @property
     def found(self) -> Mapping[SensorFault, DetectedFault]:

@@ -20,10 +20,13 @@ _MIN_CONTRADICTING = 2.0 / 3.0
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
 _NS = 1e-9
-FAULT_LOG_ODDS = math.log(1e-3)
-"""Logarithm of the prior odds of a fault within a window."""
-CERTAIN_LOG_ODDS = math.log(99.0)
-"""Logarithm of the posterior odds from which on a fault is reported."""
+_PRIOR_LOG_ODDS, _REPORTED_LOG_ODDS = math.log(1e-3), math.log(99.0)
+"""Logarithms of the prior odds of a fault within a window, and of the posterior odds from which on it is reported."""
+
+
+def is_certain(log_evidence: float) -> bool:
+    """Whether a fault is to be reported, by the logarithm of the evidence for it over that for healthy sensors."""
+    return log_evidence + _PRIOR_LOG_ODDS > _REPORTED_LOG_ODDS
 
 
 class SensorFault(NamedTuple):

@@ -126,10 +126,15 @@ def _explanation(cause: Cause, x: FloatArray, weighted: FloatArray) -> Explanati
     """How well a factor on ``x`` (n,) explains innovations of covariance C: its evidence against none, with the factor integrated out over
     its prior (Bar-Shalom, Li, Kirubarajan 2001, 1.4; a Bayes factor of two Gaussians). ``weighted`` (n, 2): C^-1 x and C^-1 innovation."""
     power, product = (x @ weighted).tolist()
-    gain = cause.sigma**2 * power
     chi_square = product**2 / power if power else 0.0
-    log_odds = 0.5 * chi_square * gain / (1.0 + gain) - 0.5 * math.log1p(gain)
+    log_odds = log_bayes_factor(chi_square, cause.sigma**2 * power)
     return Explanation(cause.regressor, cause.describe(product / power if power else 0.0), log_odds, math.sqrt(chi_square))
+
+
+def log_bayes_factor(chi_square: float, gain: float) -> float:
+    """Logarithm of the evidence that a normal variable has 1 + ``gain`` times its variance, over that for the variance; ``chi_square`` is
+    its square over the latter."""
+    return 0.5 * chi_square * gain / (1.0 + gain) - 0.5 * math.log1p(gain)
 
 
 def add_step(totals: Regressors, step: Step) -> Regressors:

@@ -12,8 +12,17 @@ from typing import NamedTuple
 
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
-from localization.sensor_checks.faults import CERTAIN_LOG_ODDS, FAULT_LOG_ODDS, DetectedFault, FaultLog, SensorFault
-from localization.sensor_checks.innovations import NO_REGRESSORS, SECONDS, TURN, TURN_CHANGE, InnovationWindows, Pair, add_step
+from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault, is_certain
+from localization.sensor_checks.innovations import (
+    NO_REGRESSORS,
+    SECONDS,
+    TURN,
+    TURN_CHANGE,
+    InnovationWindows,
+    Pair,
+    add_step,
+    log_bayes_factor,
+)
 from localization.sensor_checks.pairs import (
     CAUSES,
     GYRO_WHEELS,
@@ -41,12 +50,12 @@ PARAMETER_FAR = SensorFault(
     "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or"
     " load, {cause}. {use} Fit the file with `skidloc calibrate`.",
 )
-_DOUBT = "From t = {at_s:.1f} s on the covariance has the distance from the dead reckoning by the robot file: {what}."
-_PAIR_IN_DOUBT = (
+_INFLATION = "From t = {at_s:.1f} s on the covariance has the distance from the dead reckoning by the robot file: {what}."
+_BY_PAIR = (
     "{quantity} by the {first} and those by the {second} differ by {difference} in {seconds:.0f} s, as on some floors, and no scan shows"
     " which are right"
 )
-_PARAMETER_IN_DOUBT = (
+_BY_PARAMETER = (
     "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, where the file has {file:.3g}, and no scan shows whether another floor or"
     " load does that, or a gyro or encoders of another scale"
 )
@@ -59,7 +68,7 @@ _NAMED_WITHIN_S = 10.0
 _MAX_SIGMAS = 4.5
 """Largest sum of innovations over a window, in sigmas: 7e-6 by chance, one of 60 hours. Largest of healthy drives: gyro and wheels 4.0 (six
 simulated robots; Husky outdoors 1.0), LiDAR and gyro 3.3, ways by LiDAR and wheels 3.1 (ACES), turns by both 1.0 (ACES)."""
-_DOUBTED_SIGMAS, _FAULT_FACTOR = 1.645, 10.0
+_PRIOR_SIGMAS, _FAULT_FACTOR = 1.645, 10.0
 """A robot file's value outside of its prior's 90 % interval is not relied on. Where something is wrong with a learned parameter, it is off
 by ten times what it is off by in healthy robots."""
 _CENTER_X = "x_cr"
@@ -116,12 +125,12 @@ class SensorConsistency:
         self._matched_s = -math.inf
         self._episodes: dict[SensorFault, _Episode] = {}
         self._reported: dict[SensorFault, _Reported] = {}
-        self._doubts: dict[SensorFault, tuple[float, str]] = {}
+        self._inflation_reasons: dict[SensorFault, tuple[float, str]] = {}
 
-    def doubts(self) -> list[str]:
+    def inflation_reasons(self) -> list[str]:
         """Why the covariance has more than the sensors' noise, though no fault is probable enough to be reported."""
-        reported = self._faults.found
-        return [_DOUBT.format(at_s=max(at_s, 0.0), what=what) for fault, (at_s, what) in self._doubts.items() if fault not in reported]
+        reasons = [(at_s, what) for fault, (at_s, what) in self._inflation_reasons.items() if fault not in self._faults.found]
+        return [_INFLATION.format(at_s=max(at_s, 0.0), what=what) for at_s, what in reasons]
 
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
@@ -195,32 +204,31 @@ class SensorConsistency:
         episode = self._episodes[fault] = _Episode(begin_s, poses, row, is_by_lidar)
         unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
         numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
-        if is_clipped or best.log_odds + FAULT_LOG_ODDS > CERTAIN_LOG_ODDS:  # what floors do as well is no fault of a sensor
+        if is_clipped or is_certain(best.log_odds):  # what floors do as well is no fault of a sensor
             self._report(fault, episode, worst.sigmas if is_clipped else best.sigmas, numbers)
         elif self._is_inflating(episode):
-            words = {"quantity": pair.quantity, "first": pair.first, "second": pair.second}
-            self._doubts[fault] = begin_s, _PAIR_IN_DOUBT.format(**words, difference=unit, seconds=worst.seconds)
+            self._inflation_reasons[fault] = begin_s, _BY_PAIR.format(**pair._asdict(), difference=unit, seconds=worst.seconds)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
         """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""
         if learned and learned[0].name == RADIUS:
             self._scales.compare(learned[0], self._driven_s)
             learned = learned[1:]
-        doubted = [p for p in learned if _is_doubted(p)]
-        if not doubted or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
+        outside = [p for p in learned if _is_outside_prior(p)]
+        if not outside or self._is_explained(PARAMETER_FAR, NAMED[GYRO_WHEELS]):
             self._end(PARAMETER_FAR)
             return
         bins = next(window.bins for window in self._windows.values() if window.bins)
         episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
-        off = max(doubted, key=self._evidence)
+        off = max(outside, key=self._evidence)
         numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
         ahead_m = off.value - off.file_value
         far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
         numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
-        if self._evidence(off) + FAULT_LOG_ODDS > CERTAIN_LOG_ODDS:
+        if is_certain(self._evidence(off)):
             self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
         elif self._is_inflating(episode):
-            self._doubts[PARAMETER_FAR] = episode.begin_s, _PARAMETER_IN_DOUBT.format(**numbers)
+            self._inflation_reasons[PARAMETER_FAR] = episode.begin_s, _BY_PARAMETER.format(**numbers)
 
     def _evidence(self, p: LearnedParameter) -> float:
         """Logarithm of the evidence that something is wrong with ``p``, over that for a healthy robot: Bayes factor of two normal
@@ -228,9 +236,8 @@ class SensorConsistency:
         and with a multiplier of 1, which nobody has set, by that of any drive."""
         usual = K_SIGMA if p.name == _MULTIPLIER and p.file_value == 1.0 else self._usual.get(GYRO_WHEELS, {}).get(TURN, 0.0)
         healthy = max(p.prior_sigma, usual * abs(p.file_value) if p.name in _TURNING else 0.0) ** 2
-        noise = p.sigma**2
-        ratio = (healthy + noise) / (_FAULT_FACTOR**2 * healthy + noise)
-        return 0.5 * (p.value - p.file_value) ** 2 / (healthy + noise) * (1.0 - ratio) + 0.5 * math.log(ratio)
+        variance = healthy + p.sigma**2
+        return log_bayes_factor((p.value - p.file_value) ** 2 / variance, (_FAULT_FACTOR**2 - 1.0) * healthy / variance)
 
     def _is_explained(self, fault: SensorFault, named: Sequence[SensorFault]) -> bool:
         """Whether one of the ``named`` faults explains ``fault``: was found before it, or soon after its begin; it is retracted then."""
@@ -278,9 +285,9 @@ def _innovations(step: Step, residuals: Residuals) -> Sequence[tuple[Pair, tuple
     return (GYRO_WHEELS, residuals.turn if step.has_wheels else None), (LIDAR_GYRO, residuals.scan_turn), ways
 
 
-def _is_doubted(p: LearnedParameter) -> bool:
+def _is_outside_prior(p: LearnedParameter) -> bool:
     """Whether the robot file's value is not within its prior's 90 % interval of what was learned."""
-    return abs(p.value - p.file_value) > _DOUBTED_SIGMAS * math.hypot(p.prior_sigma, p.sigma)
+    return abs(p.value - p.file_value) > _PRIOR_SIGMAS * math.hypot(p.prior_sigma, p.sigma)
 
 
 class _Clipping:

@@ -22,7 +22,7 @@ from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.innovations import Bin, Explanation, InnovationWindow, InnovationWindows
 from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, usual_errors
 from localization.sensor_checks.reckoning import ESTIMATE
-from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency, _is_doubted
+from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency, _is_outside_prior
 from localization.sensor_checks.sweep_times import OTHER_UNIT, REVERSED_TIMES
 from motion_models import se2
 from motion_models.motion import Motion
@@ -54,7 +54,7 @@ def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> N
     found = set(outcome.pipeline.checks.found) & {TURNS_DIFFER, PARAMETER_FAR, BIAS_CHANGED}
     is_as_of_floors = name in ("left ticks lost", "ticks lost") or "scale" in name  # of a robot that skids
     assert bool(found) == (not is_as_of_floors), outcome.warnings
-    assert found or any("as on some floors" in x or "another floor or load" in x for x in outcome.pipeline.checks.doubts())
+    assert found or any("as on some floors" in x or "another floor or load" in x for x in outcome.pipeline.checks.inflation_reasons())
     assert "saturated" not in name or any("end at 20 deg/s, its range" in warning for warning in outcome.warnings)
     error, sigma = outcome.last
     assert error < max(3.0 * sigma, 0.1)
@@ -206,7 +206,7 @@ def test_turns_that_differ_while_scans_match_leave_the_covariance() -> None:
 @pytest.mark.parametrize(
     ("robot", "learned", "is_reported"), [("turtlebot3_burger", 1.9, True), ("turtlebot3_burger", 0.7, False), ("jackal", 1.9, False)]
 )
-def test_factor_beyond_what_floors_do_is_reported_and_a_doubted_file_is_in_the_covariance(
+def test_factor_beyond_what_floors_do_is_reported_and_a_file_outside_its_prior_is_in_the_covariance(
     robot: str, learned: float, is_reported: bool
 ) -> None:
     driven = Driven(robot=load_robot(robot))
@@ -217,17 +217,17 @@ def test_factor_beyond_what_floors_do_is_reported_and_a_doubted_file_is_in_the_c
 
 
 @pytest.mark.parametrize("scale", [1.0, 10.0])
-def test_healthy_parameters_are_doubted_as_often_as_their_prior_allows_and_never_reported(scale: float) -> None:
+def test_healthy_parameters_are_outside_their_prior_as_often_as_it_allows_and_never_reported(scale: float) -> None:
     """Monte Carlo of 2000 robots that are off their files by the prior, measured to a third of it; and by ten times as much."""
     rng, prior, noise = np.random.default_rng(3), 0.05, 0.017
     variance = 1.0 / (1.0 / prior**2 + 1.0 / noise**2)
     check = SensorConsistency(FaultLog(CovarianceInflation()))
     measured = scale * prior * rng.normal(size=2000) + noise * rng.normal(size=2000)
     learned = [LearnedParameter("x_cr_0", m * variance / noise**2, math.sqrt(variance), 0.0, prior) for m in measured.tolist()]
-    doubted = np.mean([_is_doubted(p) for p in learned])
+    outside = np.mean([_is_outside_prior(p) for p in learned])
     reported = np.mean([check._evidence(p) > math.log(99e3) for p in learned])
     if scale == 1.0:
-        assert 0.03 < doubted < 0.12
+        assert 0.03 < outside < 0.12
         assert reported == 0.0
     else:
         assert reported > 0.5

@@ -29,7 +29,7 @@ _MIN_REPORTED = 3.0
 _MAX_RATE_RAD_S, _CONSTANT = 1.0, 0.1
 """Rates of a robot that is turned with its wheels at rest are uniform up to this [rad/s]. Those on a turntable are constant, which is this
 share of them; those of one that rolls or is carried vary."""
-_MAX_EXPONENT = 300.0
+_MAX_EXPONENT, _MIN_DENSITY = 300.0, 1e-300
 _SETTLING_S = 0.2
 """Time in which a robot whose wheels read zero stops [s]: their clock may be ahead of the gyro's by a driver's latency (`clock_offset`)."""
 _MIN_SPELL_S, _MIN_STEPS = 0.5, 5
@@ -150,7 +150,8 @@ class StandstillTest:
             return None
         rate, noise = self._rate()
         biases = self._biases()
-        likelihoods = [b.share * _normal(rate - b.mean, b.variance + noise) for b in biases]
+        densities = [_normal(rate - b.mean, b.variance + noise) for b in biases]
+        likelihoods = [b.share * density for b, density in zip(biases, densities, strict=True)]
         at_rest = _AT_REST * sum(likelihoods)
         moved = (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S * (_CONSTANT + (1.0 - _CONSTANT) * math.exp(self._variation(rate)))
         was_at_rest, self._rest = self.is_at_rest, at_rest / (at_rest + moved)
@@ -165,8 +166,7 @@ class StandstillTest:
         if is_first:
             return BiasAtRest(max(biases[best].variance, change**2), 0.0, rate, noise)
         if abs(change) > _MIN_REPORTED * self._bias_sigma:
-            evidence = likelihoods[best] / biases[best].share * biases[0].share / max(likelihoods[0], 1e-300)
-            self.change = BiasChange(now_ns, change, math.log(evidence))
+            self.change = BiasChange(now_ns, change, math.log(densities[best] / max(densities[0], _MIN_DENSITY)))
         return BiasAtRest(0.0, change**2, rate, noise)
 
     def _biases(self) -> list[_Bias]:
