@@ -68,7 +68,7 @@ def test_every_module_that_warns_has_a_cause_and_a_cure():
 def test_messages_of_a_fault_have_their_whole_text():
     assert any(
         text.startswith("the gyro turns opposite to …. It is not used")
-        for text in HOOKS.messages("localization/sensor_checks/contradictions.py")
+        for text in HOOKS.messages("localization/sensor_checks/turn_votes.py")
     )
 
 

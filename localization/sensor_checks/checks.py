@@ -19,6 +19,7 @@ from localization.sensor_checks.gyro_rate import rate_off
 from localization.sensor_checks.inflation import CovarianceInflation
 from localization.sensor_checks.known_places import KnownPlaces
 from localization.sensor_checks.moving_objects import MAX_NIS, MIN_OFF_M
+from localization.sensor_checks.pairs import GYRO_WHEELS, usual_errors
 from localization.sensor_checks.path_uncertainty import PathUncertainty, lever_of_unknown_front
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.step_checks import StepChecks
@@ -78,14 +79,13 @@ class SensorChecks:
     are compared before the estimator has it, and its record is examined before it is published.
     """
 
-    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, robot: Robot | None = None) -> None:
-        """``robot``: whose clocks, front and slip may not be known for sure; None where they are."""
-        self._inflation = CovarianceInflation()
+    def __init__(self, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, robot: Robot) -> None:
+        """``robot``: whose clocks, front and slip may not be known for sure."""
+        self._inflation, usual = CovarianceInflation(), usual_errors(robot)
         self._faults = faults = FaultLog(self._inflation, PathUncertainty(lever_of_unknown_front(robot, mounts)))
-        self._steps = StepChecks(faults, mounts, config, step_config)
-        self._consistency, self._places = SensorConsistency(faults, robot), KnownPlaces(faults)
-        self._clocks = ClockCheck(faults, 0.0 if robot is None else robot.clock.sigma_s)
-        self._biases = BiasChangeCheck(faults)
+        self._steps = StepChecks(faults, mounts, config, step_config, usual[GYRO_WHEELS])
+        self._consistency, self._places = SensorConsistency(faults, usual), KnownPlaces(faults)
+        self._clocks, self._biases = ClockCheck(faults, robot.clock.sigma_s), BiasChangeCheck(faults)
         self._mounts, self._is_lidar_placed = mounts, True
         self._records = Records()
         self._is_acting = True

@@ -20,13 +20,15 @@ _MIN_CONTRADICTING = 2.0 / 3.0
 _MIN_LASTING_S = 1.0
 """Time for which a comparison must give the same result before a sensor is declared faulty."""
 _NS = 1e-9
-_PRIOR_LOG_ODDS, _REPORTED_LOG_ODDS = math.log(1e-3), math.log(99.0)
-"""Logarithms of the prior odds of a fault within a window, and of the posterior odds from which on it is reported."""
+CERTAIN = 0.99
+"""Posterior probability from which on a fault is reported, or a sensor is healthy again."""
+_PRIOR_LOG_ODDS = math.log(1e-3)
+"""Logarithm of the prior odds of a fault within a window."""
 
 
 def is_certain(log_evidence: float) -> bool:
     """Whether a fault is to be reported, by the logarithm of the evidence for it over that for healthy sensors."""
-    return log_evidence + _PRIOR_LOG_ODDS > _REPORTED_LOG_ODDS
+    return log_evidence + _PRIOR_LOG_ODDS > math.log(CERTAIN / (1.0 - CERTAIN))
 
 
 class SensorFault(NamedTuple):

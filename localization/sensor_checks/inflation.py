@@ -9,7 +9,7 @@ import numpy as np
 
 from localization.estimators import Estimate
 from localization.events import Step
-from localization.sensor_checks.reckoning import ESTIMATE, GYRO, WHEELS, Reckoning
+from localization.sensor_checks.reckoning import ESTIMATE, GYRO, MIRRORED, WHEELS, Reckoning
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Pose2, Tangent2
@@ -67,6 +67,7 @@ class CovarianceInflation:
         """(3,) difference of a pair of sensors that differ for now."""
         self.ongoing_scene: FloatArray | None = None
         """(3,) difference of wheels and scans while objects move in these."""
+        self._swapped_since: FloatArray | None = None  # poses where wheels may have begun to be swapped
         self.possible: FloatArray | None = None
         """(3,) the same while that is not decided: no fault yet."""
 
@@ -95,6 +96,14 @@ class CovarianceInflation:
         """Inflate by ``difference`` (3,), of which the direction is known and the sign is not."""
         self.carried = self.carried.plus(difference)
 
+    def set_swapped(self, *, may_be: bool) -> None:
+        """Whether left and right wheels ``may_be`` swapped, on which the estimate relies: it has the distance to where these would lead."""
+        if may_be and self._swapped_since is None:
+            self._swapped_since = self._agreed
+        elif not may_be and self._swapped_since is not None:
+            self.add(self.reckoning.distance(self._swapped_since, MIRRORED))
+            self._swapped_since = None
+
     @property
     def is_acting(self) -> bool:
         """Whether estimates get another covariance."""
@@ -108,12 +117,13 @@ class CovarianceInflation:
     @property
     def is_lasting(self) -> bool:
         """Whether sensors differ at present."""
-        return self.ongoing_pair is not None or self.ongoing_scene is not None
+        return any(each is not None for each in (self.ongoing_pair, self.ongoing_scene, self._swapped_since))
 
     def set_known(self, spread: Cov3) -> None:
         """A place from before the faults has shown the pose: its covariance ``spread`` (3, 3) is what is left of them."""
         self.carried = replace(self.carried, cov=spread, pending=np.zeros((3, 3)), is_any=True)
         self.restart()
+        self._swapped_since = None if self._swapped_since is None else self._agreed
 
     def inflate(self, estimate: Estimate) -> Estimate:
         """``estimate``, the last of `reckoning`, with the covariance of all differences so far."""
@@ -141,6 +151,7 @@ class CovarianceInflation:
     def total(self) -> Cov3:
         """Covariance (3, 3) of what past faults have done to the pose, and of how far a lasting disagreement has taken it."""
         total = self.carried.total
-        for difference in (self.ongoing_pair, self.ongoing_scene):
+        if_swapped = None if self._swapped_since is None else self.reckoning.distance(self._swapped_since, MIRRORED)
+        for difference in (self.ongoing_pair, self.ongoing_scene, if_swapped):
             total = total if difference is None else total + np.outer(difference, difference)
         return total

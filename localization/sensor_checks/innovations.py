@@ -82,7 +82,7 @@ class Bin(NamedTuple):
     regressors: Regressors
     """What faults would add within this bin alone."""
     poses: FloatArray
-    """(5, 3) at its end, as `Reckoning` has them."""
+    """(6, 3) at its end, as `Reckoning` has them."""
 
 
 class InnovationWindow(NamedTuple):
@@ -158,7 +158,7 @@ class InnovationWindows:
 
     def add(self, innovation: float, variance: float, totals: Regressors, now_s: float, poses: FloatArray) -> bool:
         """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``totals`` since the first step, as `add_step` has them;
-        ``poses`` (5, 3) after it."""
+        ``poses`` (6, 3) after it."""
         (a, b, c, d), (e, f, g, h), self._totals = totals, self._totals, totals
         regressors = a - e, b - f, c - g, d - h
         if not self.bins:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
-from localization.sensor_checks.contradictions import LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE
+from localization.sensor_checks.contradictions import LIDAR_DIRECTION
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.own_body import LIDAR_OWN_BODY, LIDAR_OWN_PARTS
 from localization.sensor_checks.standstill import WHEELS_STANDING
+from localization.sensor_checks.turn_votes import LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from localization.sensor_checks.window import BIN_S
 
 MOVING_OBJECTS = SensorFault(

@@ -6,19 +6,13 @@ import math
 from collections.abc import Mapping
 
 from localization.sensor_checks.clocks import CLOCKS_APART
-from localization.sensor_checks.contradictions import (
-    GYRO_OPPOSITE,
-    GYRO_STUCK,
-    GYRO_UNIT,
-    LIDAR_DIRECTION,
-    LIDAR_OPPOSITE,
-    WHEELS_OPPOSITE,
-)
+from localization.sensor_checks.contradictions import GYRO_STUCK, LIDAR_DIRECTION
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import SECONDS, TURN, TURN_CHANGE, WAY, Cause, Causes, Pair
 from localization.sensor_checks.standstill import WHEELS_STANDING
 from localization.sensor_checks.sweep_times import NO_SWEEP, OTHER_UNIT, REVERSED_TIMES
+from localization.sensor_checks.turn_votes import GYRO_OPPOSITE, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from motion_models.robot import DIFF_DRIVE, Robot
 
 _FLOOR_RAD = 0.01
@@ -89,13 +83,11 @@ LIDAR_WHEELS_TURNS = Pair("LiDAR", "wheels", "turns", _FLOOR_RAD)
 LIDAR_WHEELS_WAYS = Pair("LiDAR", "wheels", "ways", _FLOOR_M)
 
 
-def usual_errors(robot: Robot | None) -> Mapping[Pair, Mapping[int, float]]:
-    """Standard deviations of what healthy wheels of ``robot`` err by, by pair, per unit of what causes are proportional to; None: nothing.
+def usual_errors(robot: Robot) -> Mapping[Pair, Mapping[int, float]]:
+    """Standard deviations of what healthy wheels of ``robot`` err by, by pair, per unit of what causes are proportional to.
 
     A side whose wheels slip by s of their way w turns the robot by s w / track.
     """
-    if robot is None:
-        return {}
     share = _ROLLING_SIGMA if robot.drive == DIFF_DRIVE else K_SIGMA
     turns = {TURN: share, WAY: math.sqrt(2.0) * _SIDE_SLIP / robot.geometry.track_width_m}
     return {GYRO_WHEELS: turns, LIDAR_WHEELS_TURNS: turns, LIDAR_WHEELS_WAYS: {WAY: WAY_SLIP, TURN: _CENTER_M}}

@@ -19,9 +19,9 @@ from motion_models.se2 import Cov3, FloatArray, Pose2, Twist2
 _NO_TWIST = np.zeros(3)
 
 
-def lever_of_unknown_front(robot: Robot | None, mounts: Mapping[str, Mount]) -> float | None:
+def lever_of_unknown_front(robot: Robot, mounts: Mapping[str, Mount]) -> float | None:
     """How far sensors at ``mounts`` are from the middle of a ``robot`` whose front may be its rear [m]; None where its front is known."""
-    if robot is None or robot.joints.is_front_known:
+    if robot.joints.is_front_known:
         return None
     return max((abs(mount.x) for mount in mounts.values()), default=0.0)
 

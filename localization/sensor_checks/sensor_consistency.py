@@ -31,11 +31,9 @@ from localization.sensor_checks.pairs import (
     LIDAR_WHEELS_TURNS,
     LIDAR_WHEELS_WAYS,
     NAMED,
-    usual_errors,
 )
 from localization.sensor_checks.reckoning import FILE, FILE_GYRO
 from localization.sensor_checks.scales import RADIUS, ScaleCheck
-from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
 DIFFERENCES: Mapping[Pair, SensorFault] = {
@@ -94,7 +92,7 @@ class _Episode(NamedTuple):
 
     begin_s: float
     poses: FloatArray
-    """(5, 3) at its begin, as `Reckoning` has them."""
+    """(6, 3) at its begin, as `Reckoning` has them."""
     row: int
     """Row of the dead reckoning that the estimate is compared with."""
     is_by_lidar: bool = False
@@ -113,10 +111,10 @@ class SensorConsistency:
     dead reckoning by the wheels with the robot file's parameters (LiDAR and gyro: with the gyro's turns); it stays afterwards, as no scan
     takes it back. Where scans are matched, and it is not their stamps that explain the difference, they decide."""
 
-    def __init__(self, faults: FaultLog, robot: Robot | None = None) -> None:
-        """``robot``: whose wheels slip as its drive's do, and whose file may not have all parameters; None where nothing is unknown."""
+    def __init__(self, faults: FaultLog, usual: Mapping[Pair, Mapping[int, float]]) -> None:
+        """``usual``: what healthy wheels err by, as `pairs.usual_errors` has it."""
         self._faults, self._clipping, self._scales = faults, _Clipping(), ScaleCheck(faults)
-        self._usual = usual_errors(robot)
+        self._usual = usual
         self._windows = {pair: InnovationWindows(pair) for pair in NAMED}
         self._reckoning = faults.inflation.reckoning
         self._totals = NO_REGRESSORS

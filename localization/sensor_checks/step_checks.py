@@ -23,12 +23,15 @@ from motion_models.robot import Mount
 class StepChecks:
     """`compare` each step, before the estimator has it or afterwards."""
 
-    def __init__(self, faults: FaultLog, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig) -> None:
+    def __init__(
+        self, faults: FaultLog, mounts: Mapping[str, Mount], config: LidarConfig, step_config: StepConfig, usual: Mapping[int, float]
+    ) -> None:
+        """``usual``: what turns by healthy wheels err by, as `pairs.usual_errors` has it."""
         self._faults, self._inflation = faults, faults.inflation
         self.window = window = Window(mounts, config)
         """Motions of the last seconds."""
         self.own_body, self.tilt, self.sweep_times = OwnBody(faults, mounts), LidarTilt(mounts), SweepTimes(faults)
-        self._contradictions, self._gyro_rate = Contradictions(faults), GyroRate(faults)
+        self._contradictions, self._gyro_rate = Contradictions(faults, usual), GyroRate(faults)
         self.standstill, self.moving = Standstill(faults, window, step_config), MovingObjects(faults, window)
 
     @property

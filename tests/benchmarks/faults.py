@@ -28,9 +28,11 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import numpy as np
+
 from localization.estimators.fusion import EkfFusion
 from localization.events import ImuSample, Step
-from localization.sensor_checks import contradictions, step_checks
+from localization.sensor_checks import contradictions, step_checks, turn_votes
 from localization.sensor_checks.faults import SensorFault
 from tests.helpers import fault_drives, moving_scenes
 from tests.helpers.event_faults import EventFault, faults_of_stamps, faults_of_turns, faults_on_the_way, named_faults, without_gyro
@@ -114,10 +116,10 @@ def _table_of_pairs(only: str) -> Iterator[str]:
         yield f"| {place} | {name} | {' | '.join(cells)} | {known} |"
 
 
-def _no_symptom(fault: SensorFault) -> Any:
-    """Contradictions without one of their faults."""
-    others = tuple(symptom for symptom in contradictions.SYMPTOMS if symptom.fault is not fault)
-    return lambda: mock.patch.object(contradictions, "SYMPTOMS", others)
+def _no_vote(fault: SensorFault) -> Any:
+    """Votes about turns without one of the faults."""
+    others = np.array([0.0 if row.fault is fault else row.prior for row in turn_votes.ROWS])
+    return lambda: mock.patch.object(turn_votes, "_PRIORS", others)
 
 
 class _NoCheck:
@@ -146,14 +148,14 @@ def _no_check(name: str) -> Any:
 
 
 _WITHOUT = {
-    "gyro opposite": _no_symptom(contradictions.GYRO_OPPOSITE),
+    "gyro opposite": _no_vote(turn_votes.GYRO_OPPOSITE),
     "gyro in deg/s": _no_check("GyroRate"),
     "gyro glitches": _no_check("GyroRate"),
     "gyro stuck": lambda: mock.patch.object(contradictions, "is_repeating", return_value=False),
-    "sides swapped": _no_symptom(contradictions.WHEELS_OPPOSITE),
+    "sides swapped": _no_vote(turn_votes.WHEELS_OPPOSITE),
     "encoders": _no_check("Standstill"),
-    "LiDAR upside down": _no_symptom(contradictions.LIDAR_OPPOSITE),
-    "LiDAR yaw": _no_symptom(contradictions.LIDAR_DIRECTION),
+    "LiDAR upside down": _no_vote(turn_votes.LIDAR_OPPOSITE),
+    "LiDAR yaw": lambda: mock.patch.object(contradictions, "_DIRECTIONS", ()),
     "beams on the robot": _no_check("OwnBody"),
 }
 """What is left out for the faults whose names begin so."""

@@ -14,6 +14,7 @@ from localization.sensor_checks import SensorChecks
 from localization.synchronizer import StepConfig
 from motion_models import se2
 from motion_models.motion import Motion
+from motion_models.robot_file import load_robot
 from tests.helpers.rooms import ANGLES, ranges
 
 S = 1_000_000_000
@@ -36,7 +37,7 @@ class CheckedDrive:
     ) -> None:
         self.gyro, self.wheels, self.scan, self.has_scans = gyro, wheels, scan, has_scans
         self.nis = nis
-        self.checks = SensorChecks({}, LidarConfig(), StepConfig())
+        self.checks = SensorChecks({}, LidarConfig(), StepConfig(), load_robot("husky_a200"))
         self.estimator = DeadReckoning()  # of which estimates have no innovations
         self.applied: list[Step] = []
         self.estimates: list[Estimate] = []

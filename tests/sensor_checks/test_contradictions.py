@@ -8,16 +8,10 @@ import re
 import numpy as np
 import pytest
 
-from localization.sensor_checks.contradictions import (
-    GYRO_OPPOSITE,
-    GYRO_STUCK,
-    GYRO_UNIT,
-    LIDAR_DIRECTION,
-    LIDAR_OPPOSITE,
-    WHEELS_OPPOSITE,
-)
+from localization.sensor_checks.contradictions import GYRO_STUCK, LIDAR_DIRECTION
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
+from localization.sensor_checks.turn_votes import GYRO_OPPOSITE, GYRO_UNIT, LIDAR_OPPOSITE, WHEELS_OPPOSITE
 from tests.helpers import corridors
 from tests.helpers.checked_drive import CheckedDrive, turned
 from tests.helpers.event_faults import bump_lidar, named_faults, turn_scans, without_gyro

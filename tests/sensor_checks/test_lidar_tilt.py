@@ -16,6 +16,7 @@ from localization.simulation import world
 from localization.synchronizer import StepConfig
 from motion_models.motion import Motion
 from motion_models.robot import Mount
+from motion_models.robot_file import load_robot
 from tests.helpers import rooms
 
 LAB = world.lab().walls
@@ -51,7 +52,7 @@ def test_lidar_tilt_with_tilted_mount_is_silent() -> None:
 
 
 def test_tilted_clouds_of_steps_are_reported_by_the_checks() -> None:
-    checks = SensorChecks({"laser": Mount(z=0.8)}, LidarConfig(), StepConfig())
+    checks = SensorChecks({"laser": Mount(z=0.8)}, LidarConfig(), StepConfig(), load_robot("husky_a200"))
     points = rooms.cloud(LAB, np.zeros(3), 0, math.radians(5.0)) - np.array([0.0, 0.0, 0.8])
     for k in range(12):
         scan = Scan(k * 500_000_000, points, frame_id="laser", is_planar=False)

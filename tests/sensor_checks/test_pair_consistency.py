@@ -106,7 +106,7 @@ class Driven:
     def __init__(self, parameter: str = "k_0", owner: str = "the robot", robot: Robot | None = None, bias_sigma: float = 0.0) -> None:
         self.parameter, self.owner, self.bias_sigma = parameter, owner, bias_sigma
         self.faults = FaultLog(CovarianceInflation())
-        self.check = SensorConsistency(self.faults, robot)
+        self.check = SensorConsistency(self.faults, {} if robot is None else usual_errors(robot))
         self.seconds = 0.0
 
     def drive(
@@ -221,7 +221,7 @@ def test_healthy_parameters_are_outside_their_prior_as_often_as_it_allows_and_ne
     """Monte Carlo of 2000 robots that are off their files by the prior, measured to a third of it; and by ten times as much."""
     rng, prior, noise = np.random.default_rng(3), 0.05, 0.017
     variance = 1.0 / (1.0 / prior**2 + 1.0 / noise**2)
-    check = SensorConsistency(FaultLog(CovarianceInflation()))
+    check = SensorConsistency(FaultLog(CovarianceInflation()), {})
     measured = scale * prior * rng.normal(size=2000) + noise * rng.normal(size=2000)
     learned = [LearnedParameter("x_cr_0", m * variance / noise**2, math.sqrt(variance), 0.0, prior) for m in measured.tolist()]
     outside = np.mean([_is_outside_prior(p) for p in learned])
