@@ -7,6 +7,7 @@ has nothing else.
 
 from __future__ import annotations
 
+import cmath
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -61,6 +62,8 @@ _OUTLIER = math.log(1000.0)
 """Logarithm of the odds that a reading of a single publisher is no outlier: the most that one reading says for two [nats]."""
 _RESOLUTION = 1e-3
 """Least scale of changes: less is rounding [m, m/s, rad/s]."""
+_DITHER = 2.0
+"""Steps of an encoder by which readings of one publisher alternate: a speed or an angle between two counts, of both sides at once."""
 _SCALE_STEP = 0.1
 """Step of the logarithm of a scale by each reading."""
 _FOLLOW = 0.3
@@ -261,7 +264,7 @@ class _PublisherState:
 @dataclass
 class _Publisher:
     stamp_ns: int
-    values: list[float]
+    values: list[complex]
     travelled: float = 0.0
     """Since there are two publishers [m]."""
 
@@ -271,8 +274,8 @@ class PublisherSeparator:
 
     Each of two goes on from its own last reading; a single one goes on from the last reading or, where readings are noise about a speed,
     from their mean. The odds of two grow by the density of a reading by two, less the price of a label, over that by one, which has
-    either's scales: of one publisher the scales are as free as of two. Densities are Cauchy's, with scales by maximum likelihood. The
-    publisher whose wheels travel more is used, of equal ones one.
+    either's scales: of one publisher the scales are as free as of two. Densities are Cauchy's, with scales by maximum likelihood, of what
+    changes by more than `_DITHER` steps of the encoders. The publisher whose wheels travel more is used, of equal ones one.
     """
 
     def __init__(self) -> None:
@@ -282,14 +285,14 @@ class PublisherSeparator:
         self._log_odds = _ARE_TWO
         self._largest = 0.0  # cost of the jump that made the other one
         self._sizes: list[float] = []
-        self._mean: list[float] = []
+        self._mean: list[complex] = []
         self._sizes_of_one: tuple[list[float], list[float]] = [], []
         """Scales of changes since the last reading, and from the mean."""
         self._steps: list[float] = []
         """Least change of each value by either of two publishers: the step of an encoder that counts coarsely."""
 
-    def admit(self, stamp_ns: int, values: Sequence[float], speed: float) -> bool:
-        """Whether a reading of ``values`` (velocities, place; NaN where absent) at ``speed`` [m/s] is to be used."""
+    def admit(self, stamp_ns: int, values: Sequence[complex], speed: float) -> bool:
+        """Whether a reading of ``values`` (velocities, place as x + iy; NaN where absent) at ``speed`` [m/s] is to be used."""
         current = self._current
         if current is None:
             self._current = _Publisher(stamp_ns, list(values))
@@ -310,7 +313,7 @@ class PublisherSeparator:
             self._used = max(used, rival, key=lambda publisher: publisher.travelled)
         return current is self._used
 
-    def _chosen(self, current: _Publisher, stamp_ns: int, values: Sequence[float]) -> _Publisher:
+    def _chosen(self, current: _Publisher, stamp_ns: int, values: Sequence[complex]) -> _Publisher:
         """The publisher of a reading; the one before, where it is another, is the other one."""
         changes, other = _changes(values, current.values), self._other
         back = changes if other is None else _changes(values, other.values)
@@ -336,9 +339,9 @@ class PublisherSeparator:
 
     def _cost(self, changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``changes`` by either of two publishers, without that of the scales."""
-        return _cauchy(changes, self._scales(self._sizes))
+        return _cauchy(self._beyond_dither(changes), self._scales(self._sizes))
 
-    def _cost_of_one(self, values: Sequence[float], changes: Sequence[float]) -> float:
+    def _cost_of_one(self, values: Sequence[complex], changes: Sequence[float]) -> float:
         """Minus the logarithm of the density of ``values`` by a single publisher, of whose two predictions the better one so far counts."""
         off = _changes(values, self._mean)
         last, mean = self._sizes_of_one
@@ -347,10 +350,17 @@ class PublisherSeparator:
         scales = self._scales([size for size, _ in found])
         self._sizes_of_one = _fitted(last, changes), _fitted(mean, off)
         self._mean = [
-            m if not math.isfinite(v) else v if math.isnan(m) else m + _FOLLOW * (v - m) for m, v in zip(self._mean, values, strict=True)
+            m if not cmath.isfinite(v) else v if cmath.isnan(m) else m + _FOLLOW * (v - m) for m, v in zip(self._mean, values, strict=True)
         ]
         of_one = [change for _, change in found]
-        return _cauchy(of_one, scales) + _log_scales(of_one, scales)
+        return _cauchy(self._beyond_dither(of_one), scales) + _log_scales(of_one, scales)
+
+    def _beyond_dither(self, changes: Sequence[float]) -> list[float]:
+        """What ``changes`` are more than encoders that count forth and back."""
+        return [
+            change if math.isinf(step) else max(change - _DITHER * step, 0.0 * change)
+            for change, step in zip(changes, self._steps, strict=True)
+        ]
 
     def _scales(self, sizes: Sequence[float]) -> list[float]:
         """Scales of the densities of changes of such ``sizes``: no value is finer than its step."""
@@ -360,7 +370,7 @@ class PublisherSeparator:
         self._sizes = _fitted(self._sizes, changes)
 
 
-def _changes(values: Sequence[float], before: Sequence[float]) -> list[float]:
+def _changes(values: Sequence[complex], before: Sequence[complex]) -> list[float]:
     """Sizes of the changes of ``values`` from those ``before``; NaN where they are not known."""
     changes = [abs(a - b) for a, b in zip(values, before, strict=True)]
     return [change if change < math.inf else math.nan for change in changes]
@@ -621,7 +631,7 @@ class OdometryToWheels:
     def __call__(self, reading: OdometryReading) -> Iterator[WheelSample]:
         """The wheel sample of the next reading; none where it is not used."""
         twist = [math.nan] * 3 if self._pose_has_moved else reading.twist.tolist()  # speeds and headings jump by a count and return
-        values = [*twist, *reading.pose[:2].tolist()]
+        values = [*twist, complex(*reading.pose[:2].tolist())]
         if not self._publishers.admit(reading.stamp_ns, values, float(np.hypot(*reading.twist[:2]))):
             self._stats.count(self._topic, Oddity.SECOND_PUBLISHER)
             return
