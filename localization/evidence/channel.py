@@ -6,8 +6,9 @@ c_i ~ N(0, tau_i^2), a bias b_i of gyros, and n_i ~ N(0, V_i), V_i = floor_i^2 +
 
     log p(z) = -1/2 [z' V^-1 z - (a' V^-1 z)^2 / C + log|V| + log(C S^2) + k log 2 pi],    C = a' V^-1 a + S^-2,
 
-(Rasmussen & Williams 2006, A.3). Scales and biases are those of the maximum, with the width of their posterior (Laplace). In a share of the
-bins one source is somewhere else, or all are: a mixture. A profile shows this to be most of the time of a set-up: hence the loops.
+(Rasmussen & Williams 2006, A.3). Scales and biases are those of the maximum, with the width of their posterior (Laplace); encoders of a
+robot that stands show no scale. In a share of the bins one source is somewhere else, or all are: a mixture. A profile shows this to be most
+of the time of a set-up: hence the loops.
 """
 
 from __future__ import annotations
@@ -40,20 +41,20 @@ def channel_evidence(
     tau: FloatArray,
     bias_sigma: FloatArray,
     size: float,
-    least: FloatArray,
-    still: FloatArray,
+    at_rest: tuple[FloatArray, FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Tempered evidence by bin (A, n); that of the size, the scales and the biases (A,); scales' logarithms and the data's information on
     them (A, k).
 
     ``z`` (A, k, n): A alternatives of k sources in n bins, NaN where unknown; ``floor`` (A, k, n); ``bias_sigma`` (k,); ``relative`` and
-    ``tau`` (A, k); ``size``: prior standard deviation of the motion; ``least`` (A,): what is smaller is no motion; ``still`` (A, n):
-    standard deviation of the motion of a robot that stands.
+    ``tau`` (A, k); ``size``: prior standard deviation of the motion; ``at_rest``: least motion (A,), standard deviation (A, n) of the
+    motion of a robot that stands, and (k, n) 0 where a source shows no scale there, as encoders that count nothing, else 1.
     """
     A, k, n = z.shape
+    least, still, is_scaled = at_rest
     of_bins, price = np.zeros((A, n)), np.zeros(A)
     c, information = np.zeros((A, k)), np.zeros((A, k))
-    x, b = np.zeros(n), np.zeros(k)
+    x, b, scale_at_rest = np.zeros(n), np.zeros(k), np.ones(k)
     for i in range(A):
         noise = floor[i], relative[i]
         b[:] = 0.0
@@ -68,7 +69,8 @@ def channel_evidence(
         own, moving = _size_of_motion(z[i], noise, scale, b, size, x, least[i])
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
         for m in range(n):
-            of_bins[i, m] = TEMPER * _bin_evidence(z[i], noise, m, scale, b, (own, still[i, m], moving), x[m])
+            scale_at_rest[:] = scale ** is_scaled[:, m]
+            of_bins[i, m] = TEMPER * _bin_evidence(z[i], noise, m, (scale, scale_at_rest), b, (own, still[i, m], moving), x[m])
     return of_bins, price, c, information
 
 
@@ -177,14 +179,14 @@ def _size_of_motion(
 
 
 @subroutine
-def _bin_evidence(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, motion: tuple[float, float, float], x: float) -> float:
+def _bin_evidence(z: FloatArray, noise: Pair, m: int, a: Pair, b: FloatArray, motion: tuple[float, float, float], x: float) -> float:
     """Log density of bin ``m`` of a drive with this ``motion``: its size where the robot moves, that where it stands, and the share of bins
-    in which it moves."""
+    in which it moves. ``a``: scales (k,) where it moves and where it stands."""
     size, still, moving = motion
-    moves = _of_size(z, noise, m, a, b, size, x)
+    moves = _of_size(z, noise, m, a[0], b, size, x)
     if size <= still:
         return moves
-    stands = _of_size(z, noise, m, a, b, still, x)
+    stands = _of_size(z, noise, m, a[1], b, still, x)
     best = max(moves, stands)
     return best + math.log(moving * math.exp(moves - best) + (1.0 - moving) * math.exp(stands - best))
 

@@ -307,7 +307,7 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
         inputs = _inputs(single, np.zeros((1, len(single)), int), name, 1.0, used)
-        _, _, c, information = channel_evidence(*inputs, _SIZES[name], *_sizes_at_rest(single, np.zeros((1, len(single)), int), name))
+        _, _, c, information = channel_evidence(*inputs, _SIZES[name], _at_rest(single, np.zeros((1, len(single)), int), name, used))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
     return found
@@ -323,22 +323,24 @@ def least_sizes(stacks: Sequence[Stack], choices: Choices, name: str) -> FloatAr
     return np.asarray(np.maximum(_AT_REST * np.minimum(largest, _FAST * _SIZES[name]), STILL[name]))
 
 
-def _sizes_at_rest(stacks: Sequence[Stack], choices: Choices, name: str) -> tuple[FloatArray, FloatArray]:
-    """`least_sizes` (A,), and the size (A, n) of the motion of a robot that stands: where encoders count, in its unit."""
+def _at_rest(stacks: Sequence[Stack], choices: Choices, name: str, used: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """`least_sizes` (A,), the size (A, n) of the motion of a robot that stands, where encoders count in its unit, and (k, n) 1 where the
+    sources ``used`` show their scale."""
     units = [
         np.where(stack._is_scaled, np.maximum(np.exp(stack.log_unit(name)[rows]), 1.0), 1.0)
         for stack, rows in zip(stacks, choices.T, strict=True)
         if stack.channel(name) is not None
     ]
-    return least_sizes(stacks, choices, name), np.asarray(STILL[name] * np.max(units, axis=0))
+    is_scaled = np.array([stacks[i]._is_scaled for i in used], dtype=float)
+    return least_sizes(stacks, choices, name), np.asarray(STILL[name] * np.max(units, axis=0)), is_scaled
 
 
 def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float) -> FloatArray:
     """Evidence (A, n) by bin of one channel, at a level of the noise; what concerns all bins is spread over them."""
     used = [i for i, stack in enumerate(stacks) if stack.channel(name) is not None]
     inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choices, name, level, used)
-    sizes = _SIZES[name], *_sizes_at_rest(stacks, choices, name)
-    of_bins, price, _, _ = channel_evidence(*inputs, *sizes)
+    size, at_rest = _SIZES[name], _at_rest(stacks, choices, name, used)
+    of_bins, price, _, _ = channel_evidence(*inputs, size, at_rest)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
     slips = np.array([NOISE[stacks[i].kind].relative for i in used])
     slides = [(skids, level), (slips, level), *([(skids, 1.0)] if level < 1.0 else [])]  # the floor is not as quiet as the sensors
@@ -347,14 +349,14 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float
         skidding = np.where(skids[:, None] > 0.0, skidding, floor)
         of_share = np.ascontiguousarray(np.where(skids > 0.0, slip_level * part, relative))
         of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
-        of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, *sizes)
+        of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, size, at_rest)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
         of_bins = np.where(is_better[:, None], of_sliding, of_bins)
         price = np.where(is_better, price_of_sliding + _SKID_ODDS, price)
     is_alone = np.isfinite(z).any(axis=2).sum(axis=1) < 2
     found = of_bins + price[:, None] / z.shape[2]
     if is_alone.any():
-        found[is_alone] = (_of_one_source(stacks, choices, name, used, sizes[1]) / z.shape[2])[is_alone, None]
+        found[is_alone] = (_of_one_source(stacks, choices, name, used, at_rest[0]) / z.shape[2])[is_alone, None]
     return np.asarray(found)
 
 

@@ -162,7 +162,8 @@ def search(stacks: Sequence[Stack]) -> Found:
             against[key] = min(value, against.get(key, math.inf))
     best = [choice for choice in sorted(found, key=found.__getitem__, reverse=True)[:_RESCORED] if found[choice] > -_FAR]
     evidence, changed = with_changes(evidence, list(dict.fromkeys([*best[:_CHANGED], null])))
-    kept = list(dict.fromkeys([null, *best, *changed]))
+    simpler = [(*choice[:i], 0, *choice[i + 1 :]) for choice in best for i in range(len(stacks))]
+    kept = list(dict.fromkeys([null, *best, *simpler, *changed]))
     return Found(dict(zip(kept, _marginal(evidence, kept).tolist(), strict=True)), against, evidence.stacks)
 
 

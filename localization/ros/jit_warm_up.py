@@ -77,7 +77,7 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
         model.estimate(np.zeros_like(model.chain.lower))
     of_two = np.ones((1, 2))
     of_bins = np.ones((1, 2, 2))  # of the set-up of the first minute
-    channel_evidence(of_bins, of_bins, of_two, of_two, of_two[0], 1.0, of_two[0], of_two)
+    channel_evidence(of_bins, of_bins, of_two, of_two, of_two[0], 1.0, (of_two[0], of_two, of_two))
     predictor = Predictor(trial.model, run.robot, run.config.step)
     _predict_alone(predictor, WheelBuffer(run.robot.center_of_gravity))
     for event in synthetic_drive(is_planar):

@@ -15,13 +15,14 @@ FREE = 50.0
 """Sigma of the logarithm of a scale of which nothing is known."""
 
 
-def _evidence(z: np.ndarray, floor: np.ndarray, tau: tuple[float, ...]) -> float:
-    """Of one choice: sources (k, n) with floors (k,)."""
+def _evidence(z: np.ndarray, floor: np.ndarray, tau: tuple[float, ...], is_scaled: np.ndarray | None = None) -> float:
+    """Of one choice: sources (k, n) with floors (k,), which show their scale where ``is_scaled`` (k, n)."""
     k, n = z.shape
+    is_scaled = np.ones((k, n)) if is_scaled is None else is_scaled
     floors = np.ascontiguousarray(np.broadcast_to(floor[:, None], (k, n)))[None]
     noise = floors, np.full((1, k), 0.05)
     of_bins, price, _, _ = channel_evidence(
-        z[None].copy(), *noise, np.array([tau]), np.zeros(k), 0.5, np.full(1, 0.02), np.full((1, n), 0.02)
+        z[None].copy(), *noise, np.array([tau]), np.zeros(k), 0.5, (np.full(1, 0.02), np.full((1, n), 0.02), is_scaled)
     )
     return float(of_bins.sum() + price[0])
 
@@ -58,3 +59,14 @@ def test_sources_that_contradict_each_other_have_a_finite_evidence(noise: float)
     ]
     assert np.isfinite(found).all()
     assert max(found) < _evidence(np.stack([motion, motion, motion]), np.full(3, noise), (0.03,) * 3)
+
+
+def test_encoders_of_a_robot_that_mostly_stands_show_no_scale_at_rest() -> None:
+    """Turns in a few bins refute a driver that turns by half; that it counts nothing in all others does not make it probable."""
+    rng = np.random.default_rng(14)
+    is_moving = np.arange(150) < 10
+    motion = np.where(is_moving, 0.5, 0.0)
+    gyro = motion + 0.0025 * rng.normal(size=150)
+    is_scaled = np.stack([is_moving, np.ones(150)]).astype(float)
+    right, half = (_evidence(np.stack([a * motion, gyro]), np.array([2e-3, 6e-4]), (0.2, 0.03), is_scaled) for a in (1.0, 0.5))
+    assert right > half
