@@ -11,7 +11,7 @@ from types import ModuleType
 import numba
 import pytest
 
-from motion_models.compiled import fingerprint
+from motion_models.jit import fingerprint
 
 PART = """
 from typing import NamedTuple
@@ -34,7 +34,7 @@ def total(pair: Pair) -> float:
     return add(pair)
 
 FOUND = total(Pair(1.0, 2.0))
-STORED = len(total.stats.cache_hits)
+STORED = len(total.compiled.stats.cache_hits)
 """
 
 
