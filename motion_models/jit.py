@@ -45,10 +45,10 @@ def compile_kernel(function: Callable[..., Any], **options: bool) -> Any:
         return numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload]
 
 
-@typeof_impl.register(CompiledFunction)  # type: ignore[untyped-decorator]
+@typeof_impl.register(CompiledFunction)
 def _type_of_kernel(function: CompiledFunction, context: Any) -> Any:
     """To numba, a kernel that another one calls is what it has compiled itself."""
-    return numba.typeof(function.compiled)
+    return numba.typeof(function.compiled)  # type: ignore[no-untyped-call]
 
 
 class KernelCacheLocator(caching._CacheLocator):

@@ -12,6 +12,7 @@ from localization.lidar.correlative_search import OUTLIER_COST, find_place, prio
 from localization.lidar.key_scans import KeyScanError, KeyScans, key_scan_noise
 from localization.lidar.registration import Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
 from localization.lidar.submap import voxel_means
+from localization.small_filters import FORGETTING
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
 
@@ -19,8 +20,6 @@ MIN_POINTS = 10
 """Points without which a scan is not matched."""
 _CELL_OF_RANGE = 0.02
 """Voxel of a submap, as a share of the first scan's median range: in five buildings and six rooms 3 % is as robust and less precise."""
-FORGETTING = 0.98
-"""Factor per measurement of older statistics of residuals, innovations and slip: they are means over the last 50."""
 _NO_OFFSET = np.zeros(3)
 MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without

@@ -18,7 +18,7 @@ from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import OTHER_TYPES, TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, names_of, short_type
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
-from localization.ros.settings import Names
+from localization.ros.node_config import Names
 from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount, Robot
 
