@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -57,9 +56,10 @@ class OnlineCommand(CommandOptions, OnlineSettings):
             with StopSignal() as stop, run.files.claimed():
                 if self.log is not None:
                     self._play(console, self.log, rate, run, stop, view)
+                elif early is not None:
+                    self._spin(console, run, stop, view, early.transport, early)
                 else:
-                    with nullcontext(early.transport) if early is not None else listening(self, run.node, console) as transport:
-                        self._spin(console, run, stop, view, transport, early)
+                    self._listen(console, run, stop, view)
         finally:
             if view is not None:
                 view.close()
@@ -132,8 +132,12 @@ class OnlineCommand(CommandOptions, OnlineSettings):
             console.print(f"{self.out}: {count} estimates, up to where the run was stopped", markup=False, soft_wrap=True)
         raise KeyboardInterrupt
 
+    def _listen(self, console: Console, run: LiveRun, stop: StopSignal, view: View | None) -> None:
+        with listening(self, run.node, console) as transport:
+            self._spin(console, run, stop, view, transport)
+
     def _spin(
-        self, console: Console, run: LiveRun, stop: StopSignal, view: View | None, transport: Transport, early: EarlyOdometry | None
+        self, console: Console, run: LiveRun, stop: StopSignal, view: View | None, transport: Transport, early: EarlyOdometry | None = None
     ) -> None:
         def report(text: str) -> None:
             print_warning(console, text)

@@ -109,7 +109,7 @@ class TopicDiscovery:
         self.adopt(self._transport.publishers())
         while not is_over():
             if is_ready() or len(self._backlog) < MAX_BACKLOG:
-                for received in self._transport.take(_POLL_S):
+                for received in self._transport.take(_POLL_S, batch_s=_POLL_S):  # to ask who publishes takes longer than ten messages
                     self._receive(received)
             else:
                 time.sleep(_POLL_S)
