@@ -6,7 +6,6 @@ Numba itself is imported then: the first odometry of a node does not wait for it
 from __future__ import annotations
 
 import functools
-import importlib
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,8 +29,8 @@ _thread = _Thread()
 
 @contextmanager
 def interpreted() -> Iterator[None]:
-    """Inside, this thread runs compiled functions as Python: for a few numbers, where neither numba nor machine code shall be waited for.
-    Results are the same up to rounding."""
+    """Inside, this thread runs what is not compiled yet as Python: for a few numbers, where neither numba nor machine code shall be waited
+    for. Results are the same up to rounding."""
     before, _thread.is_interpreted = _thread.is_interpreted, True
     try:
         with np.errstate(all="ignore"):
@@ -41,18 +40,23 @@ def interpreted() -> Iterator[None]:
 
 
 class CompiledFunction:
-    """A function that is compiled at its first call. Inside `interpreted` it runs as Python."""
+    """A function that is compiled at its first call, which puts the compiled one in its place in its module: later calls pass nothing else.
+    Before that, it runs as Python inside `interpreted`."""
 
     def __init__(self, function: Callable[..., Any], compile_function: Callable[[], Any], python: Callable[..., Any]) -> None:
         """``compile_function`` gives the compiled form of ``function``, ``python`` is the interpreted one."""
         functools.update_wrapper(self, function)
+        self._module, self._name = function.__globals__, function.__name__
         self._compile, self._python, self._compiled, self._lock = compile_function, python, None, threading.Lock()
 
     def __call__(self, *args: Any) -> Any:
         """Run it."""
         if _thread.is_interpreted:
             return self._python(*args)
-        return (self._compiled or self.compiled)(*args)
+        result = self.compiled(*args)
+        if self._module.get(self._name) is self:
+            self._module[self._name] = self._compiled
+        return result
 
     @property
     def compiled(self) -> Any:
@@ -65,12 +69,21 @@ class CompiledFunction:
 
 def kernel(function: _Function) -> _Function:
     """A loop that Python calls, compiled once for each set of argument types. Division by zero gives inf or NaN, as in numpy."""
-    return cast(_Function, CompiledFunction(function, lambda: _jit().compile_kernel(function), function))
+    return _kernel(function)
 
 
 def threaded_kernel(function: _Function) -> _Function:
     """A `kernel` during which other threads of Python run: for loops of more than some milliseconds beside the estimates."""
-    return cast(_Function, CompiledFunction(function, lambda: _jit().compile_kernel(function, nogil=True), function))
+    return _kernel(function, nogil=True)
+
+
+def _kernel(function: _Function, **options: bool) -> _Function:
+    def compile_function() -> Any:
+        from motion_models.jit import compile_kernel
+
+        return compile_kernel(function, **options)
+
+    return cast(_Function, CompiledFunction(function, compile_function, function))
 
 
 def gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
@@ -78,7 +91,9 @@ def gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
 
     def decorate(function: Callable[..., None]) -> Callable[..., Any]:
         def compile_function() -> Any:
-            return importlib.import_module("motion_models.jit_gufunc").compile_gufunc(function, layout)
+            from motion_models.jit_gufunc import compile_gufunc
+
+            return compile_gufunc(function, layout)
 
         return CompiledFunction(function, compile_function, np.vectorize(_returning(function, layout), signature=layout))
 
@@ -106,8 +121,3 @@ def subroutine(function: _Function) -> _Function:
     """A part of kernels, compiled with them. Called from Python, it is interpreted."""
     subroutines.append(function)
     return function
-
-
-def _jit() -> Any:
-    """Numba's side, imported when it is needed first."""
-    return importlib.import_module("motion_models.jit")

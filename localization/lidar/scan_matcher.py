@@ -8,9 +8,10 @@ from typing import Annotated, Literal
 import numpy as np
 
 from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
+from localization.lidar import registration
 from localization.lidar.correlative_search import OUTLIER_COST, find_place, prior_outlier_cov
 from localization.lidar.key_scans import KeyScanError, KeyScans, key_scan_noise
-from localization.lidar.registration import Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
+from localization.lidar.registration import Alignment, align_points, is_narrow, linearize, mahalanobis
 from localization.lidar.submap import voxel_means
 from localization.small_filters import FORGETTING
 from motion_models import se2
@@ -144,7 +145,7 @@ class ScanMatcher:
         where M_g is the information of all parts beyond gap g, seen from the middle, as a step of w there displaces them all.
         """
         order, H = np.argsort(times, kind="stable"), np.empty((_SWEEP_PARTS, 3, 3))
-        fill_informations(self.submap.grid, points[order], triple(pose), H)
+        registration.fill_informations(self.submap.grid, points[order], triple(pose), H)
         t = times[order[(np.arange(0.5, _SWEEP_PARTS) * len(points) / _SWEEP_PARTS).astype(np.intp)]]  # of the middle of each part
         later, earlier = H[::-1].cumsum(axis=0)[::-1][1:], H.cumsum(axis=0)[:-1]
         after, before = np.diff(np.maximum(t, 0.0)), np.diff(np.minimum(t, 0.0))  # how much of each gap is on either side of the middle

@@ -34,7 +34,7 @@ def total(pair: Pair) -> float:
     return add(pair)
 
 FOUND = total(Pair(1.0, 2.0))
-STORED = len(total.compiled.stats.cache_hits)
+STORED = len(total.stats.cache_hits)
 """
 
 
