@@ -170,8 +170,9 @@ def _run(name: str, options: Sequence[str]) -> None:
         return
     check_arguments(name, COMMANDS[name][0], options)
     console = PlainConsole(highlight=False)
-    with _begin_early(name, options, console) as early:
+    with contextlib.ExitStack() as running:
         with _paused_garbage_collection():
+            early = running.enter_context(_begin_early(name, options, console))
             command = parse(name, options)
         command.run(console, *early)
 
@@ -192,11 +193,9 @@ def _begin_early(name: str, options: Sequence[str], console: Console) -> Iterato
     if name != "online" or any(option == "--help-all" or option.startswith("--config.") for option in options):
         yield ()
         return
-    with _paused_garbage_collection():
-        from localization.commands.online_options import EarlyOptions
+    from localization.commands.online_options import EarlyOptions
 
-        command = _parse_as(EarlyOptions, name, options)
-    with command.begin(console) as early:
+    with _parse_as(EarlyOptions, name, options).begin(console) as early:
         yield () if early is None else (early,)
 
 

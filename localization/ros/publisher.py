@@ -89,7 +89,7 @@ class EstimatePublisher:
 
     @classmethod
     def of_node(cls, transport: Transport, config: NodeConfig) -> EstimatePublisher:
-        """As ``config`` has it. Subscribers have found its topics by the first estimate, if it is made at the start."""
+        """A publisher as ``config`` has it. Subscribers have found its topics by the first estimate, if it is made at the start."""
         return cls(
             transport,
             config.names,
