@@ -78,13 +78,14 @@ class EarlyOdometry:
         predictor = Predictor(make_model(self._model, robot), robot, StepConfig(), node.predict_hz)
         self.interim, self.waiting = InterimOdometry(predictor, WheelBuffer(robot.center_of_gravity)), WaitingMessages.of(stream)
         messages = discovered.backlog
-        while not is_stopped():
+        while True:
             for received in messages:
                 self._receive(received, self.interim, self.waiting)
             if self.continuous.last is not None:
                 self._first_ended.set()
+            if is_stopped():  # after all that was taken is stored
+                return discovered
             messages = transport.take(_POLL_S)
-        return discovered
 
     def _receive(self, received: Received, interim: InterimOdometry, waiting: WaitingMessages) -> None:
         waiting.queue.append(received)

@@ -23,9 +23,9 @@ _ESTIMATOR_PACKAGES = ("numba", "scipy", "filterpy", "gtsam", "kiss_icp", "local
 
 
 class HeldTransport(LogTransport):
-    """Holds back messages after the first ``held_after``."""
+    """Holds back messages after the first ``held_after``: the periods of all topics are known by then, and no scan counts as overtaken."""
 
-    held_after, taken = 300, 0
+    held_after, taken = 1200, 0
 
     def take(self, timeout_s: float, batch_s: float = 0.0):
         if self.taken >= self.held_after:
