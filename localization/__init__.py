@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from localization.log_replay import Run, replay
     from localization.logs import Log, TopicOverrides, open_log
     from localization.pipeline import ReplayConfig, Trial
-    from localization.synchronizer import StepConfig
+    from localization.step_config import StepConfig
     from localization.trajectory import Trajectory, read_tum, write_tum
 
 __all__ = [
@@ -47,7 +47,7 @@ _MODULES = {
     "localization.logs": "Log TopicOverrides open_log",
     "localization.pipeline": "ReplayConfig Trial",
     "localization.log_replay": "Run replay",
-    "localization.synchronizer": "StepConfig",
+    "localization.step_config": "StepConfig",
     "localization.trajectory": "Trajectory read_tum write_tum",
 }
 __getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names.split()})

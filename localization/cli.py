@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import importlib
 import io
 import os
@@ -12,14 +13,18 @@ import tempfile
 import traceback
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from localization.blas_threads import use_one_blas_thread
 from localization.commands.arguments import bash_completion, check_arguments
 from localization.commands.common import PlainConsole
 from localization.commands.short_help import short_help
 from motion_models.errors import SkidlocError, no_such
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from localization.ros.early_odometry import EarlyOdometry
 
 _BAD_INPUT = 2
 _DEFECT = 70
@@ -87,6 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given and given[0] in ("-h", "--help"):
             print(overview())
         elif given == ["--version"]:
+            from importlib.metadata import version
+
             print(f"skidloc {version('skidloc')}")
         elif given == ["--completion"]:
             print(bash_completion(COMMANDS))
@@ -162,14 +169,45 @@ def _run(name: str, options: Sequence[str]) -> None:
         print(text)
         return
     check_arguments(name, COMMANDS[name][0], options)
-    parse(name, options).run(PlainConsole(highlight=False))
+    console = PlainConsole(highlight=False)
+    with contextlib.ExitStack() as running:
+        with _paused_garbage_collection():
+            early = running.enter_context(_begin_early(name, options, console))
+            command = parse(name, options)
+        command.run(console, *early)
+
+
+@contextlib.contextmanager
+def _paused_garbage_collection() -> Iterator[None]:
+    """Inside, packages are imported: all that they make stays, and to search it again and again takes a tenth of the time."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+
+
+@contextlib.contextmanager
+def _begin_early(name: str, options: Sequence[str], console: Console) -> Iterator[Collection[EarlyOdometry]]:
+    """Inside, `online` publishes odometry by wheels, for its other packages take seconds to import; not with settings of the estimator."""
+    if name != "online" or any(option == "--help-all" or option.startswith("--config.") for option in options):
+        yield ()
+        return
+    from localization.commands.online_options import EarlyOptions
+
+    with _parse_as(EarlyOptions, name, options).begin(console) as early:
+        yield () if early is None else (early,)
 
 
 def parse(name: str, options: Sequence[str]) -> Any:
     """The command ``name`` with its ``options``, to be run. Raises `SystemExit` (2) for what it does not have."""
+    return _parse_as(getattr(importlib.import_module(f"localization.commands.{module_of(name)}"), COMMANDS[name][0]), name, options)
+
+
+def _parse_as(command: Any, name: str, options: Sequence[str]) -> Any:
+    """A ``command`` of the command line ``name`` with its ``options``."""
     import tyro
 
-    command = getattr(importlib.import_module(f"localization.commands.{module_of(name)}"), COMMANDS[name][0])
     options = _expand(options, set(_three_state_options(command)))
     try:
         return tyro.cli(command, prog=f"skidloc {name}", args=options, config=(tyro.conf.FlagCreatePairsOff,))

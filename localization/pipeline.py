@@ -27,7 +27,8 @@ from localization.estimators import (
 from localization.events import Event, ImuSample, PositionSample, Scan
 from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
-from localization.synchronizer import StepConfig, Synchronizer
+from localization.step_config import StepConfig
+from localization.synchronizer import Synchronizer
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, add_correction_parameters, make_corrections
 from motion_models.robot import Mount, Robot

@@ -1,4 +1,4 @@
-"""Steps of Kalman filters of a few states within compiled loops, in place."""
+"""Steps of Kalman filters of a few states within compiled loops, in place; and for how long statistics are kept."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import numpy as np
 
 from motion_models.compiled import subroutine
 from motion_models.se2 import FloatArray
+
+FORGETTING = 0.98
+"""Factor per measurement of older statistics of residuals, innovations and slip: they are means over the last 50."""
 
 
 @subroutine

@@ -3,55 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import replace
 
-import numpy as np
-
-from localization.bounded_settings import Positive, Settings, at_least
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, Turn, WheelSample, turn_twist
 from localization.inertial import InertialSensors
 from localization.scan_queue import ScanQueue
+from localization.step_config import StepConfig
 from localization.wheel_gaps import UnknownVelocity
 from localization.wheel_motion import WheelMotion
 from motion_models.base import MotionModel
 from motion_models.robot import Mount, Robot
-from motion_models.se2 import FloatArray, Twist2
+from motion_models.se2 import FloatArray
 
 _SCAN_WAIT_NS = 1_000_000_000
 """Wait for the first scan after the first wheel sample [ns]; later, the drive starts by wheels alone."""
 
 _WAIT_PERIODS = 1.5
 """For how many periods of the wheels a scan waits for their next sample, where that is longer than the settings' time."""
-
-
-@dataclass(frozen=True)
-class StepConfig(Settings):
-    """How the time between events is cut into steps."""
-
-    max_step_s: Annotated[float, at_least(0.001)] = 0.25
-    """A step ends at a scan; where none comes for this long, it ends without one [s]."""
-    no_lidar_step_s: Positive = 0.05
-    """Shortest step in a log without a LiDAR [s]; it ends at the last stamp that wheels and gyro have both reached."""
-    wait_s: float = 0.3
-    """How long a scan waits for the wheel samples around it before it is used without them, and wheels for the gyro [s]; at least 1.5
-    periods of the wheels."""
-    max_hold_s: float = 0.5
-    """How long the last wheel rates are held when no more come [s]; at least two periods of the wheels."""
-    lost_speed_m_s: Positive = 0.5
-    """Sigma of the unknown constant speed while wheel data are missing [m/s]."""
-    lost_rate_rad_s: Positive = 0.5
-    """Sigma of the unknown constant turn rate while wheel data are missing [rad/s]."""
-    slopes: bool = True
-    """Model gravity on slopes where the IMU's accelerometer shows that the ground tilts. --no-slopes: all ground is level."""
-    planar: bool | None = None
-    """Estimate poses in the plane; false: in space, which takes an IMU with an accelerometer and a 3D LiDAR. None: in the plane, until the
-    IMU shows that the ground tilts while there are clouds of a 3D LiDAR."""
-
-    @property
-    def unknown_sigma(self) -> Twist2:
-        """(3,) of a twist that no wheel shows [m/s, m/s, rad/s]."""
-        return np.array([self.lost_speed_m_s, self.lost_speed_m_s, self.lost_rate_rad_s])
 
 
 class Synchronizer:

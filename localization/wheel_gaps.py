@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from localization.lidar import FORGETTING
+from localization.small_filters import FORGETTING
 from localization.wheel_buffer import WheelWindow
 from motion_models.compiled import kernel
 from motion_models.se2 import Cov3, FloatArray, Twist2

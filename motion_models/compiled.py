@@ -1,109 +1,123 @@
 """Decorators of compiled loops. Numba compiles a kernel at its first call and stores the machine code on disk.
 
-Compilation takes seconds. A third of it goes into the wrappers for calls from Python and C that `numba.njit` adds to every function: here
-only kernels have one.
+Numba itself is imported then: the first odometry of a node does not wait for it (`interpreted`).
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
-import sys
-from collections.abc import Callable
-from types import ModuleType
-from typing import Any, TypeVar
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar, cast
 
-import numba
-from numba.core import caching
-from numba.extending import register_jitable
+import numpy as np
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 NOT_STORED = (
     "compiled code can be stored neither beside the package nor in the home folder: each start compiles for a minute."
     " Set NUMBA_CACHE_DIR to a folder that can be written."
 )
-_not_stored: list[str] = []
-_PACKAGES = ("motion_models", "localization", "tests")
+
+
+class _Thread(threading.local):
+    is_interpreted = False
+
+
+_thread = _Thread()
+
+
+@contextmanager
+def interpreted() -> Iterator[None]:
+    """Inside, this thread runs what is not compiled yet as Python: for a few numbers, where neither numba nor machine code shall be waited
+    for. Results are the same up to rounding."""
+    before, _thread.is_interpreted = _thread.is_interpreted, True
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    finally:
+        _thread.is_interpreted = before
+
+
+class CompiledFunction:
+    """A function that is compiled at its first call, which puts the compiled one in its place in its module: later calls pass nothing else.
+    Before that, it runs as Python inside `interpreted`."""
+
+    def __init__(self, function: Callable[..., Any], compile_function: Callable[[], Any], python: Callable[..., Any]) -> None:
+        """``compile_function`` gives the compiled form of ``function``, ``python`` is the interpreted one."""
+        functools.update_wrapper(self, function)
+        self._module, self._name = function.__globals__, function.__name__
+        self._compile, self._python, self._compiled, self._lock = compile_function, python, None, threading.Lock()
+
+    def __call__(self, *args: Any) -> Any:
+        """Run it."""
+        if _thread.is_interpreted:
+            return self._python(*args)
+        result = self.compiled(*args)
+        if self._module.get(self._name) is self:
+            self._module[self._name] = self._compiled
+        return result
+
+    @property
+    def compiled(self) -> Any:
+        """What numba makes of the function."""
+        with self._lock:
+            if self._compiled is None:
+                self._compiled = self._compile()
+        return self._compiled
 
 
 def kernel(function: _Function) -> _Function:
     """A loop that Python calls, compiled once for each set of argument types. Division by zero gives inf or NaN, as in numpy."""
-    return _compile(function)
+    return _kernel(function)
 
 
 def threaded_kernel(function: _Function) -> _Function:
     """A `kernel` during which other threads of Python run: for loops of more than some milliseconds beside the estimates."""
-    return _compile(function, nogil=True)
+    return _kernel(function, nogil=True)
 
 
-def _compile(function: _Function, **options: bool) -> _Function:
-    """Stored on disk, where numba finds a folder that can be written; else compiled at each start, which is reported once."""
-    options |= {"no_cfunc_wrapper": True}
-    try:
-        return numba.njit(cache=True, error_model="numpy", **options)(function)  # type: ignore[call-overload, no-any-return]
-    except RuntimeError:
-        if not _not_stored:
-            print(f"skidloc: {NOT_STORED}", file=sys.stderr)
-        _not_stored.append(getattr(function, "__name__", ""))
-        return numba.njit(error_model="numpy", **options)(function)  # type: ignore[call-overload, no-any-return]
+def _kernel(function: _Function, **options: bool) -> _Function:
+    def compile_function() -> Any:
+        from motion_models.jit import compile_kernel
+
+        return compile_kernel(function, **options)
+
+    return cast(_Function, CompiledFunction(function, compile_function, function))
+
+
+def gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
+    """A compiled function of pose-like arguments, the last of which is its result, that broadcasts over leading axes."""
+
+    def decorate(function: Callable[..., None]) -> Callable[..., Any]:
+        def compile_function() -> Any:
+            from motion_models.jit_gufunc import compile_gufunc
+
+            return compile_gufunc(function, layout)
+
+        return CompiledFunction(function, compile_function, np.vectorize(_returning(function, layout), signature=layout))
+
+    return decorate
+
+
+def _returning(function: Callable[..., None], layout: str) -> Callable[..., Any]:
+    """``function``, which fills its last argument, as one that returns it."""
+    *inputs, output = [part.strip("()").split(",") for part in layout.replace("->", ",").replace("),(", ")|(").split("|")]
+
+    def returning(*args: Any) -> Any:
+        sizes = {name: n for names, array in zip(inputs, args, strict=True) for name, n in zip(names, array.shape, strict=True)}
+        out = np.empty([sizes[name] for name in output])
+        function(*args, out)
+        return out
+
+    return returning
+
+
+subroutines: list[Callable[..., Any]] = []
+"""Parts of kernels that numba has not got yet."""
 
 
 def subroutine(function: _Function) -> _Function:
     """A part of kernels, compiled with them. Called from Python, it is interpreted."""
-    return register_jitable(error_model="numpy", no_cfunc_wrapper=True)(function)
-
-
-class KernelCacheLocator(caching._CacheLocator):
-    """Where numba stores machine code of this project: in its usual folder, under a name that has all sources that are compiled into it.
-
-    Numba itself compares the kernel's own file alone: it would go on with an older subroutine or constant of another file, and ends with
-    "Can't get attribute" where a class of a kernel's arguments has another name by now.
-    """
-
-    def __init__(self, usual: Any, fingerprint: str) -> None:
-        self._usual, self._fingerprint, self._py_file = usual, fingerprint, usual._py_file
-
-    @classmethod
-    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> KernelCacheLocator | None:
-        """Called by numba for each function that it caches; None for those of others."""
-        if py_func.__module__.partition(".")[0] not in _PACKAGES:
-            return None
-        classes: list[Any] = [each for each in caching.CacheImpl._locator_classes if each is not cls]
-        usual = (each.from_function(py_func, py_file) for each in classes)
-        found = next((locator for locator in usual if locator is not None), None)
-        return None if found is None else cls(found, fingerprint(py_func.__module__))
-
-    def get_cache_path(self) -> str:
-        """Folder of the usual locator."""
-        return str(self._usual.get_cache_path())
-
-    def get_source_stamp(self) -> str:
-        """Nothing that the name does not have."""
-        return self._fingerprint
-
-    def get_disambiguator(self) -> str:
-        """Part of the files' name."""
-        return f"{self._usual.get_disambiguator()}-{self._fingerprint}"
-
-
-@functools.cache
-def fingerprint(name: str) -> str:
-    """Hash of the source of the module ``name``, of the numbers that it has imported, and of the modules with kernels that it imports."""
-    module = sys.modules[name]
-    with open(module.__file__ or "", "rb") as file:
-        found = hashlib.sha256(file.read())
-    for key, value in list(vars(module).items()):
-        other = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None) or ""
-        if isinstance(value, int | float):
-            found.update(f"{key}={value!r}".encode())
-        elif other != name and other.partition(".")[0] in _PACKAGES and "motion_models.compiled" in _modules(sys.modules[other]):
-            found.update(fingerprint(other).encode())
-    return found.hexdigest()[:12]
-
-
-def _modules(module: ModuleType) -> set[str]:
-    """Modules from which ``module`` has names."""
-    return {getattr(value, "__module__", None) or "" for value in vars(module).values()}
-
-
-caching.CacheImpl._locator_classes.insert(0, KernelCacheLocator)
+    subroutines.append(function)
+    return function

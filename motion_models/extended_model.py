@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from motion_models.base import FieldPrior, ModelWrapper, MotionModel, prior_sigmas
 from motion_models.errors import ModelError
@@ -63,7 +62,9 @@ class ExtendedModel(ModelWrapper):
         if inner is None:
             return None
         added = np.diag([t.sigma**2 for t in self.terms])
-        return FieldPrior(block_diag(inner.cov, added), block_diag(inner.spread, np.zeros_like(added)))
+        apart = np.zeros((len(inner.cov), len(added)))
+        cov, spread = (np.block([[of_inner, apart], [apart.T, own]]) for of_inner, own in ((inner.cov, added), (inner.spread, 0.0 * added)))
+        return FieldPrior(cov, spread)
 
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""

@@ -26,8 +26,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from motion_models.compiled import subroutine
-from motion_models.gufunc import gufunc
+from motion_models.compiled import gufunc, subroutine
 
 FloatArray = NDArray[np.float64]
 """Any shape; the docstring gives it."""

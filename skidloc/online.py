@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from localization.errors import CheckpointError, EventError
+from localization.estimate import Estimate
 from localization.estimators import check_estimator
-from localization.estimators.estimator import Estimate
 from localization.events import CgSample, Event, ImuSample, PositionSample, Reference, Scan, WheelSample
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.predictor import Predictor, extrapolate

@@ -10,9 +10,10 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from localization.events import ImuSample
-from localization.lifting import AttitudeTable, Lifting, Pose3, quaternion, write_tum3
+from localization.lifting import AttitudeTable, Lifting, write_tum3
+from localization.logs.fused_messages import FusedEstimate, odometry_message, transform_message
 from localization.logs.serialization import FusedWriter
-from localization.logs.writer import FusedEstimate, odometry_message, transform_message
+from localization.space_pose import Pose3, quaternion
 from localization.trajectory import Trajectory
 from motion_models import se2
 

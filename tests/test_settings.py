@@ -19,7 +19,7 @@ from localization.simulation.scanners import ScannerConfig, SpinningConfig
 from localization.simulation.sensors import EncoderConfig, GpsConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig
 from localization.simulation.vehicle import VehicleConfig
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 
 ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, EvaluateConfig)
 

@@ -15,7 +15,7 @@ from localization.pipeline import ReplayConfig, Trial
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.registry import make_model
 from motion_models.robot import Robot

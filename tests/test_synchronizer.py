@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from localization.errors import EventError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
-from localization.synchronizer import StepConfig, Synchronizer
+from localization.step_config import StepConfig
+from localization.synchronizer import Synchronizer
 from localization.wheel_buffer import WheelBuffer, WheelWindow
 from localization.wheel_gaps import UnknownVelocity, VelocityWithinIntervals
 from motion_models import se2

@@ -9,16 +9,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import NoReturn
 
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from localization.commands.online_options import CommandOptions, listening, print_warning
 from localization.errors import CheckpointError, OutputError
 from localization.estimators import check_estimator
 from localization.events import Event
@@ -26,11 +25,11 @@ from localization.evidence import open_log_with_set_up
 from localization.output import fingerprint
 from localization.pipeline import Pipeline
 from localization.ros.diagnostics import ERROR, OK, WARN, Status
+from localization.ros.early_odometry import EarlyOdometry
 from localization.ros.node import Node, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by, shared_of
 from localization.ros.settings import LiveRun, OnlineSettings
-from localization.ros.transports import TransportName, open_transport
-from localization.ros.transports.transport import SimTimeTransport
+from localization.ros.transports.transport import Transport
 from motion_models.prior import prior_notes
 from motion_models.registry import advice
 
@@ -46,39 +45,21 @@ _LEARNED = 8  # corrections that are shown; grids of them have dozens
 
 
 @dataclass(frozen=True)
-class OnlineCommand(OnlineSettings):
+class OnlineCommand(CommandOptions, OnlineSettings):
     """Run the estimator live on ROS topics, or on a log as it was recorded."""
 
-    log: tyro.conf.Positional[Path | None] = None
-    """A log to run from, instead of live topics."""
-    rate: str = "1"
-    """Speed at which the log runs: times as fast as it was recorded, or `max`."""
-    view: Literal["terminal", "rerun"] = "terminal"
-    """Live picture: in the terminal, or in rerun's viewer as well (extra `viz`)."""
-    view_file: Path | None = None
-    """New .rrd file to record rerun's picture to, instead of opening its viewer."""
-    dashboard: bool = False
-    """Serve a live page for browsers of this machine: map, path, covariance, scan, learned parameters, faults."""
-    transport: Annotated[TransportName, tyro.conf.arg(aliases=["--door"])] = "auto"
-    """Transport of live topics: ROS 2 by DDS itself (extra `ros2`), by rclpy, or by zenoh (extra `zenoh`, experimental); ROS 1 by rospy.
-    `auto`: rclpy where it is sourced, else DDS, else zenoh, by what is installed."""
-    domain: int | None = None
-    """ROS 2 domain (transports dds and zenoh); by default that of ROS_DOMAIN_ID, or 0."""
-    interface: str | None = None
-    """Network interface or address (transport dds); endpoint of the router (zenoh). `localhost`: this machine only, packets of others are
-    dropped; `default`: what ROS_LOCALHOST_ONLY and ROS_AUTOMATIC_DISCOVERY_RANGE demand, else all of the subnet. Without the option, what
-    these variables demand, else `localhost`."""
-
-    def run(self, console: Console) -> None:
-        """Run the command, with output on ``console``."""
+    def run(self, console: Console, early: EarlyOdometry | None = None) -> None:
+        """Run the command, with output on ``console``; ``early`` has begun on live topics."""
         rate, run = parse_rate(self.rate), self.live_run()
         view = self._view(console)
         try:
             with StopSignal() as stop, run.files.claimed():
                 if self.log is not None:
                     self._play(console, self.log, rate, run, stop, view)
+                elif early is not None:
+                    self._spin(console, run, stop, view, early.transport, early)
                 else:
-                    self._spin(console, run, stop, view)
+                    self._listen(console, run, stop, view)
         finally:
             if view is not None:
                 view.close()
@@ -108,7 +89,7 @@ class OnlineCommand(OnlineSettings):
         finally:
             session.close(forget=is_done)
         for note in dict.fromkeys([*prior_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
-            console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
+            print_warning(console, note)
         for sentence in advice(robot, [trial.model.name]):
             console.print(sentence, markup=False, soft_wrap=True)
         self._summarize(console, session, seconds, count)
@@ -151,17 +132,19 @@ class OnlineCommand(OnlineSettings):
             console.print(f"{self.out}: {count} estimates, up to where the run was stopped", markup=False, soft_wrap=True)
         raise KeyboardInterrupt
 
-    def _spin(self, console: Console, run: LiveRun, stop: StopSignal, view: View | None) -> None:
-        def report(text: str) -> None:
-            console.print(f"[yellow]![/] {escape(text)}", soft_wrap=True)
+    def _listen(self, console: Console, run: LiveRun, stop: StopSignal, view: View | None) -> None:
+        with listening(self, run.node, console) as transport:
+            self._spin(console, run, stop, view, transport)
 
-        transport = open_transport(self.transport, run.node.names, self.domain, self.interface)
-        if run.node.use_sim_time:
-            transport = SimTimeTransport(transport)
-        console.print(f"listening in {transport.place}, compiling meanwhile", markup=False, soft_wrap=True)
+    def _spin(
+        self, console: Console, run: LiveRun, stop: StopSignal, view: View | None, transport: Transport, early: EarlyOdometry | None = None
+    ) -> None:
+        def report(text: str) -> None:
+            print_warning(console, text)
+
         answers = ThreadPoolExecutor(1, "set-up")
         try:
-            node = Node.start(transport, run, report, stop.is_set, view, answers)
+            node = Node.start(transport, run, report, stop.is_set, view, answers, early)
             text = f"running {self.model} in {self.estimator} on {', '.join(node.topics)} of {transport.place}"
             console.print(text, markup=False, soft_wrap=True)
             for sentence in advice(run.robot, [self.model]):
@@ -171,7 +154,6 @@ class OnlineCommand(OnlineSettings):
             count = node.finish()
         finally:
             answers.shutdown(wait=False, cancel_futures=True)
-            transport.close()
         for note in node.warnings():
             report(note)
         self._summarize(console, node.session, node.seconds, count)

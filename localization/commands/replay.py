@@ -37,8 +37,9 @@ from localization.evidence import open_log_with_set_up
 from localization.lifting import write_tum3
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, TopicOverrides
+from localization.logs.fused_messages import MAP_FRAME, PARENT_FRAME, FusedEstimate
 from localization.logs.reference_topics import merge_positions, read_positions
-from localization.logs.writer import MAP_FRAME, PARENT_FRAME, FusedEstimate, write_fused
+from localization.logs.writer import write_fused
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.space_places import make_places
 from localization.output import as_text, check_outputs, fingerprint, versions

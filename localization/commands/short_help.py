@@ -63,7 +63,7 @@ def _class(module: str, name: str) -> tuple[ast.ClassDef, list[Option]]:
     tree = ast.parse(files(package).joinpath(*folders, f"{file}.py").read_text(encoding="utf-8"))  # no folder's __init__ is run
     found = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
     inherited: list[Option] = []
-    for base in (base.id for base in found.bases if isinstance(base, ast.Name)):
+    for base in (base.id for base in reversed(found.bases) if isinstance(base, ast.Name)):  # as dataclasses take fields
         source = next((node for node in tree.body if isinstance(node, ast.ImportFrom) and base in (a.name for a in node.names)), None)
         if source is not None and source.module is not None:
             inherited += _class(source.module, base)[1]

@@ -49,7 +49,7 @@ class WarmUpCommand:
 
 def stored_in(kernel: object) -> Path | None:
     """Folder where numba stores ``kernel``; None where it cannot."""
-    cache = getattr(kernel, "_cache", None)
+    cache = getattr(getattr(kernel, "compiled", kernel), "_cache", None)
     path = getattr(cache, "cache_path", None)
     return None if path is None else Path(path)
 

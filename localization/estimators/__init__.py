@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from localization.core.motion import FilterConfig
 from localization.core.space import SpaceConfig
 from localization.errors import EstimatorError, MapError
+from localization.estimate import Estimate
 from localization.estimators.baselines import DeadReckoning, LidarOdometry
-from localization.estimators.estimator import Estimate, Estimator, LearnedParameter, Residuals
+from localization.estimators.estimator import Estimator, LearnedParameter, Residuals
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion

@@ -9,7 +9,8 @@ import numpy as np
 
 from localization.core.twist import mean_twist, twist_at_end
 from localization.errors import EstimatorError
-from localization.estimators.estimator import NO_POINTS, Estimate, Estimator
+from localization.estimate import Estimate
+from localization.estimators.estimator import NO_POINTS, Estimator
 from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS

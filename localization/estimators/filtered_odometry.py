@@ -7,7 +7,8 @@ from typing import Generic, TypeVar
 
 from localization.core.policies.clock_offset import ClocksApart
 from localization.core.policies.standstill import BiasChange
-from localization.estimators.estimator import Estimator, GyroCalibration, LearnedParameter, Residuals
+from localization.estimate import GyroCalibration
+from localization.estimators.estimator import Estimator, LearnedParameter, Residuals
 from localization.lidar import LostScans
 from motion_models.se2 import FloatArray
 

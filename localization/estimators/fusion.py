@@ -23,14 +23,8 @@ from localization.core.policies.standstill import BIAS_CHANGE_COV, BiasChange, S
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State, Vector
 from localization.core.twist import fuse_turn, mean_twist, slip_change_cov, twist_at_end, wheel_twist_cov
-from localization.estimators.estimator import (
-    NO_POINTS,
-    Estimate,
-    Estimator,
-    GyroCalibration,
-    LearnedParameter,
-    Residuals,
-)
+from localization.estimate import Estimate, GyroCalibration
+from localization.estimators.estimator import NO_POINTS, Estimator, LearnedParameter, Residuals
 from localization.events import Step
 from localization.lidar import LostScans, ScanMatchingSensor
 from motion_models import se2

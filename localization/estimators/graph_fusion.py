@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from localization.bounded_settings import Positive, Settings, Signed
 from localization.core.state import SE2, Group
 from localization.errors import EstimatorError
-from localization.estimators.estimator import Estimate
+from localization.estimate import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_positions import GraphPositions

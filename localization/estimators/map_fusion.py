@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from localization.errors import MapError
-from localization.estimators.estimator import Estimate
+from localization.estimate import Estimate
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.recorded_drive import DriveKeyframe, RecordedDrive
 from localization.estimators.saved_map_fusion import KEYFRAME_ANGLE_RAD, KEYFRAME_DISTANCE_M, PriorMap, SavedMapFusion

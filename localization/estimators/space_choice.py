@@ -9,11 +9,13 @@ import numpy as np
 
 from localization.attitude import AttitudeFilter
 from localization.core.space import SpaceConfig
-from localization.estimators.estimator import Estimate, Estimator
+from localization.estimate import Estimate
+from localization.estimators.estimator import Estimator
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
 from localization.lidar import LidarConfig
-from localization.lifting import Lifting, Pose3
+from localization.lifting import Lifting
+from localization.space_pose import Pose3
 from motion_models.robot import GyroNoise, Mount
 
 

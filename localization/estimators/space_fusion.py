@@ -19,11 +19,12 @@ from localization.core.space import (
 )
 from localization.core.state import State
 from localization.core.twist import twist_at_end
-from localization.estimators.estimator import Estimate, Estimator
+from localization.estimate import Estimate
+from localization.estimators.estimator import Estimator
 from localization.events import Gravity, Step
 from localization.lidar import LidarConfig, LostScans
 from localization.lidar.cloud_sensor import CloudMatchingSensor
-from localization.lifting import Pose3, aligning
+from localization.space_pose import Pose3, aligning
 from motion_models import se3
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray, Points2

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from localization.core.policies.excitation import Excitation
 from localization.core.space import SE3
 from localization.core.state import clip_eigenvalues
-from localization.estimators.estimator import Estimate
+from localization.estimate import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.graph_fusion import GraphConfig, subtract_information
 from localization.estimators.keyframe_motion import MotionPreintegration

@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from localization.errors import EstimatorError, MapError
-from localization.estimators.estimator import Estimate
+from localization.estimate import Estimate
 from localization.estimators.saved_map_fusion import KEYFRAME_ANGLE_RAD, KEYFRAME_DISTANCE_M, PriorMap, SavedMapFusion
 from localization.estimators.space_fusion import SpaceFusion
 from localization.events import Step
-from localization.lifting import Pose3
 from localization.maps import SpaceMap
 from localization.maps.space_localizer import SpaceLocalizer, SpaceMotion
 from localization.maps.space_map import in_units
 from localization.maps.space_places import SpacePlaces
+from localization.space_pose import Pose3
 from localization.trajectory import Trajectory
 from motion_models import se2, se3
 from motion_models.se2 import Cov3, FloatArray, Pose2

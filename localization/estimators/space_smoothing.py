@@ -9,9 +9,10 @@ from localization.errors import EstimatorError
 from localization.estimators.recorded_path import RecordedPath
 from localization.estimators.space_graph import SpaceGraph
 from localization.lidar.cloud_loops import find_loops
-from localization.lifting import Pose3, SpaceTable, Trajectory3
+from localization.lifting import SpaceTable, Trajectory3
 from localization.maps import SpaceMap
 from localization.maps.space_map import in_units
+from localization.space_pose import Pose3
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se3
 from motion_models.se2 import FloatArray, Pose2

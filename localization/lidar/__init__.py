@@ -6,7 +6,6 @@ from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
 from localization.lidar.registration import OUTLIER_SIGMAS
 from localization.lidar.scan_matcher import (
-    FORGETTING,
     MIN_POINTS,
     LidarConfig,
     ScanMatch,
@@ -16,7 +15,6 @@ from localization.lidar.scan_matcher import (
 from localization.lidar.scan_sensor import ScanMatchingSensor
 
 __all__ = [
-    "FORGETTING",
     "MIN_POINTS",
     "OUTLIER_SIGMAS",
     "KeyScanError",

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from localization.lidar import submap
 from localization.lidar.correlative_search import LikelihoodImage, draw_image
-from localization.lidar.submap import VoxelGrid, make_grid, measure_shares
+from localization.lidar.submap import VoxelGrid, make_grid
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
@@ -103,7 +104,7 @@ class KeyScans:
         """
         drawn = np.asarray(se2.transform(pose, points))
         scan = make_grid(drawn, self.cell, self._range_noise_m)
-        shares = measure_shares(self.grid, scan)
+        shares = submap.measure_shares(self.grid, scan)
         key = KeyScan(drawn, pose, np.zeros((3, 3)) if map_cov is None else map_cov)
         self.keys = [*self._fitting_keys(pose, points, map_cov), key]
         self.grid, self._image = self._make_grid(), None

@@ -8,10 +8,12 @@ from typing import Annotated, Literal
 import numpy as np
 
 from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
+from localization.lidar import registration
 from localization.lidar.correlative_search import OUTLIER_COST, find_place, prior_outlier_cov
 from localization.lidar.key_scans import KeyScanError, KeyScans, key_scan_noise
-from localization.lidar.registration import Alignment, align_points, fill_informations, is_narrow, linearize, mahalanobis
+from localization.lidar.registration import Alignment, align_points, is_narrow, linearize, mahalanobis
 from localization.lidar.submap import voxel_means
+from localization.small_filters import FORGETTING
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
 
@@ -19,8 +21,6 @@ MIN_POINTS = 10
 """Points without which a scan is not matched."""
 _CELL_OF_RANGE = 0.02
 """Voxel of a submap, as a share of the first scan's median range: in five buildings and six rooms 3 % is as robust and less precise."""
-FORGETTING = 0.98
-"""Factor per measurement of older statistics of residuals, innovations and slip: they are means over the last 50."""
 _NO_OFFSET = np.zeros(3)
 MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
@@ -145,7 +145,7 @@ class ScanMatcher:
         where M_g is the information of all parts beyond gap g, seen from the middle, as a step of w there displaces them all.
         """
         order, H = np.argsort(times, kind="stable"), np.empty((_SWEEP_PARTS, 3, 3))
-        fill_informations(self.submap.grid, points[order], triple(pose), H)
+        registration.fill_informations(self.submap.grid, points[order], triple(pose), H)
         t = times[order[(np.arange(0.5, _SWEEP_PARTS) * len(points) / _SWEEP_PARTS).astype(np.intp)]]  # of the middle of each part
         later, earlier = H[::-1].cumsum(axis=0)[::-1][1:], H.cumsum(axis=0)[:-1]
         after, before = np.diff(np.maximum(t, 0.0)), np.diff(np.minimum(t, 0.0))  # how much of each gap is on either side of the middle

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from localization.events import Step
+from localization.lidar import registration
 from localization.lidar.deskew import Sweep
 from localization.lidar.key_scans import KeyScanError
 from localization.lidar.kiss_icp import KissIcp, choose_voxel_size
 from localization.lidar.lost_scans import LostScans
 from localization.lidar.merged_sweep import MergedSweeps
-from localization.lidar.registration import prior_error_at_points
 from localization.lidar.scan_matcher import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, choose_cell
 from localization.lidar.scan_policies import MovedRobot, StaleScans
 from motion_models import se2
@@ -96,7 +96,7 @@ class ScanMatchingSensor:
             return None, ""
         guess = None
         if self._kiss is not None:
-            guess = self._kiss.align(deskewed.points, prior, prior_error_at_points(deskewed.planar, cov))
+            guess = self._kiss.align(deskewed.points, prior, registration.prior_error_at_points(deskewed.planar, cov))
         found = self._matcher.match(deskewed.planar, prior, cov, guess, offset)
         if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
             self._scan, self._matcher.is_new_place = None, False

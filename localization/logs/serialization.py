@@ -21,8 +21,8 @@ from rosbags.typesys.store import Typestore
 from localization.logs.chunks import Channel, RawMessage
 from localization.logs.decode import Oddity, UnusableError
 from localization.logs.driver_messages import WheelJoints, as_joint_states, definitions
+from localization.logs.fused_messages import BODY_FRAME, PARENT_FRAME, FusedEstimate, odometry_message, six_by_six, transform_message
 from localization.logs.message_templates import STORE, Message, MessageLayout, Template, store_ros1
-from localization.logs.writer import BODY_FRAME, PARENT_FRAME, FusedEstimate, odometry_message, six_by_six, transform_message
 from motion_models.se2 import FloatArray
 
 _GRAPH_PACKAGE = "rmw_dds_common"

@@ -1,27 +1,14 @@
-"""Write logs: `write_bag` any messages, `write_fused` estimates as one bare .mcap with Odometry for each result, and /tf for one.
-
-Content of the messages, and where ROS's conventions differ from this library's:
-
-- `/NAME/odometry`, nav_msgs/Odometry, `odom` -> `base_link`, or `map` -> `base_link` of estimators that localize; the twist is the body's,
-  with the true vy.
-- The covariance of a pose is, here, that of a perturbation in the body's axes; ROS defines it as that of x, y in the axes of `odom`
-  (REP-103, nav_msgs/Odometry). The block of x, y, yaw is therefore turned by the heading. The covariance of a twist stays in
-  the body's axes, in both.
-- What planar motion does not estimate (z, roll, pitch and their rates) is zero with a variance of `UNKNOWN_VARIANCE`, and so is
-  every variance of an estimate without covariance: robot_localization and similar filters then give it no weight.
-- `/tf` carries the transform to `base_link` of one result only, for a frame can have only one parent.
-"""
+"""Write logs: `write_bag` any messages, `write_fused` estimates as one bare .mcap with Odometry for each result (`/NAME/odometry`), and /tf
+for one, for a frame can have only one parent."""
 
 from __future__ import annotations
 
 import contextlib
 import heapq
-import math
 import re
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,33 +17,12 @@ from rosbags import rosbag1
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from rosbags.typesys.stores.ros2_humble import builtin_interfaces__msg__Time as Time
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__Point as Point
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__Pose as Pose
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__PoseWithCovariance as PoseWithCovariance
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__Quaternion as Quaternion
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__Transform as Transform
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__TransformStamped as TransformStamped
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__Twist as Twist
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__TwistWithCovariance as TwistWithCovariance
-from rosbags.typesys.stores.ros2_humble import geometry_msgs__msg__Vector3 as Vector3
-from rosbags.typesys.stores.ros2_humble import nav_msgs__msg__Odometry as Odometry
-from rosbags.typesys.stores.ros2_humble import std_msgs__msg__Header as Header
-from rosbags.typesys.stores.ros2_humble import tf2_msgs__msg__TFMessage as TFMessage
 
 from localization.errors import OutputError
-from localization.lifting import Pose3, quaternion
+from localization.logs.fused_messages import FusedEstimate, odometry_message, transform_message
 from localization.logs.message_templates import STORE, Message, MessageLayout, Template, store_ros1
 from localization.output import output_errors, refuse_existing
-from motion_models import se2
 from motion_models.se2 import FloatArray
-
-UNKNOWN_VARIANCE = 1e6
-"""Variance of what is not estimated [m^2, rad^2, and per s^2]: ROS drivers' convention for values without information."""
-
-PARENT_FRAME = "odom"
-MAP_FRAME = "map"
-BODY_FRAME = "base_link"
 
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _TF = "tf2_msgs/msg/TFMessage"
@@ -64,8 +30,6 @@ _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _STAMP_END = 2**31 * 10**9  # seconds of a ROS stamp are an int32
 _ROUNDING = 1e-12  # below this a negative variance is that of a filter that has failed, not of its last digit
-_UNKNOWN = np.diag(np.full(6, UNKNOWN_VARIANCE)).ravel()
-_PLANAR = [6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)]  # x, y, yaw among x, y, z, roll, pitch, yaw
 _LATCHED_TOPIC = "/tf_static"
 
 
@@ -148,38 +112,6 @@ def _connect(writer: Any, path: Path, layout: MessageLayout, is_ros1: bool) -> A
         return writer.add_connection(layout.topic, layout.type, typestore=STORE)
 
 
-@dataclass(frozen=True)
-class FusedEstimate:
-    """Pose and twist of one estimator at one moment."""
-
-    stamp_ns: int
-    pose: FloatArray
-    """(3,) x, y, theta of the body in the world [m, m, rad]."""
-    twist: FloatArray
-    """(3,) vx, vy, wz of the body in its own axes [m/s, m/s, rad/s]."""
-    covariance: FloatArray | None = None
-    """(3, 3) of the pose's right (body-frame) perturbation, or None where it is unknown."""
-    twist_covariance: FloatArray | None = None
-    """(3, 3) of the twist, or None where it is unknown."""
-    parent: str = PARENT_FRAME
-    """Frame that the pose is in."""
-    in_space: Pose3 | None = None
-    """The pose in space, of which ``pose`` is the one seen from above: it is written with its (6, 6) covariance."""
-
-    def place(self) -> tuple[FloatArray, FloatArray]:
-        """Position (3,) [m] and quaternion x, y, z, w (4,); on the plane where there is no pose in space."""
-        if self.in_space is not None:
-            return self.in_space.position, np.array(quaternion(self.in_space.rotation))
-        x, y, theta = self.pose.tolist()
-        return np.array([x, y, 0.0]), np.array([0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)])
-
-    def pose_covariance(self) -> FloatArray:
-        """(36,) row-major covariance of x, y, z, roll, pitch, yaw in the parent's axes."""
-        if self.in_space is not None:
-            return self.in_space.covariance.ravel()
-        return six_by_six(None if self.covariance is None else odom_axes(self.covariance, float(self.pose[2])))
-
-
 def write_fused(path: str | Path, results: Mapping[str, Iterable[FusedEstimate]], tf_of: str | None = None) -> None:
     """Write a new bag to ``path`` (.mcap), message by message, in order of stamps; same estimates, same bytes.
 
@@ -238,58 +170,6 @@ def _write_bag(bag: Path, path: Path, results: Mapping[str, Iterable[FusedEstima
 def _write(writer: Writer, path: Path, connection: Connection, stamp_ns: int, data: bytes | memoryview) -> None:
     with _writing(path):
         writer.write(connection, stamp_ns, data)
-
-
-def odometry_message(estimate: FusedEstimate) -> Odometry:
-    """nav_msgs/Odometry."""
-    (x, y, z), turn = estimate.place()
-    vx, vy, wz = (float(v) for v in estimate.twist)
-    return Odometry(
-        header=_header(estimate),
-        child_frame_id=BODY_FRAME,
-        pose=PoseWithCovariance(
-            pose=Pose(position=Point(x=float(x), y=float(y), z=float(z)), orientation=_quaternion(turn)),
-            covariance=estimate.pose_covariance(),
-        ),
-        twist=TwistWithCovariance(
-            twist=Twist(linear=Vector3(x=vx, y=vy, z=0.0), angular=Vector3(x=0.0, y=0.0, z=wz)),
-            covariance=six_by_six(estimate.twist_covariance),
-        ),
-    )
-
-
-def transform_message(estimate: FusedEstimate) -> TFMessage:
-    """tf2_msgs/TFMessage, from the frame of the pose to `base_link`."""
-    (x, y, z), turn = estimate.place()
-    transform = Transform(translation=Vector3(x=float(x), y=float(y), z=float(z)), rotation=_quaternion(turn))
-    return TFMessage(transforms=[TransformStamped(header=_header(estimate), child_frame_id=BODY_FRAME, transform=transform)])
-
-
-def odom_axes(covariance: FloatArray, theta: float) -> FloatArray:
-    """(3, 3) covariance of x, y, yaw in the parent's axes, from that of the body-frame perturbation at heading ``theta`` [rad].
-
-    To first order, compose(pose, exp(e)) moves x, y by R(theta) e_xy and the yaw by e_theta.
-    """
-    turned = se2.rotate_covariance(covariance, theta)
-    return (turned + turned.T) / 2
-
-
-def six_by_six(planar: FloatArray | None) -> FloatArray:
-    """(36,) row-major covariance of x, y, z, roll, pitch, yaw, from the (3, 3) of x, y, yaw."""
-    full = _UNKNOWN.copy()
-    if planar is not None:
-        full[_PLANAR] = planar.ravel()
-    return full
-
-
-def _header(estimate: FusedEstimate) -> Header:
-    stamp_ns = estimate.stamp_ns
-    return Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=estimate.parent)
-
-
-def _quaternion(turn: FloatArray) -> Quaternion:
-    x, y, z, w = map(float, turn)
-    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _check_estimates(name: str, estimates: Iterable[FusedEstimate]) -> Iterator[tuple[str, FusedEstimate]]:

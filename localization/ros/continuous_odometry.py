@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.estimators import Estimate
+from localization.estimate import Estimate
+from localization.ros.publisher import EstimatePublisher
 from localization.ros.start_pose import StartPose
 from motion_models import se2
 from motion_models.se2 import Pose2, Tangent2
@@ -51,6 +52,11 @@ class ContinuousOdometry:
             estimate = StartPose(self._correction, np.outer(correction, correction)).apply(estimate)
         self.last = replace(estimate, pose=odom_T_body(estimate), odometry=None, map_T_odom=None, in_space=None, in_map=None)
         return estimate
+
+    def publish(self, estimate: Estimate, stamp_ns: int, publisher: EstimatePublisher) -> None:
+        """Publish ``estimate``, unless one that is as new was."""
+        if self.last is None or estimate.stamp_ns > self.last.stamp_ns:
+            publisher.publish_continuous(self.place(estimate), stamp_ns)
 
     def _relax(self, estimate: Estimate) -> Tangent2:
         """Move the correction towards the identity, for the time since the last published pose; its logarithm (3,)."""

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from localization.errors import TransportError
-from localization.estimators import Estimate
+from localization.estimate import Estimate
 from localization.events import Event, Scan
-from localization.logs.writer import odom_axes
+from localization.logs.fused_messages import odom_axes
 from localization.pipeline import Pipeline
 from localization.report.interactive import numbers
 from localization.report.page import Live, Page, Section, render

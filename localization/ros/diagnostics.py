@@ -24,7 +24,7 @@ import numpy as np
 
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference
 from localization.calibration.windows import WindowConfig
-from localization.estimators import Estimate
+from localization.estimate import Estimate
 from localization.events import Event, Scan
 from localization.lidar.losses import MAX_LOST_S, LidarLosses
 from localization.pipeline import Pipeline

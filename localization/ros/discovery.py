@@ -18,7 +18,7 @@ from localization.logs.serialization import decoder, live_channel
 from localization.logs.topic_roles import OTHER_TYPES, TYPES, TopicChooser, TopicOverrides, TopicRoles, choose_roles, names_of, short_type
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
-from localization.ros.settings import Names
+from localization.ros.node_config import Names
 from localization.ros.transports.transport import Received, Transport
 from motion_models.robot import Mount, Robot
 
@@ -109,7 +109,7 @@ class TopicDiscovery:
         self.adopt(self._transport.publishers())
         while not is_over():
             if is_ready() or len(self._backlog) < MAX_BACKLOG:
-                for received in self._transport.take(_POLL_S):
+                for received in self._transport.take(_POLL_S, batch_s=_POLL_S):  # to ask who publishes takes longer than ten messages
                     self._receive(received)
             else:
                 time.sleep(_POLL_S)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from localization.errors import CheckpointError, OutputError
+from localization.estimate import Estimate
 from localization.estimate_table import COLUMNS, COV, POSE, TWIST, TWIST_COV, row_of
-from localization.estimators import Estimate
-from localization.logs.writer import FusedEstimate
+from localization.logs.fused_messages import FusedEstimate
 from localization.trajectory import IntArray
 from motion_models.input_files import check_file
 from motion_models.se2 import FloatArray

@@ -13,9 +13,9 @@ import numpy as np
 from localization.errors import SettingError
 from localization.events import PositionSample
 from localization.logs.decode import MessageStats, UnusableError, stamp_ns
+from localization.logs.fused_messages import odom_axes
 from localization.logs.reference_topics import east_north, geodetic_to_ecef, position_sample, reference_decoder
 from localization.logs.serialization import decoder
-from localization.logs.writer import odom_axes
 from localization.ros.transports.transport import Received
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Pose2

@@ -6,13 +6,16 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from localization.estimators import Estimate
+from localization.estimate import Estimate
 from localization.events import CgSample, Event, WheelSample
+from localization.ros.continuous_odometry import ContinuousOdometry
 from localization.ros.discovery import MAX_BACKLOG
 from localization.ros.live_stream import LiveStream
 from localization.ros.predictor import Predictor
+from localization.ros.publisher import EstimatePublisher
 from localization.ros.transports.transport import Received
 from localization.wheel_buffer import WheelBuffer
+from motion_models.compiled import interpreted
 
 
 class InterimOdometry:
@@ -30,6 +33,13 @@ class InterimOdometry:
     def restart(self, start: Estimate) -> None:
         """Go on from ``start``."""
         self._predictor.advance(start)
+
+    def publish_due(self, event: Event, stream: LiveStream, continuous: ContinuousOdometry, publisher: EstimatePublisher) -> None:
+        """Take the next event, of ``stream``, and publish the pose at the newest wheel sample, where one is due. Interpreted: it shall not
+        wait for what compiles meanwhile."""
+        with interpreted():
+            if (estimate := self.insert(event)) is not None:
+                continuous.publish(estimate, stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False), publisher)
 
     def insert(self, event: Event) -> Estimate | None:
         """Take the next event. Returns the pose at the newest wheel sample, where one is due."""

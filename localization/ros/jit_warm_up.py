@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import threading
 from collections.abc import Iterator
@@ -15,7 +14,6 @@ from localization.evidence.channel import channel_evidence
 from localization.pipeline import Pipeline, Trial
 from localization.ros.predictor import Predictor
 from localization.ros.settings import LiveRun
-from localization.wheel_buffer import WheelBuffer
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
@@ -28,8 +26,8 @@ _PUSH = np.array([0.6, 0.4, 0.2])
 _GRAVITY = np.array([-2.0, 0.0, 9.6])
 """On a slope [m/s^2]: what models it is compiled, too."""
 _PERIOD_NS, _EVENTS, _EVENTS_PER_SCAN = 20_000_000, 180, 5
-_EVENTS_BY_WHEELS, _STANDING, _PUSHED_AT = 60, 15, 110
-"""Events of odometry by wheels alone; up to the first motion; and up to the push: a key scan and its search grid are there by then."""
+_STANDING, _PUSHED_AT = 15, 110
+"""Events up to the first motion; and up to the push: a key scan and its search grid are there by then."""
 
 
 class WarmUp:
@@ -79,7 +77,6 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
     of_bins = np.ones((1, 2, 2))  # of the set-up of the first minute
     channel_evidence(of_bins, of_bins, of_two, of_two, of_two[0], 1.0, (of_two[0], of_two, of_two))
     predictor = Predictor(trial.model, run.robot, run.config.step)
-    _predict_alone(predictor, WheelBuffer(run.robot.center_of_gravity))
     for event in synthetic_drive(is_planar):
         for estimate in pipeline.process(event):
             pipeline.run_deferred()
@@ -88,18 +85,6 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
     pipeline.estimator.map_points()
     pipeline.estimator.occupancy()
     pipeline.finish()
-
-
-def _predict_alone(predictor: Predictor, wheels: WheelBuffer) -> None:
-    """What odometry by wheels needs comes first: it does not wait for the estimator."""
-    for event in itertools.islice(synthetic_drive(is_planar=True), _EVENTS_BY_WHEELS):
-        if not isinstance(event, WheelSample):
-            continue
-        wheels.insert(event)
-        if predictor.is_due(event.stamp_ns):
-            predictor.predict(wheels)
-        else:
-            predictor.begin(event.stamp_ns)
 
 
 def synthetic_drive(is_planar: bool) -> Iterator[Event]:

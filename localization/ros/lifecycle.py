@@ -14,7 +14,8 @@ from typing import Any
 from localization.errors import SettingError
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node, StopSignal
-from localization.ros.settings import LiveRun, ManagedNodeSettings, Names, make_settings, nearest, parameters
+from localization.ros.node_config import Names
+from localization.ros.settings import LiveRun, ManagedNodeSettings, make_settings, nearest, parameters
 from localization.ros.transports.rclpy import RclpyTransport, import_rclpy
 from localization.ros.transports.transport import SimTimeTransport, Transport
 from motion_models.errors import SkidlocError

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.estimators import Estimate, GraphFusion
+from localization.estimate import Estimate
+from localization.estimators import GraphFusion
 from localization.events import Event, Scan, WheelSample
 from localization.pipeline import Pipeline, Trial
 from localization.ros.continuous_odometry import ContinuousOdometry
@@ -44,7 +45,6 @@ class LiveOutputs:
         """Open the topics that not every node fills."""
         config = self._run.node
         self.publisher.advertise_optional(
-            has_predictions=config.predict,
             has_map_frame=has_map_frame,
             has_path=bool(config.path_period_s),
             has_map=bool(config.map_period_s) and self._inputs.has_lidar,
@@ -60,6 +60,10 @@ class LiveOutputs:
         if start is not None:
             self._interim.restart(start)
         self._predictor = self._make_predictor()
+
+    def take_over(self, early: InterimOdometry) -> None:
+        """Go on with interim odometry that has begun ``early``."""
+        self._interim = early
 
     def end_interim(self, pipeline: Pipeline) -> None:
         """The estimator of ``pipeline`` has taken up all messages: what is published continues by its estimates, if there are any yet."""
@@ -93,8 +97,8 @@ class LiveOutputs:
 
     def reckon(self, event: Event, stream: LiveStream) -> None:
         """Publish interim odometry, where ``event`` of ``stream`` makes it due and no estimator gives any."""
-        if self._interim is not None and (estimate := self._interim.insert(event)) is not None:
-            self._publish_in_order(estimate, stream.sender_stamp_ns(estimate.stamp_ns, by_lidar=False))
+        if self._interim is not None:
+            self._interim.publish_due(event, stream, self.continuous, self.publisher)
 
     def is_prediction_due(self, event: Event) -> bool:
         """Whether ``event`` makes a prediction possible that is due and received by somebody."""
@@ -110,7 +114,7 @@ class LiveOutputs:
         self.publish_fix(estimate, session, stamp_ns)
         self.go_on_from(estimate, session.pipeline, is_current=is_current)
         if self._interim is None:
-            self._publish_in_order(estimate, stamp_ns)
+            self.continuous.publish(estimate, stamp_ns, self.publisher)
 
     def go_on_from(self, estimate: Estimate, pipeline: Pipeline, *, is_current: bool) -> None:
         """Predict from ``estimate`` on; what is published continues there, if it ``is_current``."""
@@ -128,12 +132,8 @@ class LiveOutputs:
         """Publish the pose at the newest wheel sample, if it can be predicted."""
         if (prediction := self._newest(pipeline)) is not None:
             by_lidar = self._inputs.has_lidar
-            self._publish_in_order(prediction, self._inputs.stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=by_lidar))
-
-    def _publish_in_order(self, estimate: Estimate, stamp_ns: int) -> None:
-        last = self.continuous.last
-        if last is None or estimate.stamp_ns > last.stamp_ns:
-            self.publisher.publish_continuous(self.continuous.place(estimate), stamp_ns)
+            stamp_ns = self._inputs.stream.sender_stamp_ns(prediction.stamp_ns, by_lidar=by_lidar)
+            self.continuous.publish(prediction, stamp_ns, self.publisher)
 
     def publish_overview(self, now: float, session: Session, stamp_ns: int) -> None:
         """Path and map, where they are due at ``now`` [s] of the monotonic clock."""

@@ -21,13 +21,15 @@ from typing import Any
 import numpy as np
 
 from localization.errors import CheckpointError
-from localization.estimators import Estimate, PriorMap, SavedMapFusion
+from localization.estimate import Estimate
+from localization.estimators import PriorMap, SavedMapFusion
 from localization.events import Event, Scan
 from localization.logs.decode import MessageStats
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import read_head
 from localization.ros.diagnostics import Doctor, Health, Status
 from localization.ros.discovery import DiscoveredTopics, TopicDiscovery
+from localization.ros.early_odometry import EarlyOdometry
 from localization.ros.interim_odometry import WaitingMessages
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.live_inputs import LiveInputs
@@ -114,27 +116,23 @@ class Node:
         is_over: Callable[[], bool] = lambda: False,
         view: View | None = None,
         executor: Executor | None = None,
+        early: EarlyOdometry | None = None,
     ) -> Node:
         """Compile and discover the topics side by side, then begin, or continue from the state on disk. Where compiling takes longer,
         odometry is by wheels alone until then.
 
         ``report`` is given messages for the user; ``is_over`` ends it (`KeyboardInterrupt`); ``executor`` answers which set-up the
-        robot has beside the estimator, None at once. Raises `TransportError`, `TopicError`,
-        `EstimatorError`, `CheckpointError` and `OutputError`.
+        robot has beside the estimator, None at once; ``early``, on ``transport``, has begun with the options of ``run``. Raises
+        `TransportError`, `TopicError`, `EstimatorError`, `CheckpointError` and `OutputError`.
         """
         warming = WarmUp(run)
         run = run.resolve_topics()
         config, state_file = run.node, run.files.state
-        discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
-        # now: subscribers have found it by the first estimate
-        publisher = EstimatePublisher(
-            transport,
-            config.names,
-            config.frames,
-            with_tf=config.tf,
-            map_topic=config.map_topic,
-            transform_tolerance_s=config.transform_tolerance,
-        )
+        if early is None:
+            discovery = TopicDiscovery(transport, run.robot, run.topics, config.names, config.frames.base_link_frame)
+            publisher, discovered = EstimatePublisher.of_node(transport, config), None
+        else:
+            discovery, publisher, discovered = early.discovery, early.publisher, early.take_over()
         is_resumed = state_file is not None and state_file.exists()
         needed = read_head(state_file).get("topics", []) if state_file is not None and is_resumed else []
 
@@ -142,7 +140,7 @@ class Node:
             return warming.is_done(with_clouds=discovery.has_clouds)
 
         patience_s = _COMPILING_S if config.predict else math.inf
-        discovered = discovery.discover(config.wait_s, needed, report, is_over, is_compiled, patience_s)
+        discovered = discovered or discovery.discover(config.wait_s, needed, report, is_over, is_compiled, patience_s)
         run = replace(run, robot=discovered.parts.robot)
         sources = discovered.parts.sources
         trial = run.make_trial(sources.lidar is not None)
@@ -152,10 +150,12 @@ class Node:
         for warning in (*notes, *notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report, discovery, executor)
-        node._open_session(discovered, view, is_compiled)
+        node._open_session(discovered, view, is_compiled, early)
         return node
 
-    def _open_session(self, discovered: DiscoveredTopics, view: View | None, is_compiled: Callable[[], bool]) -> None:
+    def _open_session(
+        self, discovered: DiscoveredTopics, view: View | None, is_compiled: Callable[[], bool], early: EarlyOdometry | None
+    ) -> None:
         gc.collect()
         gc.freeze()  # these objects stay: later collections skip them
         pipeline, config = self._make_pipeline(discovered.mounts), self._run.node
@@ -177,16 +177,25 @@ class Node:
                 self._continue_from(self.session.head, discovered.start_ns)
             else:
                 self._begin_checks()
-            if not is_compiled():
-                self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
-                self._waiting = WaitingMessages.of(self.inputs.open_stream(MessageStats()), is_ready=is_compiled)
-            if not is_compiled() or self.session.head:
-                self.outputs.begin_interim(WheelBuffer(self.inputs.robot.center_of_gravity), self.outputs.continuous.resume())
-            for received in discovered.backlog:
-                self._receive(received)
+            self._begin_interim(discovered, is_compiled, early)
             if self._waiting is None:
                 self._times.caught_up_ns = self._transport.now_ns()
             failing.pop_all()
+
+    def _begin_interim(self, discovered: DiscoveredTopics, is_compiled: Callable[[], bool], early: EarlyOdometry | None) -> None:
+        """Process what was received so far, or go on with odometry by wheels until the estimator has compiled."""
+        if early is not None and early.waiting is not None and early.interim is not None:
+            self.outputs.take_over(early.interim)
+            self.outputs.continuous = self.session.state.odometry = early.continuous
+            self._waiting = replace(early.waiting, is_ready=is_compiled)
+            return
+        if not is_compiled():
+            self._report("compiling, once: odometry is by wheels alone until the estimator begins.")
+            self._waiting = WaitingMessages.of(self.inputs.open_stream(MessageStats()), is_ready=is_compiled)
+        if not is_compiled() or self.session.head:
+            self.outputs.begin_interim(WheelBuffer(self.inputs.robot.center_of_gravity), self.outputs.continuous.resume())
+        for received in discovered.backlog:
+            self._receive(received)
 
     def _make_pipeline(self, mounts: Mapping[str, Mount]) -> Pipeline:
         return Pipeline(self._trial, self.inputs.robot, mounts, self.inputs.has_lidar, self._run.config)

@@ -18,14 +18,14 @@ import numpy as np
 from localization.errors import MapError, OutputError
 from localization.estimators import PriorMap, SavedMapFusion
 from localization.logs.decode import UnusableError, frame_name
+from localization.logs.fused_messages import odom_axes
 from localization.logs.serialization import decoder
-from localization.logs.writer import odom_axes
 from localization.maps import KeyframeMap, SavedMap, SpaceMap, load_map, save_map
 from localization.maps.space_places import Places, make_places
 from localization.output import versions
 from localization.ros.gnss import GeodeticMap
+from localization.ros.node_config import Names
 from localization.ros.payloads import Load, Payloads
-from localization.ros.settings import Names
 from localization.ros.start_pose import StartPose
 from localization.ros.transports.transport import Received, ServiceReply, Transport
 from motion_models.errors import CgError, RobotError

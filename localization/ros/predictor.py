@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from localization.core.twist import CHANGE_SHARE, SLIP_LASTS_S, TWIST_FLOOR
-from localization.estimators import Estimate
-from localization.estimators.estimator import GyroCalibration
+from localization.estimate import Estimate, GyroCalibration
 from localization.events import Turn
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from localization.wheel_buffer import WheelBuffer
 from localization.wheel_gaps import UnknownVelocity
 from motion_models.base import MotionModel

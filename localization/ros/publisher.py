@@ -5,21 +5,23 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from localization.estimators import Estimate
-from localization.lifting import Pose3
+from localization.estimate import Estimate
+from localization.logs.fused_messages import FusedEstimate
 from localization.logs.serialization import FusedWriter, encode, make
-from localization.logs.writer import FusedEstimate
-from localization.maps.grid import Grid
-from localization.ros.diagnostics import Status
 from localization.ros.discovery import TF, TF_TYPE
-from localization.ros.settings import Frames, Names
+from localization.ros.node_config import Frames, Names, NodeConfig
 from localization.ros.transports.transport import Transport
+from localization.space_pose import Pose3
 from motion_models import se2
 from motion_models.se2 import FloatArray
+
+if TYPE_CHECKING:
+    from localization.maps.grid import Grid
+    from localization.ros.diagnostics import Status
 
 ODOMETRY, PREDICTED_ODOMETRY, POSE = "~/odometry", "~/odometry_predicted", "~/pose"
 CORRECTIONS, DIAGNOSTICS, PATH, MAP = "~/corrections", "/diagnostics", "~/path", "~/map"
@@ -60,7 +62,15 @@ class EstimatePublisher:
     """
 
     def __init__(
-        self, transport: Transport, names: Names, frames: Frames, *, with_tf: bool, map_topic: str = MAP, transform_tolerance_s: float = 0.0
+        self,
+        transport: Transport,
+        names: Names,
+        frames: Frames,
+        *,
+        with_tf: bool,
+        has_predictions: bool = False,
+        map_topic: str = MAP,
+        transform_tolerance_s: float = 0.0,
     ) -> None:
         """``transform_tolerance_s``: by how much `map` -> `odom` is stamped later [s]."""
         self._transport, self._with_tf, self._frames = transport, with_tf, frames
@@ -71,16 +81,28 @@ class EstimatePublisher:
         """Transforms of the body, as they were published."""
         self._topics = {topic: names.resolve(map_topic if topic == MAP else topic) for topic in _TYPES}
         self._advertised: set[str] = set()
-        self._has_predictions = False
+        self._has_predictions = has_predictions
         self._unread: frozenset[str] = frozenset()  # topics of predictions that nobody receives
         self._path = Path()
-        for topic in (ODOMETRY, CORRECTIONS, DIAGNOSTICS, *((TF,) if with_tf else ())):
+        for topic in (ODOMETRY, CORRECTIONS, DIAGNOSTICS, *((TF,) if with_tf else ()), *((PREDICTED_ODOMETRY,) if has_predictions else ())):
             self._advertise(topic)
 
-    def advertise_optional(self, *, has_predictions: bool, has_map_frame: bool, has_path: bool, has_map: bool, has_fix: bool) -> None:
+    @classmethod
+    def of_node(cls, transport: Transport, config: NodeConfig) -> EstimatePublisher:
+        """A publisher as ``config`` has it. Subscribers have found its topics by the first estimate, if it is made at the start."""
+        return cls(
+            transport,
+            config.names,
+            config.frames,
+            with_tf=config.tf,
+            has_predictions=config.predict,
+            map_topic=config.map_topic,
+            transform_tolerance_s=config.transform_tolerance,
+        )
+
+    def advertise_optional(self, *, has_map_frame: bool, has_path: bool, has_map: bool, has_fix: bool) -> None:
         """Open the topics that not every node fills."""
-        self._has_predictions = has_predictions
-        optional = {PREDICTED_ODOMETRY: has_predictions, POSE: has_map_frame, PATH: has_path, MAP: has_map, FIX: has_fix}
+        optional = {POSE: has_map_frame, PATH: has_path, MAP: has_map, FIX: has_fix}
         for topic, is_used in optional.items():
             if is_used:
                 self._advertise(topic)
@@ -177,21 +199,25 @@ class EstimatePublisher:
         if not len(points):
             return
         origin, cell, cells = occupancy_grid(points)
-        self.publish_grid(Grid(cells, (float(origin[0]), float(origin[1])), cell), stamp_ns)
+        self._publish_cells(cells, np.array([*origin, 0.0]), cell, stamp_ns)
 
     def publish_grid(self, grid: Grid, stamp_ns: int, map_T_grid: FloatArray = _NO_OFFSET) -> None:
         """nav_msgs/OccupancyGrid with free space; ``map_T_grid`` (3,): of the frame that ``grid`` was drawn in."""
+        origin = np.array([*grid.origin, 0.0])
+        self._publish_cells(grid.cells, se2.compose(map_T_grid, origin), grid.resolution, stamp_ns)
+
+    def _publish_cells(self, cells: Any, origin: FloatArray, cell_m: float, stamp_ns: int) -> None:
         frame = self._frames.map_frame if self._path.is_in_map else self._frames.odom_frame
-        height, width = grid.cells.shape
+        height, width = cells.shape
         info = make(
             "nav_msgs/msg/MapMetaData",
             map_load_time=_time(stamp_ns),
-            resolution=grid.resolution,
+            resolution=cell_m,
             width=width,
             height=height,
-            origin=_pose(se2.compose(map_T_grid, np.array([*grid.origin, 0.0]))),
+            origin=_pose(origin),
         )
-        self._publish(MAP, make(_TYPES[MAP], header=self._header(stamp_ns, frame), info=info, data=grid.cells.ravel()))
+        self._publish(MAP, make(_TYPES[MAP], header=self._header(stamp_ns, frame), info=info, data=cells.ravel()))
 
     def publish_corrections(self, parameters: Mapping[str, tuple[float, float]], stamp_ns: int) -> None:
         """Named numbers as sensor_msgs/JointState: ``position`` is the mean, ``effort`` its sigma."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from localization.errors import OutputError, TransportError
-from localization.estimators import Estimate
+from localization.estimate import Estimate
 from localization.events import Event, Scan
 from localization.pipeline import Pipeline
 from motion_models.robot import Mount, Robot

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, Protocol, TextIO
 
 from localization.errors import CheckpointError, OutputError
+from localization.estimate import Estimate
 from localization.estimate_table import trajectory
-from localization.estimators import Estimate
 from localization.events import Event
-from localization.logs.writer import MAP_FRAME, PARENT_FRAME, write_fused
+from localization.logs.fused_messages import MAP_FRAME, PARENT_FRAME
+from localization.logs.writer import write_fused
 from localization.output import output_errors, refuse_existing
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import Checkpoint, CheckpointWriter, fingerprints, read_checkpoint, remove_checkpoint

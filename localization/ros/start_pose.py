@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from localization.estimators import Estimate
-from localization.lifting import Pose3
+from localization.estimate import Estimate
+from localization.space_pose import Pose3
 from motion_models import se2
 from motion_models.se2 import FloatArray
 

@@ -23,7 +23,7 @@ from localization.sensor_checks.pairs import GYRO_WHEELS, usual_errors
 from localization.sensor_checks.path_uncertainty import PathUncertainty, lever_of_unknown_front
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.step_checks import StepChecks
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount, Robot

@@ -10,13 +10,14 @@ import numpy as np
 
 from localization.estimators import Estimate
 from localization.events import Step
+from localization.sensor_checks import wheel_agreement
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.moving_report import MovingReport
 from localization.sensor_checks.past_views import LidarViews, PastViews, View
 from localization.sensor_checks.reckoning import ESTIMATE, GYRO
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.scene_motion import STILL, SceneComparison, explain
-from localization.sensor_checks.wheel_agreement import CALM_S, Departure, Jump, Suspicion, agree, compare_motions, difference
+from localization.sensor_checks.wheel_agreement import CALM_S, Departure, Jump, Suspicion, agree, difference
 from localization.sensor_checks.window import Window
 from localization.trajectory import BoolArray
 from motion_models import se2
@@ -137,7 +138,7 @@ class MovingObjects:
         if self._departure is not None or begin is None:
             self._jump.add(now, is_off=False, is_unclear=True)
             return
-        is_near, distance = compare_motions(begin, now)
+        is_near, distance = wheel_agreement.compare_motions(begin, now)
         is_off = distance > MIN_OFF_M or (nis is not None and nis > MAX_NIS)
         self._jump.add(now, is_off=not is_near and distance > _MAX_OFF_M, is_unclear=self._suspicion is not None)
         is_unsure = compared is not None and compared.is_unsure
@@ -191,7 +192,7 @@ class MovingObjects:
     def _update(self, step: Step, lidar: LidarViews, view: View, now: FloatArray, found: SceneComparison) -> None:
         """Whether objects move now."""
         moved_share, now_s, is_standing = found.scene.moved_share, self._faults.now_s, step.rested_s > 0.0
-        _, distance = compare_motions(view.poses, now)
+        _, distance = wheel_agreement.compare_motions(view.poses, now)
         is_moving, has_turn = moved_share >= _MIN_UNSURE and is_standing, step.turn is not None
         if not is_standing and (moved_share >= _MIN_UNSURE or distance >= _MAX_OFF_M):
             has_turn = step.turn is not None or lidar.is_active

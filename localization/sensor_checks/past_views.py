@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.sensor_checks import wheel_agreement
 from localization.sensor_checks.scan_motion import Profile
-from localization.sensor_checks.wheel_agreement import CALM_S, compare_motions
+from localization.sensor_checks.wheel_agreement import CALM_S
 from motion_models import se2
 from motion_models.se2 import FloatArray
 
@@ -52,11 +53,11 @@ class LidarViews:
         """The oldest view from which wheels and estimate have hardly moved to the poses ``now`` (2, 3), and the middle one of those after
         it; the first one of a robot that stands there; none before the first."""
         views = self._views
-        if self._standing is not None and not compare_motions(self._standing.poses, now)[0]:
+        if self._standing is not None and not wheel_agreement.compare_motions(self._standing.poses, now)[0]:
             self._standing = None
         if self._standing is not None and not self.is_active:
             return [self._standing]
-        while views and not compare_motions(views[0].poses, now)[0]:
+        while views and not wheel_agreement.compare_motions(views[0].poses, now)[0]:
             views.popleft()
         return [views[0], views[len(views) // 2]] if len(views) > 2 else list(views)[:1]
 

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.sensor_checks.scan_motion import BEARINGS, Profile, align_profiles, bearing_bin
+from localization.sensor_checks import scan_motion
+from localization.sensor_checks.scan_motion import BEARINGS, Profile, bearing_bin
 from motion_models import se2
 from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import solve
@@ -65,7 +66,7 @@ def explain(reference: Profile, now: Profile, points: Points2, start: Pose2, lea
 def align_rest(reference: Profile, points: Points2, still: SceneMotion) -> Pose2 | None:
     """Motion (3,) of the LiDAR that explains those ``points`` (N, 2) which are not of the still world; None for too few."""
     rest = points[still.labels != STILL]
-    motion, inliers = align_profiles(reference, rest, triple(still.motion), np.empty((2, 2)))
+    motion, inliers = scan_motion.align_profiles(reference, rest, triple(still.motion), np.empty((2, 2)))
     return np.array(motion) if inliers >= _MIN_ALIGNED and np.isfinite(motion).all() else None
 
 

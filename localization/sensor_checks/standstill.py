@@ -11,7 +11,7 @@ import numpy as np
 from localization.events import ImuSample, Step
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.window import Bins, Window
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from localization.wheel_gaps import UnknownVelocity
 from motion_models.se2 import FloatArray
 

@@ -16,7 +16,7 @@ from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.window import Window
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models.robot import Mount
 
 

@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.sensor_checks.scan_motion import BEARINGS, Profile, bearing_bins
+from localization.sensor_checks import scan_motion
+from localization.sensor_checks.scan_motion import BEARINGS, Profile
 from motion_models import se2
 from motion_models.se2 import FloatArray, Pose2, Twist2
 
@@ -62,7 +63,7 @@ class WeightedMean:
 def times_by_bearing(points: FloatArray, times: FloatArray) -> FloatArray:
     """(180,) time after the sweep's middle of the points of each bearing [s], by ``points`` (N, 2) about the sensor and their ``times``
     (N,); NaN without any, and where they have several, as of a scanner that does not turn."""
-    bins, first, last = bearing_bins(points), np.full(BEARINGS, np.inf), np.full(BEARINGS, -np.inf)
+    bins, first, last = scan_motion.bearing_bins(points), np.full(BEARINGS, np.inf), np.full(BEARINGS, -np.inf)
     np.minimum.at(first, bins, times)
     np.maximum.at(last, bins, times)
     is_one = last - first <= _SAME_TIME * np.ptp(times)
@@ -97,7 +98,7 @@ def _linearize(a: TimedProfile, b: TimedProfile, a_T_b: Pose2, factor: float) ->
     R = se2.rotation(a_T_b[2])
     turned = (b.profile.points + factor * b.skew) @ R.T
     moved = turned + a_T_b[:2]
-    k = bearing_bins(moved)
+    k = scan_motion.bearing_bins(moved)
     n, d = a.profile.normals[k], moved - a.profile.points[k] - factor * a.skew[k]
     lever = n[:, 1] * turned[:, 0] - n[:, 0] * turned[:, 1]
     J = np.column_stack([n, lever, np.sum(n * (b.skew @ R.T - a.skew[k]), axis=1)])

@@ -11,7 +11,6 @@ from typing import Annotated, Literal, Protocol
 import numpy as np
 
 from localization.bounded_settings import Allowed, Positive, Settings, Share, Signed
-from localization.lifting import quaternion as rotation_quaternion
 from localization.logs import message_templates
 from localization.logs.message_templates import Message
 from localization.simulation.hill_sensors import body_poses, imu_motion
@@ -20,6 +19,7 @@ from localization.simulation.scanners import PlanarScanner, ScannerConfig, Spinn
 from localization.simulation.terrain import NO_WAVES
 from localization.simulation.vehicle import ANGLES, POSE, TWIST, MassDistribution, SampleClock, TrueMotion, seconds
 from localization.simulation.world import World
+from localization.space_pose import quaternion as rotation_quaternion
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY

@@ -18,10 +18,11 @@ from localization.ros.jit_warm_up import WarmUp
 from localization.ros.live_set_up import LiveSetUp
 from localization.ros.live_stream import LiveStream
 from localization.ros.node import Node
+from localization.ros.node_config import NodeConfig
 from localization.ros.predictor import Predictor
 from localization.ros.publisher import EstimatePublisher
 from localization.ros.session import Files, Session
-from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot

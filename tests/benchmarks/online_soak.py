@@ -17,8 +17,9 @@ from localization.logs.message_templates import Message, MessageLayout, Template
 from localization.pipeline import Trial
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
+from localization.ros.node_config import NodeConfig
 from localization.ros.session import Files
-from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import MonotonicTime, Received
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.scanners import ScannerConfig

@@ -16,7 +16,7 @@ import pytest
 from localization import cli
 from localization.cli import COMMANDS, main
 from localization.simulation.experiments import EXPERIMENTS
-from motion_models import gufunc
+from motion_models import jit_gufunc
 from tests.helpers import bags, online
 from tests.helpers.disks import files_of_at_most
 from tests.helpers.extended import cases
@@ -220,11 +220,11 @@ def test_compilation_does_not_wait_for_a_lock_held_for_ever(kind: str, tmp_path:
     lock = tmp_path / ".skidloc.lock"
     os.mkfifo(lock) if kind == "fifo" else lock.touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(gufunc, "_MAX_LOCK_WAIT_S", 0.05)
+    monkeypatch.setattr(jit_gufunc, "_MAX_LOCK_WAIT_S", 0.05)
     descriptor = os.open(lock, os.O_RDWR)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
-        double = gufunc.gufunc("(n)->(n)")(_double)
+        double = jit_gufunc.compile_gufunc(_double, "(n)->(n)")
     finally:
         os.close(descriptor)
     assert double([3.0]).tolist() == [6.0]

@@ -9,7 +9,7 @@ import pytest
 from localization.cli import main
 from localization.commands import warm_up
 from localization.ros import predictor
-from motion_models import compiled
+from motion_models import compiled, jit
 
 
 def test_warm_up_runs_each_part_and_names_the_folder(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,9 +32,9 @@ def test_kernel_where_nothing_can_be_stored_runs_and_says_so_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """As for a user without a home folder, of a package that another user has installed."""
-    monkeypatch.setattr(compiled.KernelCacheLocator, "from_function", classmethod(lambda cls, function, file: None))
-    monkeypatch.setattr(compiled.caching.CacheImpl, "_locator_classes", [])
-    monkeypatch.setattr(compiled, "_not_stored", [])
+    monkeypatch.setattr(jit.KernelCacheLocator, "from_function", classmethod(lambda cls, function, file: None))
+    monkeypatch.setattr(jit.caching.CacheImpl, "_locator_classes", [])
+    monkeypatch.setattr(jit, "_not_stored", [])
     double, triple = (compiled.kernel(lambda x, factor=factor: x * factor) for factor in (2.0, 3.0))
     assert (double(2.0), triple(2.0)) == (4.0, 6.0)
     assert capsys.readouterr().err.count("Set NUMBA_CACHE_DIR") == 1

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 
 from localization.core.policies.slip import SlipChanges
 from localization.errors import EstimatorError
+from localization.estimate import Estimate
 from localization.estimators import EstimatorConfig
-from localization.estimators.estimator import Estimate
 from localization.evaluation.consistency import nees
 from localization.events import Event, ImuSample, Scan, Step, WheelSample
 from localization.lidar import LidarConfig

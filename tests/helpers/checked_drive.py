@@ -11,7 +11,7 @@ from localization.estimators.baselines import DeadReckoning
 from localization.events import Scan, Step, Turn
 from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models import se2
 from motion_models.motion import Motion
 from motion_models.robot_file import load_robot

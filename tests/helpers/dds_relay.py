@@ -8,8 +8,8 @@ import sys
 
 import numpy as np
 
+from localization.logs.fused_messages import FusedEstimate
 from localization.logs.serialization import FusedWriter
-from localization.logs.writer import FusedEstimate
 from localization.ros.discovery import TF, TF_TYPE
 from localization.ros.transports.dds import DdsTransport
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from localization.events import Event, Scan
 from localization.pipeline import Pipeline, ReplayConfig, Trial
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.registry import make_model
 from motion_models.se2 import FloatArray

@@ -23,9 +23,10 @@ from localization.pipeline import Pipeline, Trial
 from localization.ros.discovery import TF
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
+from localization.ros.node_config import Names, NodeConfig
 from localization.ros.publisher import DIAGNOSTICS, FIX, MAP, ODOMETRY, PATH, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files, View
-from localization.ros.settings import LiveRun, Names, NodeConfig
+from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import MonotonicTime, Received, ServiceHandler
 from localization.simulation.experiments import Experiment, MoveArms, OpenLoop, Rest, constant
 from localization.simulation.scanners import ScannerConfig

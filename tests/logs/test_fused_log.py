@@ -18,7 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from localization.errors import OutputError
-from localization.logs.writer import MAP_FRAME, UNKNOWN_VARIANCE, FusedEstimate, write_fused
+from localization.logs.fused_messages import MAP_FRAME, UNKNOWN_VARIANCE, FusedEstimate
+from localization.logs.writer import write_fused
 from motion_models import se2
 
 COVARIANCE = np.array([[4e-2, 1e-3, 2e-3], [1e-3, 1e-2, -3e-3], [2e-3, -3e-3, 5e-3]])

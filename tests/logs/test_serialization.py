@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from localization.logs.decode import UnusableError
+from localization.logs.fused_messages import FusedEstimate, odometry_message, transform_message
 from localization.logs.serialization import FusedWriter, decoder, encode, fast_decoder, make
-from localization.logs.writer import FusedEstimate, odometry_message, transform_message
 from tests.helpers.bags import STORE
 
 IMU, JOINTS, SCAN = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState", "sensor_msgs/msg/LaserScan"

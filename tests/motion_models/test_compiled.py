@@ -11,7 +11,7 @@ from types import ModuleType
 import numba
 import pytest
 
-from motion_models.compiled import fingerprint
+from motion_models.jit import fingerprint
 
 PART = """
 from typing import NamedTuple

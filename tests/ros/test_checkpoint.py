@@ -28,7 +28,7 @@ from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
 from localization.ros.state_serialization import deserialize, serialize, serialize_parts
 from localization.sensor_checks.innovations import Bin
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from localization.wheel_buffer import WheelInterval
 from motion_models.registry import make_model
 from motion_models.robot import Mount

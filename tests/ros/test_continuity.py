@@ -20,9 +20,10 @@ from localization.ros import node as node_module
 from localization.ros.discovery import TF
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import ODOMETRY, PREDICTED_ODOMETRY
 from localization.ros.session import Files
-from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received
 from motion_models import se2
 from motion_models.registry import make_model

@@ -21,8 +21,8 @@ from localization.estimators import Estimate
 from localization.events import ImuSample, Scan, WheelSample
 from localization.logs import open_log
 from localization.ros.diagnostics import ERROR, OK, WARN, Doctor, Health, Request, Status, diagnose_events
+from localization.ros.node_config import Names, NodeConfig
 from localization.ros.publisher import DIAGNOSTICS, ODOMETRY
-from localization.ros.settings import Names, NodeConfig
 from localization.simulation.experiments import ExperimentConfig, Phase, Rest
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig

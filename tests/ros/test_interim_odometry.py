@@ -9,8 +9,9 @@ import numpy as np
 from localization.pipeline import Trial
 from localization.ros import node as node_module
 from localization.ros.node import Node
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import PREDICTED_ODOMETRY
-from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.settings import LiveRun
 from motion_models.registry import make_model
 from tests.helpers.online import ROBOT, LogTransport, drive_log, run_node, track
 

@@ -12,7 +12,8 @@ import sys
 from numba.core.registry import CPUDispatcher
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
-from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.node_config import NodeConfig
+from localization.ros.settings import LiveRun
 from localization.ros.session import Files
 from localization.pipeline import Trial
 from motion_models.registry import make_model

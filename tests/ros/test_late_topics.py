@@ -8,8 +8,8 @@ import pytest
 from localization.logs.serialization import decoder, encode, make
 from localization.logs.topic_roles import TopicOverrides
 from localization.ros.diagnostics import ERROR, OK
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import DIAGNOSTICS, PREDICTED_ODOMETRY
-from localization.ros.settings import NodeConfig
 from localization.ros.transports.transport import Received
 from tests.helpers.online import ROBOT, LogTransport, drive_log, published, run_node, track
 from tests.ros.test_continuity import check_continuity

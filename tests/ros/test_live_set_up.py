@@ -12,8 +12,9 @@ from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Trial
 from localization.ros.jit_warm_up import WarmUp
 from localization.ros.node import Node
+from localization.ros.node_config import NodeConfig
 from localization.ros.session import Files
-from localization.ros.settings import LiveRun, NodeConfig
+from localization.ros.settings import LiveRun
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot

@@ -21,8 +21,8 @@ from localization.estimators import Estimate
 from localization.events import Scan, WheelSample
 from localization.log_replay import replay
 from localization.logs import TopicOverrides, open_log
+from localization.logs.fused_messages import FusedEstimate, transform_message
 from localization.logs.serialization import encode
-from localization.logs.writer import FusedEstimate, transform_message
 from localization.pipeline import Trial
 from localization.ros import discovery
 from localization.ros.checkpoint import CheckpointWriter, read_head
@@ -30,9 +30,10 @@ from localization.ros.diagnostics import ERROR, OK, WARN, degeneracy
 from localization.ros.discovery import TF
 from localization.ros.estimate_log import old_estimate_log
 from localization.ros.node import Node, notes_on_clocks
+from localization.ros.node_config import Frames, Names, NodeConfig
 from localization.ros.publisher import CORRECTIONS, DIAGNOSTICS, ODOMETRY, EstimatePublisher
 from localization.ros.session import Files
-from localization.ros.settings import Frames, LiveRun, Names, NodeConfig
+from localization.ros.settings import LiveRun
 from localization.ros.transports.transport import Received, ServiceReply
 from localization.trajectory import read_tum
 from motion_models import se2
@@ -609,7 +610,7 @@ def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
     """Odometry and its transform are those that never jump; what the graph corrects is a transform of its own (REP-105)."""
     transport = LogTransport(drive_log(scans_hz=6.25))
     publisher = EstimatePublisher(transport, Names(), frames, with_tf=True)
-    publisher.advertise_optional(has_predictions=False, has_map_frame=True, has_path=False, has_map=False, has_fix=False)
+    publisher.advertise_optional(has_map_frame=True, has_path=False, has_map=False, has_fix=False)
     in_odom, map_T_odom = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.25, -0.1])
     cov, cov_in_map = 0.01 * np.eye(3), 0.04 * np.eye(3)
     pose = se2.compose(map_T_odom, in_odom)

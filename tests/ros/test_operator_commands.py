@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from localization.logs.fused_messages import six_by_six
 from localization.logs.serialization import encode, make
-from localization.logs.writer import six_by_six
+from localization.ros.node_config import NodeConfig
 from localization.ros.operator_commands import POSE_TYPE
 from localization.ros.publisher import DIAGNOSTICS, MAP, PATH, PREDICTED_ODOMETRY, occupancy_grid
 from localization.ros.session import Files
-from localization.ros.settings import NodeConfig
 from localization.ros.transports.transport import Received
 from motion_models import se2
 from tests.helpers.online import LogTransport, drive_log, published, run_node, stamp_of, track

@@ -17,7 +17,8 @@ from ruamel.yaml import YAML
 
 from localization.errors import SettingError
 from localization.estimators import ESTIMATORS
-from localization.ros.settings import PARAMS_FILE, Names, defaults, make_settings, parameters, to_yaml
+from localization.ros.node_config import Names
+from localization.ros.settings import PARAMS_FILE, defaults, make_settings, parameters, to_yaml
 from motion_models.registry import MODELS
 
 ROOT = Path(__file__).parents[2]

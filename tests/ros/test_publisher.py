@@ -13,11 +13,11 @@ from localization.estimators import Estimate
 from localization.events import WheelSample
 from localization.logs.reader import open_source
 from localization.ros.discovery import TF
+from localization.ros.node_config import NodeConfig
 from localization.ros.predictor import Predictor, predicted_motion
 from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files
-from localization.ros.settings import NodeConfig
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from localization.trajectory import read_tum
 from localization.wheel_buffer import WheelBuffer
 from motion_models import se2

@@ -16,8 +16,9 @@ from localization.logs.reference_topics import east_north, geodetic_to_ecef
 from localization.logs.topic_roles import TopicOverrides
 from localization.ros.discovery import TF
 from localization.ros.gnss import parse_datum, utm_pose
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import FIX, ODOMETRY
-from localization.ros.settings import NodeConfig, OnlineSettings
+from localization.ros.settings import OnlineSettings
 from localization.simulation.experiments import Experiment, OpenLoop, Rest, constant
 from localization.simulation.sensors import GpsConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation

@@ -17,8 +17,9 @@ from localization.maps.place_search import PlaceMap
 from localization.pipeline import Trial
 from localization.ros.diagnostics import OK, WARN
 from localization.ros.discovery import TF
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import DIAGNOSTICS
-from localization.ros.settings import NodeConfig, OnlineSettings
+from localization.ros.settings import OnlineSettings
 from localization.ros.transports.transport import Received
 from motion_models.registry import make_model
 from tests.helpers.floor_plan import make_map

@@ -17,8 +17,8 @@ from localization.maps.space_places import SpacePlaces
 from localization.pipeline import Pipeline, Trial
 from localization.ros.diagnostics import OK
 from localization.ros.discovery import TF
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import MAP, POSE
-from localization.ros.settings import NodeConfig
 from localization.ros.state_serialization import deserialize, serialize
 from localization.ros.transports.transport import Received
 from motion_models.registry import make_model

@@ -97,7 +97,7 @@ def test_silent_scanner_leaves_the_estimate_to_the_other():
 
 
 def test_names_of_several_scanners_are_resolved_in_the_namespace():
-    from localization.ros.settings import Names
+    from localization.ros.node_config import Names
 
     names = Names(namespace="/robot1")
     assert names.apply_to_overrides(TopicOverrides(scan="front/scan, rear/scan")).scan == "/robot1/front/scan,/robot1/rear/scan"

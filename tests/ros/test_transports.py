@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from localization.logs.serialization import encode, make
+from localization.ros.node_config import NodeConfig
 from localization.ros.publisher import ODOMETRY
-from localization.ros.settings import NodeConfig
 from localization.ros.transports import choose_transport
 from localization.ros.transports.transport import CLOCK, CLOCK_TYPE, Received, SimTimeTransport
 from tests.helpers.online import LogTransport, drive_log, run_node, track

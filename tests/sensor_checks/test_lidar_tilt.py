@@ -13,7 +13,7 @@ from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
 from localization.sensor_checks.lidar_tilt import LidarTilt, fit_ground
 from localization.simulation import world
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models.motion import Motion
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot

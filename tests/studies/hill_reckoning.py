@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from localization.log_replay import Run, replay
 from localization.pipeline import ReplayConfig, Trial
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.registry import make_model
 from motion_models.se2 import FloatArray

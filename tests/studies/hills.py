@@ -28,7 +28,7 @@ from localization.events import ImuSample, Scan
 from localization.lidar import Sweep
 from localization.log_replay import replay
 from localization.pipeline import ReplayConfig, Trial
-from localization.synchronizer import StepConfig
+from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import Step
-from localization.lidar import FORGETTING, OUTLIER_SIGMAS, ScanMatch, ScanMatchingSensor
+from localization.lidar import OUTLIER_SIGMAS, ScanMatch, ScanMatchingSensor
+from localization.small_filters import FORGETTING
 from motion_models import se2
 from motion_models.se2 import Cov3, Pose2, Tangent2, Twist2
 

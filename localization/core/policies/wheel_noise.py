@@ -9,7 +9,8 @@ import numpy as np
 from localization.core.filter import Innovation
 from localization.core.state import State
 from localization.events import Step
-from localization.lidar import FORGETTING, OUTLIER_SIGMAS
+from localization.lidar import OUTLIER_SIGMAS
+from localization.small_filters import FORGETTING
 from motion_models.se2 import Cov3, FloatArray
 
 _MIN_INFORMATION = 30.0

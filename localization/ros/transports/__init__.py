@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Mapping
 from typing import Literal
 
-from localization.ros.settings import Names
+from localization.ros.node_config import Names
 from localization.ros.transports.transport import Transport, default_domain
 
 TransportName = Literal["auto", "dds", "rclpy", "zenoh", "rospy"]

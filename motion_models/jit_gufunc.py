@@ -11,17 +11,17 @@ from typing import Any
 
 import numba
 
+from motion_models.jit import register_subroutines
 
-def gufunc(layout: str) -> Callable[[Callable[..., None]], Callable[..., Any]]:
-    """A compiled function of pose-like arguments, the last of which is its result, that broadcasts over leading axes."""
-    signature = "void(" + ", ".join("float64" + "[:" + ",:" * part.count(",") + "]" for part in _parts(layout)) + ")"
 
-    def compiled(function: Callable[..., None]) -> Any:
-        with _cache_lock() as is_locked:
-            decorate: Callable[..., Any] = numba.guvectorize([signature], layout, nopython=True, cache=is_locked)  # type: ignore[no-untyped-call]
-            return decorate(function).ufunc  # numpy's own object: without numba's Python wrapper around each call
-
-    return compiled
+def compile_gufunc(function: Callable[..., None], layout: str) -> Any:
+    """The ufunc of ``function`` for `motion_models.compiled.gufunc`."""
+    register_subroutines()
+    parts = [part.strip("()") for part in layout.replace("->", ",").replace("),(", ")|(").split("|")]
+    signature = "void(" + ", ".join("float64" + "[:" + ",:" * part.count(",") + "]" for part in parts) + ")"
+    with _cache_lock() as is_locked:
+        decorate: Callable[..., Any] = numba.guvectorize([signature], layout, nopython=True, cache=is_locked)  # type: ignore[no-untyped-call]
+        return decorate(function).ufunc  # numpy's own object: without numba's Python wrapper around each call
 
 
 _MAX_LOCK_WAIT_S = 5.0
@@ -76,7 +76,3 @@ def _lock(descriptor: int, wait_s: float) -> bool:
             return True
         else:
             return True
-
-
-def _parts(layout: str) -> list[str]:
-    return [part.strip("()") for part in layout.replace("->", ",").replace("),(", ")|(").split("|")]
