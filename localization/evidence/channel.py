@@ -69,7 +69,8 @@ def channel_evidence(
         own, moving = _size_of_motion(z[i], noise, scale, b, size, x, least[i])
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
         for m in range(n):
-            scale_at_rest[:] = scale ** is_scaled[:, m]
+            for j in range(k):
+                scale_at_rest[j] = scale[j] if is_scaled[j, m] else 1.0
             of_bins[i, m] = TEMPER * _bin_evidence(z[i], noise, m, (scale, scale_at_rest), b, (own, still[i, m], moving), x[m])
     return of_bins, price, c, information
 

@@ -53,13 +53,14 @@ class Contradictions:
     def compare(self, window: Window) -> bool:
         """Declare faults that last; whether the turns show no fault, ways are equal where there are scans, and nothing contradicts."""
         is_stuck, way = window.has_gyro and is_repeating(window.bins), direction_of(window.bins)
+        least_rad = way.least
         are_turns_equal, are_ways_equal = self._turns.compare(window, has_gyro=not is_stuck), way.is_equal
         self._is_any_shown = is_stuck or self._turns.is_likely
         self._stuck.add(is_stuck, window.end_s, window.begin_s)
-        if self._stuck.is_lasting and self._stuck.is_majority:
+        if is_stuck and self._stuck.is_lasting and self._stuck.is_majority:
             self._faults.declare(GYRO_STUCK, self._stuck.since_s, {})
         for (beyond, _), evidence in zip(_DIRECTIONS, self._directions, strict=True):
-            is_shown = way.is_beyond(beyond)
+            is_shown = least_rad > beyond
             evidence.add(True if is_shown else False if are_ways_equal else None, window.end_s, window.begin_s)
             if is_shown and evidence.is_lasting and evidence.is_majority:
                 degrees = math.degrees(way.angle)

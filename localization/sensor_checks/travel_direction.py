@@ -55,9 +55,10 @@ class Direction(NamedTuple):
         """Both travel alike, but for what robots slide by."""
         return abs(self.angle) <= SLIDE_RAD and self.bound <= SLIDE_RAD
 
-    def is_beyond(self, limit: float) -> bool:
-        """Whether it is farther from 0 than ``limit`` [rad] by more than its error."""
-        return abs(self.angle) - self.bound > limit
+    @property
+    def least(self) -> float:
+        """How far it is from 0 at least [rad]; negative where it may be 0."""
+        return abs(self.angle) - self.bound
 
 
 def direction_of(bins: Bins) -> Direction:

@@ -223,7 +223,16 @@ def _add_bin(
         elif s == _GYRO:
             y[0] = h[s] * _BIAS_RAD_S * duration
         count, log_det, information = count + 1, log_det + math.log(variance), information + h[s] ** 2 / variance
-        projected += y * (h[s] / variance)
-        M += np.outer(y, y) / variance
-    M -= np.outer(projected, projected) / information
+        _add_outer(M, y, 1.0 / variance)
+        for p in range(4):
+            projected[p] += h[s] / variance * y[p]
+    _add_outer(M, projected, -1.0 / information)
     return count, log_det + math.log(information)
+
+
+@subroutine
+def _add_outer(M: FloatArray, y: FloatArray, weight: float) -> None:
+    """Add ``weight`` y y^T to ``M`` (4, 4)."""
+    for p in range(4):
+        for q in range(4):
+            M[p, q] += weight * y[p] * y[q]

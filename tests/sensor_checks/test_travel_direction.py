@@ -42,7 +42,7 @@ def test_direction_accuses_no_noise_of_its_own(noise_m: float) -> None:
     """Short bins with scans as noisy as their way: hardly any window is beyond a limit that the true direction is on."""
     rng = np.random.default_rng(0)
     found = [_direction_of_ways(rng, math.degrees(SLIDE_RAD), noise_m, turns, 0.5 * rng.normal()) for _ in range(1000) for turns in _TURNS]
-    assert sum(each.is_beyond(SLIDE_RAD) for each in found) <= 0.002 * len(found)
+    assert sum(each.least > SLIDE_RAD for each in found) <= 0.002 * len(found)
 
 
 @pytest.mark.parametrize("turns", [_TURNS[0], _TURNS[2]], ids=["straight", "curves"])
@@ -57,13 +57,13 @@ def test_direction_of_a_turned_lidar_is_certain(turns: list[float]) -> None:
 def test_direction_of_a_turned_lidar_is_certain_where_scans_show_no_way_along_a_corridor(degrees: float) -> None:
     found = _direction_in_corridor(np.random.default_rng(4), degrees)
     assert math.degrees(found.angle) == pytest.approx(degrees, abs=math.degrees(found.bound))
-    assert found.is_beyond(SLIDE_RAD)
+    assert found.least > SLIDE_RAD
 
 
 @pytest.mark.parametrize("wheels", [1.0, 1.5, 3.0])
 def test_direction_accuses_no_lidar_of_wheels_that_spin_along_a_corridor(wheels: float) -> None:
     found = [_direction_in_corridor(np.random.default_rng(seed), 0.0, wheels=wheels) for seed in range(1000)]
-    assert sum(each.is_beyond(math.radians(2.0)) for each in found) <= 2
+    assert sum(each.least > math.radians(2.0) for each in found) <= 2
     assert all(each.is_equal for each in found)
 
 
@@ -80,4 +80,4 @@ def test_one_scan_at_a_wrong_place_in_a_corridor_does_not_show_a_robot_that_goes
     assert direction_of(Bins.of(rows)).bound == math.inf
     rows[:8, 5:7] = -0.19, 0.0
     turned = direction_of(Bins.of(rows))
-    assert turned.is_beyond(math.radians(130.0))
+    assert turned.least > math.radians(130.0)
