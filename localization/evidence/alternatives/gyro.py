@@ -66,10 +66,9 @@ def _level_evidence(rates: FloatArray, axis: FloatArray) -> float:
     """Evidence of the rates (n, 3) across the ``axis`` that points up: on a floor they are noise, tilt and a bias, whatever the
     unit."""
     rates = (rates - np.nanmedian(rates, axis=0)) / size_of(rates)
-    up = rates @ axis
-    across = rates - up[:, None] * axis
+    up, across = rates @ axis, rates @ np.linalg.svd(axis[None])[2][1:].T
     sigma = np.sqrt(_LEVEL_FLOOR**2 + (_LEVEL_OF_TURN * up) ** 2)
-    return 2.0 / 3.0 * mixture(across, sigma[:, None], 1.0)
+    return mixture(across, sigma[:, None], 1.0)
 
 
 def _rotation_to_up(axis: FloatArray) -> tuple[float, float]:
