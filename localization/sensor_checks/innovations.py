@@ -81,6 +81,8 @@ class Bin(NamedTuple):
     seconds: float
     regressors: Regressors
     """What faults would add within this bin alone."""
+    bias_sigma: float
+    """Standard deviation of the gyro's bias then, where no rest had measured it [rad/s]; 0 for pairs without a gyro."""
     poses: FloatArray
     """(6, 3) at its end, as `Reckoning` has them."""
 
@@ -105,8 +107,9 @@ class InnovationWindow(NamedTuple):
         end_s = np.array([b.end_s for b in self.bins[1:]])
         C = np.diag(variance) + (pair.floor / len(X)) ** 2
         lasting = 0.5 + 0.5 * np.exp(-np.abs(end_s[:, None] - end_s) / SLIP_S)
-        for regressor, sigma in usual.items():
-            C += sigma**2 * np.outer(X[:, regressor], X[:, regressor]) * lasting
+        of_bias = X[:, SECONDS] * [b.bias_sigma for b in self.bins[1:]]
+        for x in (of_bias, *(sigma * X[:, regressor] for regressor, sigma in usual.items())):
+            C += np.outer(x, x) * lasting
         weighted = np.linalg.solve(C, np.column_stack([X, innovation]))
         found = [_explanation(cause, X[:, cause.regressor], weighted[:, [cause.regressor, -1]]) for cause in causes]
         best = max(found, key=operator.attrgetter("log_odds"))
@@ -151,25 +154,26 @@ class InnovationWindows:
     """The innovations of one pair over the last minute: `add` each measurement."""
 
     def __init__(self, pair: Pair) -> None:
-        self.pair = pair
+        self.pair, self._is_of_gyro = pair, pair.is_of_gyro
         self.bins: list[Bin] = []
         self._innovation = self._variance = self._seconds = 0.0
         self._regressors = self._totals = NO_REGRESSORS
 
-    def add(self, innovation: float, variance: float, totals: Regressors, now_s: float, poses: FloatArray) -> bool:
+    def add(self, innovation: float, variance: float, totals: Regressors, now_s: float, bias_sigma: float, poses: FloatArray) -> bool:
         """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``totals`` since the first step, as `add_step` has them;
-        ``poses`` (6, 3) after it."""
+        ``bias_sigma``: of the gyro, before a rest has measured its bias; ``poses`` (6, 3) after it."""
+        bias_sigma = bias_sigma if self._is_of_gyro else 0.0
         (a, b, c, d), (e, f, g, h), self._totals = totals, self._totals, totals
         regressors = a - e, b - f, c - g, d - h
         if not self.bins:
-            self.bins.append(Bin(now_s - regressors[SECONDS], 0.0, 0.0, 0.0, NO_REGRESSORS, poses))
+            self.bins.append(Bin(now_s - regressors[SECONDS], 0.0, 0.0, 0.0, NO_REGRESSORS, bias_sigma, poses))
         self._innovation, self._variance = self._innovation + innovation, self._variance + variance
         (a, b, c, d), (e, f, g, h) = self._regressors, regressors
         self._regressors = a + e, b + f, c + g, d + h
         self._seconds += regressors[SECONDS]
         if self._regressors[SECONDS] < BIN_S:
             return False
-        self.bins.append(Bin(now_s, self._innovation, self._variance, self._seconds, self._regressors, poses))
+        self.bins.append(Bin(now_s, self._innovation, self._variance, self._seconds, self._regressors, bias_sigma, poses))
         self._regressors = NO_REGRESSORS
         while self.bins[1].end_s < now_s - WINDOWS_S[-1]:
             del self.bins[0]

@@ -15,7 +15,6 @@ from localization.events import Step
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault, is_certain
 from localization.sensor_checks.innovations import (
     NO_REGRESSORS,
-    SECONDS,
     TURN,
     TURN_CHANGE,
     InnovationWindows,
@@ -119,7 +118,7 @@ class SensorConsistency:
         self._reckoning = faults.inflation.reckoning
         self._totals = NO_REGRESSORS
         self._has_moved = False
-        self._driven_s = self._bias_sigma = 0.0
+        self._driven_s = 0.0
         self._matched_s = -math.inf
         self._episodes: dict[SensorFault, _Episode] = {}
         self._reported: dict[SensorFault, _Reported] = {}
@@ -134,7 +133,6 @@ class SensorConsistency:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
         self._has_moved |= not step.is_standing
         self._driven_s += 0.0 if step.is_standing else step.duration
-        self._bias_sigma = residuals.bias_sigma
         self._totals = add_step(self._totals, step)
         if not self._has_moved:
             return  # before the first motion, the bias is measured
@@ -144,7 +142,7 @@ class SensorConsistency:
         for pair, innovation in _innovations(step, residuals):
             if innovation is None:
                 continue
-            if self._windows[pair].add(*innovation, self._totals, self._faults.now_s, self._reckoning.poses):
+            if self._windows[pair].add(*innovation, self._totals, self._faults.now_s, residuals.bias_sigma, self._reckoning.poses):
                 self._compare(pair, learned)
                 has_ended = True
         if has_ended:
@@ -185,10 +183,7 @@ class SensorConsistency:
         if self._is_explained(fault, NAMED[pair]) or worst is None or worst.sigmas < (_MAX_CLIPPED_SIGMAS if is_clipped else _MAX_SIGMAS):
             self._end(fault)
             return
-        usual = dict(self._usual.get(pair, {}))
-        if self._bias_sigma and pair.is_of_gyro:
-            usual[SECONDS] = self._bias_sigma
-        best = worst.explain(pair, CAUSES[pair], usual)
+        best = worst.explain(pair, CAUSES[pair], self._usual.get(pair, {}))
         regressor, cause = best.regressor, best.sentence
         if regressor == TURN:
             unset = [p for p in learned() if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value]

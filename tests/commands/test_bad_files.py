@@ -144,7 +144,7 @@ def test_tables_have_a_limit_of_lines(tmp_path: Path) -> None:
         read_text(path, 1 << 20)
 
 
-_OWN = ("motion_models/input_files.py", "motion_models/compiled.py")
+_OWN = ("motion_models/input_files.py", "motion_models/jit.py")
 """The door, and a module of the package that reads itself."""
 
 

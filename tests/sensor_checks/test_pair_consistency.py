@@ -243,19 +243,22 @@ def test_sums_of_innovations_exceed_a_limit_as_often_as_a_normal_variable(limit:
         for k in range(20):
             variance = float(rng.uniform(0.5, 2.0))
             totals = (0.1 * (k + 1), 0.0, 0.03 * (k + 1), 0.0)
-            windows.add(math.sqrt(variance) * float(rng.normal()), variance, totals, 0.1 * (k + 1), np.zeros((3, 3)))
+            windows.add(math.sqrt(variance) * float(rng.normal()), variance, totals, 0.1 * (k + 1), 0.0, np.zeros((3, 3)))
         worst = windows.worst()
         assert worst is not None
         beyond += worst.sigmas > limit
     assert abs(beyond - n * expected) < 3.0 * math.sqrt(n * expected * (1.0 - expected))
 
 
-def explained(innovation: FloatArray, variance: FloatArray, X: FloatArray, usual: Mapping[int, float]) -> Explanation:
+def explained(
+    innovation: FloatArray, variance: FloatArray, X: FloatArray, usual: Mapping[int, float], bias_sigmas: FloatArray | float = 0.0
+) -> Explanation:
     """Of a window of half seconds with ``innovation`` and ``variance`` (n,), and what causes are proportional to (n, 4)."""
-    bins, sums = [Bin(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0), np.zeros((5, 3)))], np.zeros(3)
+    bins, sums = [Bin(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0), 0.0, np.zeros((6, 3)))], np.zeros(3)
+    bias_sigmas = np.broadcast_to(bias_sigmas, len(X))
     for k, x in enumerate(X):
         sums += [innovation[k], variance[k], 0.5]
-        bins.append(Bin(0.5 * (k + 1), *sums.tolist(), tuple(x.tolist()), np.zeros((5, 3))))
+        bins.append(Bin(0.5 * (k + 1), *sums.tolist(), tuple(x.tolist()), float(bias_sigmas[k]), np.zeros((6, 3))))
     sigmas = abs(sums[0]) / math.sqrt(sums[1])
     return InnovationWindow(bins, 0.5 * len(X), float(sums[0]), sigmas).explain(GYRO_WHEELS, CAUSES[GYRO_WHEELS], usual)
 
@@ -280,6 +283,16 @@ def test_causes_of_healthy_wheels_that_slip_are_improbable_and_their_sigmas_thos
     assert sum(e.log_odds > math.log(99e3) for e in found) == 0
     assert sum(e.log_odds > math.log(100.0) for e in found) <= 0.03 * len(found)  # 1 % by each of three causes at most
     assert np.mean([e.sigmas > 3.0 for e in found]) < 3.0 * math.erfc(3.0 / math.sqrt(2.0)) + 0.003
+
+
+@pytest.mark.parametrize(("is_unmeasured", "is_reported"), [(True, False), (False, True)])
+def test_bias_that_a_rest_has_measured_since_is_in_what_came_before(is_unmeasured: bool, is_reported: bool) -> None:
+    """A gyro is off by 2 deg/s until the robot rests in the middle of the window."""
+    before = np.arange(20) < 10
+    X, variance = np.column_stack([np.full(20, 0.5), *np.zeros((3, 20))]), np.full(20, 1e-5)
+    sigmas = np.where(before, 0.03 * is_unmeasured, 0.0)
+    found = explained(np.where(before, 0.5 * math.radians(2.0), 0.0), variance, X, {}, sigmas)
+    assert (found.log_odds > math.log(99e3)) == is_reported
 
 
 def test_side_that_loses_far_more_than_slip_is_found_and_named() -> None:
