@@ -233,8 +233,12 @@ def drawn_log(
     return Drawn(base, sensors, tuple(names), t, twists, poses, _robot(base), sorted(records, key=lambda r: r[2]), tuple(remarks))
 
 
+_LEAST_K_OF_CASTERS = 0.9
+"""Two driven wheels beside casters turn the robot by as much as they roll."""
+
+
 def _robot(base: Base) -> Robot:
-    drive = DIFF_DRIVE if len(base.left) == 1 else "skid_steer"
+    drive = DIFF_DRIVE if len(base.left) == 1 and base.k > _LEAST_K_OF_CASTERS else "skid_steer"  # else tracks
     return Robot(
         "drawn",
         Geometry(base.radius, base.track, base.wheelbase, 30.0),
