@@ -36,6 +36,11 @@ class PlainConsole(Console):
             yield segment if segment.control else segment._replace(text=_COMMANDS.sub("\N{REPLACEMENT CHARACTER}", segment.text))
 
 
+def print_warning(console: Console, text: str) -> None:
+    """A line that is not lost among others."""
+    console.print(f"[yellow]![/] {escape(text)}", soft_wrap=True)
+
+
 def names(text: str, option: str) -> list[str]:
     """Names in ``text``, separated by commas, each once. Raises `SettingError` where there is none."""
     found = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))

@@ -12,11 +12,10 @@ from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 
-from localization.commands.common import names, write_json
+from localization.commands.common import names, print_warning, write_json
 from localization.commands.models import model_names
 from localization.comparison.comparison_page import CompareHead, check_report, write_comparison_report
 from localization.comparison.jobs import OK, Job, LogOrigin, Row, job_key, run_job, run_local, run_on_cluster, trials
@@ -83,7 +82,7 @@ class Compare:
         jobs = self._jobs(console, table)
         notes = self._notes(jobs)
         for note in notes:
-            console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
+            print_warning(console, note)
         left = [dataclasses.replace(job, trials=missing) for job in jobs if (missing := table.missing(job))]
         done = sum(len(job.trials) for job in jobs) - sum(len(job.trials) for job in left)
         if done:
@@ -95,7 +94,7 @@ class Compare:
                 table.record(job, rows, jobs)
                 progress.advance(task)
                 for reason in dict.fromkeys(row["error"] for row in rows if row["status"] != OK):
-                    console.print(f"[yellow]![/] {escape(job.log)}: {escape(reason)}", soft_wrap=True)
+                    print_warning(console, f"{job.log}: {reason}")
         table.save(jobs)
         self._report(console, jobs, table, report_path)
 
@@ -154,7 +153,7 @@ class Compare:
             known = ", ".join(sorted({name for row in rows for name, value in row.items() if isinstance(value, float)}))
             raise EvaluationError(f"no result has a number '{self.metric}'; there are {known}.")
         for log, damage in found.damaged.items():
-            console.print(f"[yellow]![/] {escape(log)}: {escape(damage)}", soft_wrap=True)
+            print_warning(console, f"{log}: {damage}")
         grid = Grid("", "logs", f"mean {self.metric}", "95 %", box=None, header_style="bold", pad_edge=False)
         for m in found.means:
             grid.add_row(m.name, str(m.n), f"{m.mean:.4g}", f"{m.low:.4g} to {m.high:.4g}" if m.n > 1 else "")

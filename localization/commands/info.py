@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from localization.commands.common import print_table, write_json
+from localization.commands.common import print_table, print_warning, write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.logs.topic_roles import CHOSEN_BY
 from localization.output import check_outputs
@@ -67,6 +67,6 @@ def _print(console: Console, info: LogInfo) -> None:
         console.print(f"mount of {frame}: [{at}] m, roll, pitch and yaw [{turned}] deg", markup=False, soft_wrap=True)
     console.print(f"tilt of the ground: {info.tilt}", markup=False, soft_wrap=True)
     for problem in info.problems:
-        console.print(f"[yellow]![/] {escape(problem)}", soft_wrap=True)
+        print_warning(console, problem)
     for note in info.warnings:
         console.print(f"  {note}", markup=False, soft_wrap=True)

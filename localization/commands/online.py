@@ -17,7 +17,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from localization.commands.online_options import CommandOptions, listening, print_warning
+from localization.commands.common import print_warning
+from localization.commands.online_options import CommandOptions, listening
 from localization.errors import CheckpointError, OutputError
 from localization.estimators import check_estimator
 from localization.events import Event

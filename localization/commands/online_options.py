@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
+from localization.commands.common import print_warning
 from localization.ros.early_odometry import EarlyOdometry
 from localization.ros.node_config import LiveOptions, NodeConfig
 from localization.ros.transports import TransportName, open_transport
@@ -77,8 +77,3 @@ def listening(options: CommandOptions, node: NodeConfig, console: Console) -> It
         yield SimTimeTransport(transport) if node.use_sim_time else transport
     finally:
         transport.close()
-
-
-def print_warning(console: Console, text: str) -> None:
-    """A line that is not lost among others."""
-    console.print(f"[yellow]![/] {escape(text)}", soft_wrap=True)

@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from localization.commands.common import WIDE, names, new_folder, print_table, write_json
+from localization.commands.common import WIDE, names, new_folder, print_table, print_warning, write_json
 from localization.commands.models import model_names
 from localization.errors import EstimatorError, EvaluationError, MapError, SettingError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
@@ -348,7 +348,7 @@ class Replay:
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         of_reference = reference.warnings if isinstance(reference, ReferenceTrack) else ()
         for note in dict.fromkeys([*head.warnings, *map(as_text, of_reference)]):
-            console.print(f"[yellow]![/] {escape(note)}", soft_wrap=True)
+            print_warning(console, note)
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         robot = load_robot(self.robot)
