@@ -35,8 +35,6 @@ _REPEATED_RAD_S = 1e-7
 _MIN_STUCK_OFF_RAD_S, _MIN_STUCK_WHEELS_RAD_S = 0.05, 0.002
 """A gyro that repeats is stuck where the wheels turn by something else, which its bias (ten prior sigmas of the shipped robots) does not
 explain; over a whole window, where the wheels turn at all [rad/s]."""
-
-
 _DIRECTIONS = (SLIDE_RAD, _SLIDE_S), (_MAX_SLIDE_RAD, MEMORY_S)
 """Directions of travel of a LiDAR whose mount is turned, and the times of which most comparisons show them [rad, s]."""
 

@@ -67,9 +67,9 @@ class CovarianceInflation:
         """(3,) difference of a pair of sensors that differ for now."""
         self.ongoing_scene: FloatArray | None = None
         """(3,) difference of wheels and scans while objects move in these."""
-        self._swapped_since: FloatArray | None = None  # poses where wheels may have begun to be swapped
         self.possible: FloatArray | None = None
         """(3,) the same while that is not decided: no fault yet."""
+        self._swapped_since: FloatArray | None = None  # poses where wheels may have begun to be swapped
 
     def restart(self) -> None:
         """All sensors agree: measure from here on how far faults lead the estimate away."""
