@@ -279,12 +279,12 @@ def test_serialize_of_named_tuples_writes_columns():
 def test_serialize_of_rows_within_rows_writes_columns():
     """Named tuples that hold tuples and arrays of different lengths; of an array in two places there is one afterwards."""
     poses = [np.arange(float(i)) for i in range(40)]
-    values = [Bin(0.5 * i, 0.1, 0.2, 0.3, (0.1 * i, 1.0, 2.0, 3.0), poses[i % 40]) for i in range(200)]
+    values = [Bin(0.5 * i, 0.1, 0.2, 0.3, (0.1 * i, 1.0, 2.0, 3.0), 0.01, poses[i % 40]) for i in range(200)]
     text, blob = serialize(values)
     assert text.count(b"Bin") == 1
-    assert len(blob) < 200 * 9 * 8 + sum(pose.nbytes for pose in poses)
+    assert len(blob) < 200 * 10 * 8 + sum(pose.nbytes for pose in poses)
     found = deserialize(text, blob)
-    assert [value[:5] for value in found] == [value[:5] for value in values]
+    assert [value[:6] for value in found] == [value[:6] for value in values]
     assert {type(value) for value in found} == {Bin}
     assert all(np.array_equal(a.poses, b.poses) for a, b in zip(found, values, strict=True))
     assert found[0].poses is found[40].poses
