@@ -14,9 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from localization.evidence.alternatives import Alternative, Row
-from localization.evidence.alternatives.alternative import LEVELS
 from localization.evidence.angles import BoolArray
-from localization.evidence.likelihood import Choice, Evidence, Stack, varied
+from localization.evidence.likelihood import NOISE_LEVELS, Choice, Evidence, Stack, varied
 from motion_models.se2 import FloatArray
 
 _ODDS = math.log(0.1)
@@ -47,7 +46,7 @@ def _best_change(evidence: Evidence, choice: Choice, index: int) -> Alternative 
     where none is more probable than the best without a change."""
     stacks = evidence.stacks
     stack, bins = stacks[index], range(_MIN_BINS, len(stacks[index].t) - _MIN_BINS, _EVERY)
-    level = max(LEVELS, key=lambda each: evidence.log_posterior(np.array([choice]), each)[0])
+    level = max(NOISE_LEVELS, key=lambda each: evidence.log_posterior(np.array([choice]), each)[0])
     choices = varied(choice, index, stack)
     E = evidence.by_bin(choices, level) + stack.log_jacobians
     own = np.array([a.log_prior + a.own for a in stack.alternatives])

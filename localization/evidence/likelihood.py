@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives.alternative import (
-    SLIP,
+    LEVELS,
     STILL_M_S,
     STILL_RAD_S,
     TEMPER,
@@ -22,50 +22,10 @@ from localization.evidence.alternatives.alternative import (
 )
 from localization.evidence.angles import BoolArray
 from localization.evidence.channel import channel_evidence, log_size_prior
+from localization.evidence.noise import NOISE
 from localization.evidence.signals import Kind
 from motion_models.se2 import FloatArray
 
-
-@dataclass(frozen=True)
-class Noise:
-    """Errors of one kind of source over half a second."""
-
-    relative: float
-    """Part of the motion: slip, matching."""
-    turn_floor: float
-    """[rad/s]; of wheels part of the largest turn that their rates may be (`Stack.sizes`): encoders are still where the robot is."""
-    way_floor: float
-    """[m/s]; of wheels part of the largest way."""
-    turn_scale: float
-    """Sigma of the logarithm of its scale: skidding, gyro."""
-    way_scale: float
-    """Radius, ranges."""
-    bias: float = 0.0
-    """Sigma of a constant yaw rate [rad/s]."""
-    skid_relative: float = 0.0
-    """Part of the turns where the robot turns by a changing part of what its wheels turn (`_SKID_ODDS`)."""
-    turn_of_way: float = 0.0
-    """Error of the turn by the way [rad/m]: sides that slip or grow; fr079, ACES, Husky: 0.03, 0.04, 0.003."""
-    skid_of_way: float = 0.0
-    """Error of the turn by the way where the robot skids [rad/m]."""
-    way_of_turn: float = 0.0
-    """Error of the way by the turn [m/rad]: a load beside the middle moves the centre of rotation to the side, .2 m of a Warthog in MuJoCo
-    with a seventh of its track."""
-
-    @property
-    def floors(self) -> dict[str, float]:
-        """By channel."""
-        return {"way": self.way_floor, "turn": self.turn_floor}
-
-
-NOISE: Mapping[Kind, Noise] = {
-    "wheels": Noise(SLIP, 0.01, 0.03, 0.25, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12, way_of_turn=0.1),
-    "driver": Noise(SLIP, 0.01, 0.03, 0.05, 0.08, skid_relative=1.2, turn_of_way=0.04, skid_of_way=0.12, way_of_turn=0.1),
-    "gyro": Noise(0.04, 0.01, 0.0, 0.03, 0.0, bias=0.03),
-    "lidar": Noise(0.06, 0.02, 0.02, 0.01, 0.04),
-    "reference": Noise(0.05, 0.02, 0.02, 0.01, 0.02),
-}
-"""Measured on fr079, MIT-CSAIL, ACES and the Husky of `tests/data`; the level is estimated in each log (`LEVELS`)."""
 _SKID_ODDS, _SKID_SIGMA = math.log(0.03), 0.4
 """Logarithm of the odds of a k that changes with speed, floor or load within a log, or that is unusual; sigma of its logarithm."""
 _STANDS_ODDS = math.log(0.03)
@@ -76,6 +36,10 @@ STILL = {"way": STILL_M_S, "turn": STILL_RAD_S}
 _FAST = 5.0
 """Size of a fast robot's motion over `_SIZES`: 2.5 m/s, 3 rad/s."""
 _SIZES = {"way": WAY_M_S, "turn": TURN_RAD_S}
+Levels = tuple[float, float]
+"""Factors on the noise of sensors, and of wheels: a floor is as quiet as no sensor is."""
+NOISE_LEVELS: Sequence[Levels] = [(of_sensors, of_wheels) for of_sensors in LEVELS for of_wheels in LEVELS if of_wheels >= of_sensors]
+"""Those of which each log has one, equally probable before."""
 Choice = tuple[int, ...]
 """Index of an alternative, by source."""
 Choices = NDArray[np.intp]
@@ -148,7 +112,17 @@ class Stack:
         """(A, n) tempered logarithm of the Jacobian of a channel: what counts nothing at rest does so in any unit."""
         channel = self.channel(name)
         assert channel is not None
-        return np.asarray(TEMPER * self.log_unit(name) * (np.isfinite(channel) & self._is_scaled))
+        log_unit = self.log_unit(name)
+        of_sides = np.array([[a.has_two_units] for a in self.alternatives])
+        if of_sides.any():
+            log_unit = np.where(of_sides & (log_unit > 0.0), np.minimum(log_unit, self._log_growth(name, channel)), log_unit)
+        return np.asarray(TEMPER * np.where(np.isfinite(channel) & self._is_scaled, log_unit, 0.0))
+
+    def _log_growth(self, name: str, channel: FloatArray) -> FloatArray:
+        """(A, n) logarithm of a channel's noise over that by the robot file. The Jacobian of a side's larger unit is that at most: the noise
+        of way and turn grows by less than the side's own, so that a unit would gain where sensors agree no better."""
+        log_noise = np.log(np.hypot(self._floors[name], NOISE[self.kind].relative * channel))
+        return np.asarray(log_noise - log_noise[0])
 
     def log_unit(self, name: str) -> FloatArray:
         """(A, n) logarithm of the unit of a channel."""
@@ -176,11 +150,15 @@ class Stack:
         way. It is in the unit of the channel, so that no unit has less noise than another."""
         return self._floors[name]
 
-    def noise_floor(self, name: str, level: float) -> FloatArray:
-        """(A, n) `floor` at a ``level`` of the noise, with what the source itself shows."""
+    def level(self, levels: Levels) -> float:
+        """Factor on its noise."""
+        return levels[self._counts]
+
+    def noise_floor(self, name: str, levels: Levels) -> FloatArray:
+        """(A, n) `floor` at ``levels`` of the noise, with what the source itself shows."""
         channel = "turn" if name == "skidding" else name
-        own = self.jitter.get(channel, 0.0)
-        return np.hypot(level * self.floor(name), own * self.unit(channel)[:, None]) if own else level * self.floor(name)
+        own, floor = self.jitter.get(channel, 0.0), self.level(levels) * self.floor(name)
+        return np.hypot(floor, own * self.unit(channel)[:, None]) if own else floor
 
     def alike(self, name: str) -> Choices:
         """(A,) index of the first alternative by which a channel is the same, with its noise and its unit."""
@@ -274,29 +252,29 @@ class Evidence:
     """
 
     stacks: Sequence[Stack]
-    _known: dict[tuple[str, float], dict[Choice, FloatArray]] = field(default_factory=dict)
-    """Evidence (n,) by channel, level of the noise, and index of the first alternative of each source with the same channel."""
+    _known: dict[tuple[str, Levels], dict[Choice, FloatArray]] = field(default_factory=dict)
+    """Evidence (n,) by channel, levels of the noise, and index of the first alternative of each source with the same channel."""
 
     def with_more(self, stacks: Sequence[Stack]) -> Evidence:
         """The evidence of ``stacks``, which have further alternatives behind those that were there."""
         return Evidence(stacks, self._known)
 
-    def log_posterior(self, choices: Choices, level: float) -> FloatArray:
-        """Log posterior (A,) of ``choices`` at a ``level`` of the noise."""
+    def log_posterior(self, choices: Choices, levels: Levels) -> FloatArray:
+        """Log posterior (A,) of ``choices`` at these ``levels`` of the noise."""
         own = sum(stack.own[rows] for stack, rows in zip(self.stacks, choices.T, strict=True))
-        return np.asarray(own + self.by_bin(choices, level).sum(axis=1))
+        return np.asarray(own + self.by_bin(choices, levels).sum(axis=1))
 
-    def by_bin(self, choices: Choices, level: float) -> FloatArray:
+    def by_bin(self, choices: Choices, levels: Levels) -> FloatArray:
         """(A, n) the part of `log_posterior` that the sources have of each other."""
         names = [name for name in _SIZES if any(stack.channel(name) is not None for stack in self.stacks)]
-        return np.asarray(sum(self._of_channel(choices, name, level) for name in names))
+        return np.asarray(sum(self._of_channel(choices, name, levels) for name in names))
 
-    def _of_channel(self, choices: Choices, name: str, level: float) -> FloatArray:
-        known = self._known.setdefault((name, level), {})
+    def _of_channel(self, choices: Choices, name: str, levels: Levels) -> FloatArray:
+        known = self._known.setdefault((name, levels), {})
         firsts = [tuple(row) for row in np.stack([s.alike(name)[k] for s, k in zip(self.stacks, choices.T, strict=True)], axis=1).tolist()]
         new = [first for first in dict.fromkeys(firsts) if first not in known]
         if new:
-            known.update(zip(new, _evidence(self.stacks, np.array(new), name, level), strict=True))
+            known.update(zip(new, _evidence(self.stacks, np.array(new), name, levels), strict=True))
         return np.array([known[first] for first in firsts])
 
 
@@ -306,7 +284,7 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     used = [i for i, stack in enumerate(single) if stack.channel(name) is not None]
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
-        inputs = _inputs(single, np.zeros((1, len(single)), int), name, 1.0, used)
+        inputs = _inputs(single, np.zeros((1, len(single)), int), name, (1.0, 1.0), used)
         _, _, c, information = channel_evidence(*inputs, _SIZES[name], _at_rest(single, np.zeros((1, len(single)), int), name, used))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
@@ -335,19 +313,18 @@ def _at_rest(stacks: Sequence[Stack], choices: Choices, name: str, used: Sequenc
     return least_sizes(stacks, choices, name), np.asarray(STILL[name] * np.max(units, axis=0)), is_scaled
 
 
-def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, level: float) -> FloatArray:
-    """Evidence (A, n) by bin of one channel, at a level of the noise; what concerns all bins is spread over them."""
+def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, levels: Levels) -> FloatArray:
+    """Evidence (A, n) by bin of one channel, at ``levels`` of the noise; what concerns all bins is spread over them."""
     used = [i for i, stack in enumerate(stacks) if stack.channel(name) is not None]
-    inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choices, name, level, used)
+    inputs = z, floor, relative, tau, bias_sigma = _inputs(stacks, choices, name, levels, used)
     size, at_rest = _SIZES[name], _at_rest(stacks, choices, name, used)
     of_bins, price, _, _ = channel_evidence(*inputs, size, at_rest)
     skids = np.array([NOISE[stacks[i].kind].skid_relative for i in used])
     slips = np.array([NOISE[stacks[i].kind].relative for i in used])
-    slides = [(skids, level), (slips, level), *([(skids, 1.0)] if level < 1.0 else [])]  # the floor is not as quiet as the sensors
-    for part, slip_level in slides if name == "turn" and skids.any() else ():
-        skidding = np.stack([stacks[i].noise_floor("skidding", slip_level)[choices[:, i]] for i in used], axis=1)
+    for part in (skids, slips) if name == "turn" and skids.any() else ():
+        skidding = np.stack([stacks[i].noise_floor("skidding", levels)[choices[:, i]] for i in used], axis=1)
         skidding = np.where(skids[:, None] > 0.0, skidding, floor)
-        of_share = np.ascontiguousarray(np.where(skids > 0.0, slip_level * part, relative))
+        of_share = np.ascontiguousarray(np.where(skids > 0.0, levels[1] * part, relative))
         of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
         of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, size, at_rest)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price
@@ -375,14 +352,14 @@ def _of_one_source(stacks: Sequence[Stack], choices: Choices, name: str, used: S
 
 
 def _inputs(
-    stacks: Sequence[Stack], choices: Choices, name: str, level: float, used: Sequence[int]
+    stacks: Sequence[Stack], choices: Choices, name: str, levels: Levels, used: Sequence[int]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Channels and floors (A, k, n), relative noise (A, k), sigmas of scales (A, k) and of biases (k,)."""
     rows = {i: choices[:, i] for i in used}
     z = np.stack([c[r] for i, r in rows.items() if (c := stacks[i].channel(name)) is not None], axis=1)
-    floor = np.stack([stacks[i].noise_floor(name, level)[r] for i, r in rows.items()], axis=1)
+    floor = np.stack([stacks[i].noise_floor(name, levels)[r] for i, r in rows.items()], axis=1)
     tau = np.stack([stacks[i].tau[name][r] for i, r in rows.items()], axis=1)
     noise = [NOISE[stacks[i].kind] for i in used]
-    relative = level * np.repeat([[n.relative for n in noise]], len(choices), axis=0)
+    relative = np.repeat([[stacks[i].level(levels) * n.relative for i, n in zip(used, noise, strict=True)]], len(choices), axis=0)
     bias_sigma = np.array([n.bias if name == "turn" else 0.0 for n in noise])
     return z, floor, relative, tau, bias_sigma

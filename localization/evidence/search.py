@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives import MAKERS, Alternative, Row
-from localization.evidence.alternatives.alternative import LEVELS, size_of, unrelated_evidence
+from localization.evidence.alternatives.alternative import size_of, unrelated_evidence
 from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
-from localization.evidence.likelihood import Choice, Evidence, Stack, least_sizes, varied
+from localization.evidence.likelihood import NOISE_LEVELS, Choice, Evidence, Levels, Stack, least_sizes, varied
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -30,7 +30,7 @@ _FAR = 30.0
 """Logarithm of the evidence below the best at any level, beyond which no level brings a choice back."""
 _CHANGED = 3
 """Best choices of which one source is tried with a change within the log."""
-_SEARCH_LEVELS = (0.35, 1.0)
+_SEARCH_LEVELS: Sequence[Levels] = ((0.35, 0.35), (0.35, 1.0), (1.0, 1.0))
 """Levels of the noise at which set-ups are searched."""
 _MAX_BINS = 140
 _CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
@@ -167,7 +167,7 @@ def search(stacks: Sequence[Stack]) -> Found:
     return Found(dict(zip(kept, _marginal(evidence, kept).tolist(), strict=True)), against, evidence.stacks)
 
 
-def _search_at(evidence: Evidence, null: Choice, level: float, found: dict[Choice, float]) -> dict[str, float]:
+def _search_at(evidence: Evidence, null: Choice, level: Levels, found: dict[Choice, float]) -> dict[str, float]:
     """Add the best choices at a ``level`` to ``found``; the Bayes factors against single faults."""
     stacks = evidence.stacks
     at_level: dict[Choice, float] = {}
@@ -266,7 +266,7 @@ def _mirror_of(stack: Stack, k: int, signs: Mapping[str, float]) -> int | None:
 
 def _marginal(evidence: Evidence, choices: Sequence[Choice]) -> FloatArray:
     """Log posterior (A,) of ``choices``, integrated over the level of the noise."""
-    return np.asarray(np.logaddexp.reduce([evidence.log_posterior(np.array(choices), level) for level in LEVELS]))
+    return np.asarray(np.logaddexp.reduce([evidence.log_posterior(np.array(choices), level) for level in NOISE_LEVELS]))
 
 
 def rows_of(stacks: Sequence[Stack], choice: Choice) -> tuple[Row, ...]:

@@ -18,8 +18,6 @@ OUTLIER = 0.1
 """Share of bins in which a source slips, is matched to the wrong place or is lost."""
 LEVELS = (0.0625, 0.125, 0.25, 0.5, 1.0, 2.0)
 """Factors on all noise, of which each log has one, equally probable before: from a simulator to a worn robot on gravel."""
-SLIP = 0.15
-"""Noise of wheels' rates over half a second, a part of their motion."""
 STILL_M_S = 0.02
 """Noise of speeds at rest [m/s]: what is smaller is no motion."""
 STILL_RAD_S = 0.03
@@ -103,6 +101,8 @@ class Alternative:
     delay_s: float = 0.0
     own_by_bin: FloatArray | None = None
     """(n,) the part of ``own`` that each bin has; None where it is of all bins alike."""
+    has_two_units: bool = False
+    """Whether the sides have different units, so that none is that of way or turn."""
 
     @property
     def log_prior(self) -> float:

@@ -10,7 +10,8 @@ from functools import partial
 
 import numpy as np
 
-from localization.evidence.alternatives.alternative import FACTOR_SIGMA, SLIP, Alternative, Row, free_factor, mixture, size_of
+from localization.evidence.alternatives.alternative import FACTOR_SIGMA, Alternative, Row, free_factor, mixture, size_of
+from localization.evidence.noise import NOISE
 from localization.evidence.signals import Source
 from motion_models.prior import expected_scaling
 from motion_models.robot import Robot
@@ -200,6 +201,8 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
     """Rates of one side in another unit."""
     n, nl = rates.shape[1], source.left
     sides = tuple(range(nl)), tuple(range(nl, n))
+    left, right = (rates[:, part].mean(axis=1) for part in sides)
+    alike = _alike_evidence(rates, *sides)
     for name, factor in (
         ("rpm", math.tau / 60.0),
         ("deg/s", math.pi / 180.0),
@@ -209,21 +212,19 @@ def _of_one_side(source: Source, rates: FloatArray, radius: float, scale: float)
         ("x 1/4", 4.0),
         ("m/s", 1.0 / radius),
     ):
-        for side, columns in zip(("left", "right"), sides, strict=True):
-            factors = np.ones(n)
-            factors[list(columns)] = factor
-            of_left, of_right = ((rates * factors)[:, part].mean(axis=1) for part in sides)
+        for side in ("left", "right"):
+            of_left, of_right = (factor * left, right) if side == "left" else (left, factor * right)
             text = f"rates of the {side} wheels are in another unit than the others' ({name})"
             row = Row(f"wheels.factor_{side}", text, _ODDS["side_unit"], name, factor, partial(_scale_side, side, factor))
             way, turn = 0.5 * radius * (of_left + of_right), scale * (of_right - of_left)
-            own, other = (of_left, of_right) if side == "left" else (of_right, of_left)
-            units = factor ** (0.5 * _seen(own / factor, other))
-            yield Alternative((row,), way, turn, (units, units), _alike_evidence(rates, *sides), 0.05, 0.05)
+            own, other = (left, of_right) if side == "left" else (right, of_left)
+            units = factor ** (0.5 * _seen(own, other))
+            yield Alternative((row,), way, turn, (units, units), alike, 0.05, 0.05, has_two_units=True)
 
 
 def _seen(rate: FloatArray, other: FloatArray) -> FloatArray:
     """Share (n,) of the ``rate`` of a side that is seen beside the noise of the ``other`` side's: one that hardly rolls shows no unit."""
-    return np.asarray(rate**2 / (rate**2 + (SLIP * other) ** 2 + 1e-12))
+    return np.asarray(rate**2 / (rate**2 + (NOISE["wheels"].relative * other) ** 2 + 1e-12))
 
 
 def _set_sides(left: tuple[str, ...], right: tuple[str, ...], robot: Robot) -> Robot:
