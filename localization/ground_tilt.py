@@ -81,8 +81,10 @@ class GroundTilt:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the ground may tilt, and whether it does is not certain."""
-        return not self.is_certain and bool(np.hypot(*self.ground) > _LEVEL)
+        """Whether it is certain that the ground tilts or the mount is off, and not which."""
+        both = np.hstack([np.eye(2), np.eye(2)])
+        is_large = bool(np.hypot(*self.ground) > _LEVEL)
+        return not self.is_certain and is_large and _is_shown(both @ self._mean, both @ self._cov @ both.T)
 
     def restart(self) -> None:
         """The ground is another one: nothing is known of its tilt."""
@@ -96,8 +98,7 @@ class GroundTilt:
         for i, (_, ground) in enumerate(_BANK):
             self._log_weights[i] += _separate(ground.sigma, self._means[i], self._covs[i], downhill, cov, turn, way) / _LASTING
         self._mix()
-        square = float(self.ground @ np.linalg.solve(self.ground_cov, self.ground))
-        is_shown = bool(np.hypot(*self.ground) > _LEVEL and square > _CERTAIN**2)
+        is_shown = _is_shown(self.ground, self.ground_cov)
         self.is_certain = is_shown or (self.is_certain and bool(self.probabilities[0].sum() > 0.5))
 
     def _mix(self) -> None:
@@ -106,6 +107,11 @@ class GroundTilt:
         self._mean = p @ self._means
         off = self._means - self._mean
         self._cov = np.einsum("h,hij->ij", p, self._covs + off[:, :, None] * off[:, None, :])
+
+
+def _is_shown(slope: FloatArray, cov: FloatArray) -> bool:
+    """Whether a ``slope`` (2,) of this ``cov`` (2, 2) is certain, and more than that of level ground."""
+    return bool(np.hypot(*slope) > _LEVEL and slope @ np.linalg.solve(cov, slope) > _CERTAIN**2)
 
 
 @kernel

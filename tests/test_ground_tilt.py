@@ -57,6 +57,24 @@ def test_imu_that_sits_askew_is_no_hill_before_it_turns():
         assert not made.is_certain
 
 
+def test_ground_under_a_robot_that_shakes_is_not_in_question():
+    """Three degrees of noise on level ground are neither a hill nor an IMU that sits askew."""
+    for seed in range(20):
+        rng, made = np.random.default_rng(seed), GroundTilt()
+        for _ in range(60):
+            made.update(np.radians(3.0) * rng.normal(size=2), 36.0 * COV, 0.1, 0.3)
+            assert not made.is_ambiguous
+            assert not made.is_certain
+
+
+def test_tilt_that_may_be_the_mounts_is_in_question():
+    rng, made, found = np.random.default_rng(2), GroundTilt(), []
+    for _ in range(4):
+        made.update(np.radians([9.0, 8.5]) + np.radians(0.5) * rng.normal(size=2), COV, 0.0, 0.3)
+        found.append(made.is_ambiguous)
+    assert all(found)
+
+
 def test_hills_after_a_level_floor_are_found_without_a_turn():
     """Straight on over a floor and up a ramp of 9 deg: what begins on the way is no mount."""
     rng, made, found = np.random.default_rng(0), GroundTilt(), []
