@@ -47,7 +47,7 @@ class Residuals(NamedTuple):
     scan_way: tuple[float, float] | None = None
     """Innovation of the matched scan's way ahead, and its variance [m, m^2]."""
     bias_sigma: float = 0.0
-    """Standard deviation of the gyro's bias by a prior that no rest has tested [rad/s]; 0 once one has."""
+    """Standard deviation of the gyro's bias [rad/s]: by the filter, and by a prior that no rest has tested."""
 
 
 class Estimator(ABC):

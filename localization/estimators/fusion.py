@@ -274,9 +274,11 @@ class EkfFusion(Estimator):
         last = self.last
         by_corrections = last.motion.d_params @ self.noise.corrections.directions @ last.corrections
         file_delta = se2.retract(last.motion.delta, -by_corrections)
-        turn, scan = None if last.turn is None else last.turn.component(0), last.scan
-        scan_turn, scan_way = (None, None) if scan is None else (scan.component(2), scan.component(0))
-        return Residuals(turn, file_delta, scan_turn, scan_way, self._policies.standstill.bias_sigma)
+        scan_turn, scan_way = (None, None) if last.scan is None else (last.scan.component(2), last.scan.component(0))
+        if last.turn is None:
+            return Residuals(None, file_delta, scan_turn, scan_way)
+        bias_sigma = math.hypot(self._policies.standstill.bias_sigma, math.sqrt(self.state.variance("gyro_bias")))
+        return Residuals(last.turn.component(0), file_delta, scan_turn, scan_way, bias_sigma)
 
     def learned_parameters(self) -> Sequence[LearnedParameter]:
         """The motion model's parameters that are corrected, and the wheels' radius where scans measure it, against the robot file."""

@@ -82,7 +82,7 @@ class Bin(NamedTuple):
     regressors: Regressors
     """What faults would add within this bin alone."""
     bias_sigma: float
-    """Standard deviation of the gyro's bias then, where no rest had measured it [rad/s]; 0 for pairs without a gyro."""
+    """Standard deviation of the gyro's bias then [rad/s]; 0 for pairs without a gyro."""
     poses: FloatArray
     """(6, 3) at its end, as `Reckoning` has them."""
 
@@ -161,7 +161,7 @@ class InnovationWindows:
 
     def add(self, innovation: float, variance: float, totals: Regressors, now_s: float, bias_sigma: float, poses: FloatArray) -> bool:
         """Add an ``innovation`` with its ``variance``; whether it ends a bin. ``totals`` since the first step, as `add_step` has them;
-        ``bias_sigma``: of the gyro, before a rest has measured its bias; ``poses`` (6, 3) after it."""
+        ``bias_sigma``: of the gyro; ``poses`` (6, 3) after it."""
         bias_sigma = bias_sigma if self._is_of_gyro else 0.0
         (a, b, c, d), (e, f, g, h), self._totals = totals, self._totals, totals
         regressors = a - e, b - f, c - g, d - h

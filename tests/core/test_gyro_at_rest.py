@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from localization.core.motion import FilterConfig
+from localization.core.policies.standstill import _BIAS_PRIORS
 from localization.estimators.fusion import EkfFusion
 from localization.events import Step
 from localization.rate_series import RateSeries
@@ -72,6 +73,20 @@ def test_two_seconds_of_rest_know_a_mems_bias_to_the_noise_of_the_gyro():
     assert 0.5 < np.mean(bias_nees) < 2.0
     assert np.mean(yaw_nees) < 2.0
     assert math.degrees(float(np.sqrt(np.mean(np.square(yaw_errors))))) < 3.0
+
+
+def test_bias_by_a_rest_that_leaves_its_prior_open_is_consistent():
+    """Half a second of a noisy gyro does not show whether the driver has zeroed it: NEES over biases drawn from all priors."""
+    nees = []
+    for seed in range(150):
+        rng = np.random.default_rng([seed, 9])
+        _, factor, own = _BIAS_PRIORS[rng.choice(len(_BIAS_PRIORS), p=[share for share, _, _ in _BIAS_PRIORS])]
+        bias = rng.normal(0.0, factor * GyroNoise.bias_sigma_rad_per_s + own)
+        ekf, _ = drive(constant_rate(bias, 1.0), white=10.0 * WHITE, seed=seed)
+        if ekf._policies.standstill.is_at_rest:
+            nees.append((ekf.state.number("gyro_bias") - bias) ** 2 / ekf.state.variance("gyro_bias"))
+    assert len(nees) > 130
+    assert 0.5 < np.mean(nees) < 2.0
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0, 3.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -40,7 +41,7 @@ class BiasAtRest(NamedTuple):
     """A bias by the time at rest that was not yet used to measure it."""
 
     prior_variance: float
-    """Variance of the prior that holds, where it is wider than the filter's [rad^2/s^2]; else 0."""
+    """Variance of the prior that holds, or of all together, where it is wider than the filter's [rad^2/s^2]; else 0."""
     change_variance: float
     """Square of the change since the rest before [rad^2/s^2]; 0 where there is none."""
     rate: float
@@ -160,7 +161,7 @@ class StandstillTest:
             return None
         self.bias_sigma = 0.0
         if not best:
-            return BiasAtRest(0.0, 0.0, rate, noise)
+            return BiasAtRest(0.0, 0.0, rate, noise) if self._is_prior_tested else _mixed(biases, likelihoods, rate, noise)
         is_first, change = not self._is_prior_tested, rate - self._bias[0]
         self._is_prior_tested, self._bias = True, (rate, noise)
         if is_first:
@@ -206,6 +207,17 @@ class StandstillTest:
         ratio = float(np.sum((turns[:, 0] - rate * turns[:, 1]) ** 2 / turns[:, 1])) / (n * self._density())
         gain = 0.5 * n * (ratio - 1.0 - math.log(ratio)) if ratio > 1.0 else 0.0
         return min(gain - 0.5 * math.log(n), _MAX_EXPONENT)
+
+
+def _mixed(biases: Sequence[_Bias], likelihoods: Sequence[float], rate: float, noise: float) -> BiasAtRest:
+    """The bias by a ``rate`` that leaves several priors probable, as a rest of half a second does: the prior and the measurement that have
+    the mean and the variance of all of them together, each with its probability (moment matching: Bar-Shalom et al. 2001, 1.4.16)."""
+    p = np.array(likelihoods) / sum(likelihoods)
+    mean, variance = np.array([(b.mean, b.variance) for b in biases]).T
+    gain = variance / (variance + noise)
+    means = mean + gain * (rate - mean)
+    mixed, whole = float(p @ gain), float(p @ (gain * noise + (means - p @ means) ** 2))
+    return BiasAtRest(whole / (1.0 - mixed), 0.0, rate, whole / mixed)
 
 
 def _normal(residual: float, variance: float) -> float:
