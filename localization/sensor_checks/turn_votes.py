@@ -74,7 +74,6 @@ ROWS = (
     Row(1e-3, "gyro", -1.0, GYRO_OPPOSITE),
     Row(1e-3, "LiDAR", -1.0, LIDAR_OPPOSITE),
     Row(1e-3, "gyro", math.degrees(1.0), GYRO_UNIT),
-    Row(1e-4, "gyro", math.radians(1.0), GYRO_UNIT),
     Row(1e-2, "wheels", 0.0),
     Row(1e-2, "wheels", 1.0, slip=25.0),
     Row(1e-3, "gyro", 0.0),

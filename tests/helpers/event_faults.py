@@ -124,6 +124,7 @@ def named_faults(axis: int = 2) -> dict[str, EventFault]:
         "gyro opposite": change_gyro(lambda w, part: -w, axis),
         "gyro in deg/s": change_gyro(lambda w, part: math.degrees(w), axis),
         "gyro in deg/s from half": change_gyro(lambda w, part: math.degrees(w) if part > 0.5 else w, axis),
+        "gyro converted to radians twice from half": change_gyro(lambda w, part: math.radians(w) if part > 0.5 else w, axis),
         "gyro glitches": change_gyro(lambda w, part: w + 40.0 * (round(1e6 * part) % 50_000 < 500), axis),
         "gyro stuck at 0": hold_gyro(0.4, 0.0, axis),
         "gyro stuck at 0.3 rad/s": hold_gyro(0.4, 0.3, axis),

@@ -45,13 +45,6 @@ def test_gyro_that_turns_a_tenth_the_other_way_is_no_reversed_one() -> None:
     assert GYRO_OPPOSITE not in CheckedDrive(gyro=lambda w: -0.1 * w).drive().found
 
 
-def test_gyro_below_wheels_and_lidar_has_another_unit() -> None:
-    """Its driver converts to radians twice."""
-    robot = CheckedDrive(gyro=lambda w: math.radians(w))
-    assert list(robot.drive().found) == [GYRO_UNIT]
-    assert robot.applied[-1].turn is None
-
-
 @pytest.mark.parametrize("gyro", [lambda w: w, None], ids=["gyro", "no gyro"])
 def test_lidar_that_is_upside_down_is_left_out(gyro) -> None:
     robot = CheckedDrive(gyro=gyro, scan=lambda points: points * (1.0, -1.0, 1.0))
