@@ -119,8 +119,10 @@ class Stack:
         return np.asarray(TEMPER * np.where(np.isfinite(channel) & self._is_scaled, log_unit, 0.0))
 
     def _log_growth(self, name: str, channel: FloatArray) -> FloatArray:
-        """(A, n) logarithm of a channel's noise over that by the robot file, at which the Jacobian of a side's larger unit ends: way and turn
-        have less of it than the side itself, and a unit would gain where sensors agree no better."""
+        """(A, n) logarithm of a channel's noise over that by the robot file, at which the Jacobian of a side's larger unit ends.
+
+        Way and turn have less of that noise than the side itself, and a unit would gain where sensors agree no better.
+        """
         log_noise = np.log(np.hypot(self._floors[name], NOISE[self.kind].relative * channel))
         return np.asarray(log_noise - log_noise[0])
 
