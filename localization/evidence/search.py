@@ -296,7 +296,7 @@ def _with_shared_evidence(stacks: Sequence[Stack], scores: Mapping[Choice, float
         chosen = [stack.alternatives[k] for stack, k in zip(stacks, choice, strict=True)]
         rows = [row for a in chosen for row in a.rows]
         relative = tuple(round(a.delay_s - chosen[0].delay_s, 1) for a in chosen)
-        others = tuple((row.key, row.value) for row in rows if row.source != "clock")
+        others = tuple(row.key for row in rows if row.source != "clock")  # what they measure differs with the delay
         alignments.setdefault((relative, others), []).append((choice, sum(row.log_odds for row in rows if row.source == "clock")))
     found = {}
     for members in alignments.values():
