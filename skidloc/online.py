@@ -161,6 +161,11 @@ class Online:
         """Problems of the sensors so far, with what to do."""
         return [*self._messages.stats.describe(), *self.pipeline.warnings()]
 
+    @property
+    def inflation_reasons(self) -> list[str]:
+        """Why the covariance has more than the sensors' noise, where no sensor is certainly at fault."""
+        return self.pipeline.checks.inflation_reasons()
+
     def _publish(self, found: list[Estimate]) -> list[Estimate]:
         estimates = [self._placed(estimate) for estimate in found]
         for estimate in estimates:

@@ -141,9 +141,9 @@ class Health:
         silent: Mapping[str, float] | None = None,
         troubles: Mapping[str, str] | None = None,
     ) -> list[Status]:
-        """Statuses of the estimate, the LiDAR, the wheels, the files and the messages. ``silent``: seconds since the last message of
+        """Statuses of the estimate, the LiDAR, the wheels, what sensors contradict, the files and the messages. ``silent``: seconds since the last message of
         topics; ``troubles``: what cannot be written, and why."""
-        of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline)]
+        of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline), _of_contradictions(pipeline)]
         of_sensors += [_of_place(found)] if (found := pipeline.estimator.localization()) is not None else []
         of_sensors += _of_lidars(pipeline)
         return [*of_sensors, _of_files(troubles or {}), _of_messages(dropped, silent or {})]
@@ -212,6 +212,14 @@ class Health:
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
             return Status("wheels", WARN, _SLIP, values)
         return Status("wheels", values=values)
+
+
+def _of_contradictions(pipeline: Pipeline) -> Status:
+    """What sensors contradict each other in, as warnings, and why the covariance is wide though no sensor is certainly at fault."""
+    faults = pipeline.checks.warnings()
+    others = [*pipeline.checks.inflation_reasons(), *pipeline.synchronizer.warnings(), *pipeline.estimator.warnings()]
+    notes = {f"note_{i}": note for i, note in enumerate(others, 1)}
+    return Status("sensors", WARN, " ".join(faults), notes) if faults else Status("sensors", values=notes)
 
 
 _BESIDE = "ready: its points are used as well once its mount is known"

@@ -22,7 +22,7 @@ _AFTER_ESTIMATE = 1.5
 
 
 class NodeStatus:
-    """`publish` where it `is_due`; problems of frames are reported when they appear."""
+    """`publish` where it `is_due`; problems of frames and faults of sensors are reported when they appear."""
 
     def __init__(self, inputs: LiveInputs, publisher: EstimatePublisher, doctor: Doctor, report: Callable[[str], None]) -> None:
         """``doctor`` diagnoses the last minutes."""
@@ -63,11 +63,16 @@ class NodeStatus:
             self._publisher.publish_corrections(parameters, stamp_ns)
 
     def report_problems(self, session: Session) -> None:
-        """Report problems of the frames of scans and transforms that are new."""
+        """Report problems of the frames of scans and transforms, and faults of sensors, that are new."""
         for problem in (session.pipeline.synchronizer.scans.frames.problem, self._inputs.transforms.problem):
-            if problem is not None and problem not in self._reported:
-                self._reported.add(problem)
-                self._report(problem)
+            self._report_once(problem, problem)
+        for fault, found in session.pipeline.checks.found.items():
+            self._report_once(fault.message, found.sentence)  # its numbers may change
+
+    def _report_once(self, problem: str | None, sentence: str | None) -> None:
+        if problem is not None and sentence is not None and problem not in self._reported:
+            self._reported.add(problem)
+            self._report(sentence)
 
     def _with_roles(self, statuses: list[Status], discovery: TopicDiscovery) -> list[Status]:
         """``statuses``, with what is missing: a sensor that is not used though it is published is an error, and none is never "ok"."""

@@ -55,6 +55,11 @@ class DetectedFault:
     """Time of the fault since the first step [s]."""
     message: str
 
+    @property
+    def sentence(self) -> str:
+        """When it began, and what it is."""
+        return f"at t = {self.at_s:.1f} s: {self.message}"
+
 
 class FaultLog:
     """Faults so far. `start_step`, then the checks `declare` what they find."""
@@ -115,7 +120,7 @@ class FaultLog:
 
     def warnings(self) -> list[str]:
         """All so far, in sentences."""
-        return [f"at t = {found.at_s:.1f} s: {found.message}" for found in self.found.values()]
+        return [found.sentence for found in self.found.values()]
 
 
 class Evidence:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from localization.estimators import Estimate
 from localization.events import ImuSample, Scan, WheelSample
@@ -23,6 +24,7 @@ from localization.logs import open_log
 from localization.ros.diagnostics import ERROR, OK, WARN, Doctor, Health, Request, Status, diagnose_events
 from localization.ros.node_config import Names, NodeConfig
 from localization.ros.publisher import DIAGNOSTICS, ODOMETRY
+from localization.ros.transports.transport import Received
 from localization.simulation.experiments import ExperimentConfig, Phase, Rest
 from localization.simulation.scanners import ScannerConfig
 from localization.simulation.sensors import SensorConfig
@@ -76,7 +78,32 @@ def test_levels_of_a_quiet_drive_are_ok():
         for estimate in core.process(event):
             health.add_estimate(estimate, core)
         health.observe_event(event)
-    assert [status.level for status in health.statuses(core)] == [OK] * 5
+    assert [status.level for status in health.statuses(core)] == [OK] * 6
+
+
+def _gyro_reversed_from_half(messages: list[Received]) -> list[Received]:
+    """The IMU's driver has the wrong sign in the second half."""
+    store, half = get_typestore(Stores.ROS2_HUMBLE), messages[len(messages) // 2].received_ns
+    found = []
+    for message in messages:
+        if "imu" in message.topic and message.received_ns > half:
+            imu = store.deserialize_cdr(message.data, "sensor_msgs/msg/Imu")
+            imu.angular_velocity.z *= -1.0
+            message = message._replace(data=bytes(store.serialize_cdr(imu, "sensor_msgs/msg/Imu")))
+        found.append(message)
+    return found
+
+
+def test_sensor_that_contradicts_the_others_while_driving_is_reported_at_once():
+    """By a status, and by one line on the terminal."""
+    transport = LogTransport(drive_log(), _gyro_reversed_from_half)
+    _, reports = run_node(transport)
+    (reported,) = [report for report in reports if "the gyro turns opposite" in report]
+    assert reported.startswith("at t = ")
+    statuses = [status for message in published(transport, DIAGNOSTICS) for status in message.status if status.name == "skidloc: sensors"]
+    assert (statuses[0].level, statuses[0].message) == (OK, "ok")
+    assert statuses[-1].level == WARN
+    assert reported in statuses[-1].message
 
 
 def _echo(connection: Connection, request: Request) -> None:

@@ -156,6 +156,7 @@ def test_node_publishes_odometry_transforms_and_diagnostics(calm):
         "skidloc: estimate",
         "skidloc: lidar",
         "skidloc: wheels",
+        "skidloc: sensors",
         "skidloc: files",
         "skidloc: messages",
         "skidloc: transforms",
