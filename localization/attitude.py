@@ -247,7 +247,8 @@ class AttitudeFilter:
             least = _EXPLAINED if is_explained else _UNEXPLAINED
             _update_vertical(state, cov, gravity, least)
             self.gravity = Gravity(gravity, max(float(state[6]), least**2))
-            self._ground.update(self._slope(), self._slope_cov(), float(turn), float(way))
+            own = self.gravity.variance / GRAVITY**2 + _ACCELEROMETER_RAD**2  # what is new in it: the vertical holds the windows before
+            self._ground.update(self._slope(), own * np.eye(2), float(turn), float(way))
         self._restart(has_wheels)
 
     def _start(self, gravity: FloatArray) -> None:
