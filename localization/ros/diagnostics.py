@@ -141,8 +141,10 @@ class Health:
         silent: Mapping[str, float] | None = None,
         troubles: Mapping[str, str] | None = None,
     ) -> list[Status]:
-        """Statuses of the estimate, the LiDAR, the wheels, what sensors contradict, the files and the messages. ``silent``: seconds since the last message of
-        topics; ``troubles``: what cannot be written, and why."""
+        """Statuses of the estimate, the LiDAR, the wheels, what sensors contradict, the files and the messages.
+
+        ``silent``: seconds since the last message of topics; ``troubles``: what cannot be written, and why.
+        """
         of_sensors = [self._of_estimate(), self._of_lidar(pipeline), self._of_wheels(pipeline), _of_contradictions(pipeline)]
         of_sensors += [_of_place(found)] if (found := pipeline.estimator.localization()) is not None else []
         of_sensors += _of_lidars(pipeline)

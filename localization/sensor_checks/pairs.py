@@ -67,6 +67,11 @@ def _describe_stamps(shift: float) -> str:
 
 
 def _describe_way_factor(change: float) -> str:
+    if change < -1.0:
+        return (
+            f"A factor of {1.0 + change:.2f} on the wheels' ways explains it best: encoders, or a driver, that count the same forwards and"
+            " backwards."
+        )
     return (
         f"A factor of {1.0 + change:.2f} on the wheels' ways explains it best: wheels that spin, encoders that lose counts, or another"
         " radius."

@@ -19,8 +19,8 @@ from localization.ros.state_serialization import deserialize, serialize
 from localization.sensor_checks.bias_changes import BIAS_CHANGED
 from localization.sensor_checks.faults import FaultLog
 from localization.sensor_checks.inflation import CovarianceInflation
-from localization.sensor_checks.innovations import Bin, Explanation, InnovationWindow, InnovationWindows
-from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, usual_errors
+from localization.sensor_checks.innovations import Bin, Explanation, InnovationWindow, InnovationWindows, Pair
+from localization.sensor_checks.pairs import CAUSES, GYRO_WHEELS, LIDAR_GYRO, LIDAR_WHEELS_WAYS, usual_errors
 from localization.sensor_checks.reckoning import ESTIMATE
 from localization.sensor_checks.sensor_consistency import DIFFERENCES, PARAMETER_FAR, SensorConsistency, _is_outside_prior
 from localization.sensor_checks.sweep_times import OTHER_UNIT, REVERSED_TIMES
@@ -251,7 +251,12 @@ def test_sums_of_innovations_exceed_a_limit_as_often_as_a_normal_variable(limit:
 
 
 def explained(
-    innovation: FloatArray, variance: FloatArray, X: FloatArray, usual: Mapping[int, float], bias_sigmas: FloatArray | float = 0.0
+    innovation: FloatArray,
+    variance: FloatArray,
+    X: FloatArray,
+    usual: Mapping[int, float],
+    bias_sigmas: FloatArray | float = 0.0,
+    pair: Pair = GYRO_WHEELS,
 ) -> Explanation:
     """Of a window of half seconds with ``innovation`` and ``variance`` (n,), and what causes are proportional to (n, 4)."""
     bins, sums = [Bin(0.0, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0, 0.0), 0.0, np.zeros((6, 3)))], np.zeros(3)
@@ -260,7 +265,17 @@ def explained(
         sums += [innovation[k], variance[k], 0.5]
         bins.append(Bin(0.5 * (k + 1), *sums.tolist(), tuple(x.tolist()), float(bias_sigmas[k]), np.zeros((6, 3))))
     sigmas = abs(sums[0]) / math.sqrt(sums[1])
-    return InnovationWindow(bins, 0.5 * len(X), float(sums[0]), sigmas).explain(GYRO_WHEELS, CAUSES[GYRO_WHEELS], usual)
+    return InnovationWindow(bins, 0.5 * len(X), float(sums[0]), sigmas).explain(pair, CAUSES[pair], usual)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(0.8, "another radius"), (-1.0, "the same forwards and backwards")])
+def test_factor_on_ways_is_one_of_size_or_of_sign(factor: float, words: str) -> None:
+    """A Pioneer of Freiburg publishes speeds without their sign: where it goes back, its odometry goes on."""
+    rng, way = np.random.default_rng(3), np.where(np.arange(20) % 4 < 2, 0.2, 0.05)
+    X = np.column_stack([np.full(20, 0.5), np.zeros(20), way, np.zeros(20)])
+    found = explained((factor - 1.0) * way + 2e-3 * rng.normal(size=20), np.full(20, 4e-6), X, {}, pair=LIDAR_WHEELS_WAYS)
+    assert f"A factor of {factor:.2f} on the wheels' ways" in found.sentence
+    assert words in found.sentence
 
 
 def drawn_window(rng: np.random.Generator, usual: Mapping[int, float], side: float = 0.0) -> Explanation:
