@@ -164,7 +164,7 @@ class Online:
     @property
     def inflation_reasons(self) -> list[str]:
         """Why the covariance has more than the sensors' noise, where no sensor is certainly at fault."""
-        return self.pipeline.checks.inflation_reasons()
+        return [*self.pipeline.checks.inflation_reasons()]
 
     def _publish(self, found: list[Estimate]) -> list[Estimate]:
         estimates = [self._placed(estimate) for estimate in found]
