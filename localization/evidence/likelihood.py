@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,16 +37,24 @@ STILL = {"way": STILL_M_S, "turn": STILL_RAD_S}
 _FAST = 5.0
 """Size of a fast robot's motion over `_SIZES`: 2.5 m/s, 3 rad/s."""
 _SIZES = {"way": WAY_M_S, "turn": TURN_RAD_S}
-Levels = tuple[float, float]
-"""Factors on the noise of sensors, and of wheels: a floor is as quiet as no sensor is."""
-NOISE_LEVELS: Sequence[Levels] = [(of_sensors, of_wheels) for of_sensors in LEVELS for of_wheels in LEVELS if of_wheels >= of_sensors]
-"""Those of which each log has one, equally probable before."""
 Choice = tuple[int, ...]
 """Index of an alternative, by source."""
 Choices = NDArray[np.intp]
 """(A, sources) choices."""
 _HAS_SIDE: frozenset[Kind] = frozenset(("lidar", "reference"))
 """Sources that measure sideways motion as well, in the unit of the way."""
+
+
+class Levels(NamedTuple):
+    """Factors on the noise of a log."""
+
+    sensors: float
+    wheels: float
+    """Of sensors at least: a floor is as quiet as no sensor is."""
+
+
+NOISE_LEVELS = [Levels(sensors, wheels) for sensors in LEVELS for wheels in LEVELS if wheels >= sensors]
+"""Those of which each log has one, equally probable before."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +163,7 @@ class Stack:
 
     def level(self, levels: Levels) -> float:
         """Factor on its noise."""
-        return levels[self._counts]
+        return levels.wheels if self._counts else levels.sensors
 
     def noise_floor(self, name: str, levels: Levels) -> FloatArray:
         """(A, n) `floor` at ``levels`` of the noise, with what the source itself shows."""
@@ -286,7 +295,7 @@ def scales(single: Sequence[Stack], name: str) -> list[tuple[float, float]]:
     used = [i for i, stack in enumerate(single) if stack.channel(name) is not None]
     found = [(0.0, float(stack.tau[name][0])) for stack in single]
     if used:
-        inputs = _inputs(single, np.zeros((1, len(single)), int), name, (1.0, 1.0), used)
+        inputs = _inputs(single, np.zeros((1, len(single)), int), name, Levels(1.0, 1.0), used)
         _, _, c, information = channel_evidence(*inputs, _SIZES[name], _at_rest(single, np.zeros((1, len(single)), int), name, used))
         for k, i in enumerate(used):
             found[i] = float(c[0, k]), 1.0 / math.sqrt(float(information[0, k]) + float(single[i].tau[name][0]) ** -2.0)
@@ -326,7 +335,7 @@ def _evidence(stacks: Sequence[Stack], choices: Choices, name: str, levels: Leve
     for part in (skids, slips) if name == "turn" and skids.any() else ():
         skidding = np.stack([stacks[i].noise_floor("skidding", levels)[choices[:, i]] for i in used], axis=1)
         skidding = np.where(skids[:, None] > 0.0, skidding, floor)
-        of_share = np.ascontiguousarray(np.where(skids > 0.0, levels[1] * part, relative))
+        of_share = np.ascontiguousarray(np.where(skids > 0.0, levels.wheels * part, relative))
         of_k = np.ascontiguousarray(np.where(skids > 0.0, np.maximum(tau, _SKID_SIGMA), tau))
         of_sliding, price_of_sliding, _, _ = channel_evidence(z, skidding, of_share, of_k, bias_sigma, size, at_rest)
         is_better = of_sliding.sum(axis=1) + price_of_sliding + _SKID_ODDS > of_bins.sum(axis=1) + price

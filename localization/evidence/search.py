@@ -30,7 +30,7 @@ _FAR = 30.0
 """Logarithm of the evidence below the best at any level, beyond which no level brings a choice back."""
 _CHANGED = 3
 """Best choices of which one source is tried with a change within the log."""
-_SEARCH_LEVELS: Sequence[Levels] = ((0.35, 0.35), (0.35, 1.0), (1.0, 1.0))
+_SEARCH_LEVELS = Levels(0.35, 0.35), Levels(0.35, 1.0), Levels(1.0, 1.0)
 """Levels of the noise at which set-ups are searched."""
 _MAX_BINS = 140
 _CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
