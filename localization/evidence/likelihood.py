@@ -50,7 +50,7 @@ class Levels(NamedTuple):
 
     sensors: float
     wheels: float
-    """Of sensors at least: a floor is as quiet as no sensor is."""
+    """That of the sensors at least: no floor is as quiet as they are."""
 
 
 NOISE_LEVELS = [Levels(sensors, wheels) for sensors in LEVELS for wheels in LEVELS if wheels >= sensors]

@@ -30,7 +30,8 @@ _CAUSES: Mapping[str, tuple[str, str]] = {
     ),
     "moved": (
         "lost the map at once although the wheels hardly moved",
-        "The robot was moved by other than its wheels, or the LiDAR was turned: the pose is unknown until a mapped place is found.",
+        "Where the robot was moved by other than its wheels, or the LiDAR was turned, the pose is unknown until a mapped place is found; "
+        "where nothing was, take a longer range (lidar.max_range_m).",
     ),
     "excluded": (
         "were left out by a check",
@@ -83,7 +84,12 @@ class LidarLosses:
         """What to do against missing scans, else against the most frequent cause; "" where nothing was lost."""
         if self.silences:
             return _SILENCE_ADVICE
-        return _CAUSES[max(self.causes, key=lambda name: (name == "moved", self.causes[name]))][1] if self.causes else ""
+        if not self.causes:
+            return ""
+        counts = dict(self.causes)
+        if "moved" in counts:  # the scans after that are lost
+            counts["moved"] += counts.pop("lost", 0)
+        return _CAUSES[max(counts, key=counts.__getitem__)][1]
 
     def describe(self) -> str:
         """What happened, where, why, and what to do; "" where every scan came and was matched."""

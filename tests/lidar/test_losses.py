@@ -68,6 +68,15 @@ def test_losses_of_scans_left_out_are_no_silence() -> None:
     assert losses.advice == "See the warning about the LiDAR above."
 
 
+@pytest.mark.parametrize(
+    ("causes", "words"),
+    [({"sparse": 208, "moved": 1, "lost": 16}, "what covers the LiDAR"), ({"sparse": 3, "moved": 1, "lost": 16}, "was moved by other")],
+)
+def test_advice_is_about_the_most_frequent_cause(causes: dict[str, int], words: str) -> None:
+    """One scan that lost the map is no robot that was carried; the scans after one that was are lost as well."""
+    assert words in LidarLosses(351, 126, 0.64, 20.0, 10.0, 0.0, causes).advice
+
+
 def test_describe_without_lost_scans_is_empty() -> None:
     losses = LidarLosses.of(counted("mmmm"))
     assert losses.describe() == losses.advice == ""
