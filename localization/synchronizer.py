@@ -146,6 +146,7 @@ class Synchronizer:
         is_standing = bool(len(window.dt)) and missing == 0.0 and not rates.any()
         has_wheels = missing == 0.0 and bool(len(rates))
         turn, body_turn, gravity = self.inertial.measure(start_ns, end_ns, by_wheels=float(motion.delta[2]), scan=scan)
+        self._velocity.known_m2 += motion.cov[0, 0] + motion.cov[1, 1]
         if missing:
             motion = replace(motion, cov=motion.cov + self._velocity.increment(missing, has_turn=turn is not None))
         if missing < (end_ns - start_ns) * 1e-9:  # wheels measured the velocity in this step

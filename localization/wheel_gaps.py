@@ -17,8 +17,6 @@ _CHANGES_WITHIN_S = 1.0
 """Time in which a velocity changes by the unknown twist's sigma, until the log has shown it [s]: prior with the weight of one interval."""
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 """Upper bounds of the variances of x, y and yaw; yaw: that of a uniform distribution from -pi to pi [rad^2]."""
-_MIN_REPORTED_S = 0.05
-"""Shorter times without wheel data are not reported: the first scan is often some milliseconds before the first wheel sample."""
 _LONG_S = 60.0
 _PAUSED = (
     "Where no other sensor has data either, the recorder was paused, or the computer's clock was set forward: `skidloc info` has the gaps;"
@@ -108,6 +106,8 @@ class UnknownVelocity:
         self.lasted_s: FloatArray | float = 0.0
         """For how long the motion along x, along y and the turn (3,), or all alike, have been unknown [s]: 0 where the pose was measured
         now."""
+        self.known_m2 = self._unknown_m2 = 0.0
+        """Variance of the ways that wheels have measured, all together, and of those without them [m^2]."""
         self._total_s = 0.0
 
     def increment(self, missing_s: float, has_turn: bool) -> Cov3:
@@ -120,11 +120,12 @@ class UnknownVelocity:
         until = since + missing_s
         self.lasted_s = until * is_unknown
         after, before = (np.minimum((sigma * t) ** 2, _MAX_VARIANCE) for t in (until, since))
+        self._unknown_m2 += after[0] - before[0] + after[1] - before[1]
         return np.diag(after - before)
 
     def warnings(self) -> list[str]:
-        """How long there were no wheel data in all."""
-        if self._total_s < _MIN_REPORTED_S:
+        """How long there were no wheel data in all, where more of the way is unknown by that than by the wheels themselves."""
+        if self._unknown_m2 <= self.known_m2:
             return []
         text = f"no wheel data for {self._total_s:.1f} s in all: motion there is predicted with a wide covariance."
         return [text if self._total_s < _LONG_S else f"{text} {_PAUSED}"]

@@ -329,6 +329,14 @@ def test_missing_wheels_give_wide_covariance_and_warning():
     assert f"no wheel data for {5.9 - 2.5:.1f} s" in cutter.warnings()[-1]
 
 
+@pytest.mark.parametrize(("missing_s", "is_reported"), [(0.1, False), (2.0, True)])
+def test_missing_wheels_are_reported_where_more_of_the_way_is_unknown_than_by_the_wheels(missing_s, is_reported):
+    """A minute of wheels, and scans that go on after their last rates have been held."""
+    end_s = 60.0 + StepConfig().max_hold_s + missing_s
+    _, cutter = cut(in_order(wheels(60.0), [scan(t) for t in np.linspace(0.5, end_s, 120)]))
+    assert any("no wheel data" in warning for warning in cutter.warnings()) == is_reported
+
+
 @pytest.mark.parametrize("scan_s", [0.05, 0.1, 0.4])
 def test_missing_wheels_covariance_grows_with_time_squared(scan_s):
     """A velocity that nobody knows lasts: how far it leads does not depend on how often a scanner looks meanwhile. The variance of
