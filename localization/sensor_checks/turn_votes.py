@@ -92,6 +92,8 @@ _NOISE_RAD = np.array([5e-3, 1e-3, 5e-3])
 A gyro in another unit has as much in that, or more [rad]."""
 _BIAS_RAD_S = 0.025
 """Standard deviation of the gyro's bias: five prior sigmas of the shipped robots [rad/s]."""
+_INDEPENDENT = 0.3
+"""Share of the bins whose slip is independent: it lasts for seconds (autocorrelation of three buildings, as in the evidence of set-ups)."""
 _TURN_RATE_RAD_S = 1.0
 """Standard deviation of a robot's turn rate [rad/s]."""
 
@@ -218,7 +220,7 @@ def _add_bin(
             variance = unrelated[s]
         elif s == _WHEELS:
             y[1], y[2] = slip[0], more * slip[1]
-            variance += slip[0] ** 2 + slip[1] ** 2
+            variance += (slip[0] ** 2 + slip[1] ** 2) / _INDEPENDENT
         elif s == _GYRO:
             y[0] = h[s] * _BIAS_RAD_S * duration
         count, log_det, information = count + 1, log_det + math.log(variance), information + h[s] ** 2 / variance
