@@ -89,8 +89,8 @@ def test_healthy_robots_are_accused_of_nothing(kind: str, missing: int | None, r
 @pytest.mark.parametrize("name", _FAULTS)
 @pytest.mark.parametrize("kind", _TURNING)
 def test_the_sensor_that_two_others_contradict_is_at_fault(name: str, kind: str) -> None:
-    """Nearly all windows show it, of wheels, which slip for seconds, one in four; on one arc these may as well have a side that loses counts. None
-    shows anything else."""
+    """Nearly all windows show it, of wheels, which slip for seconds, one in four; on one arc these may as well have a side that loses
+    counts. None shows anything else."""
     column, factor, fault = _FAULTS[name]
     rng, found = np.random.default_rng([6, len(kind)]), []
     for _ in range(200):
