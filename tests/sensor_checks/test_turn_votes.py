@@ -62,7 +62,7 @@ def _compare(rows: np.ndarray, robot: Robot = _JACKAL) -> tuple[bool, TurnVotes,
 
 
 _TURNING = ("curves", "an arc", "turns on the spot")
-_KINDS = ("along a rail", "straight", *_TURNING)
+_KINDS = ("straight", *_TURNING, "along a rail")
 _FAULTS: Mapping[str, tuple[int, float, SensorFault]] = {
     "wheels swapped": (_WHEELS, -1.0, WHEELS_OPPOSITE),
     "gyro reversed": (_GYRO, -1.0, GYRO_OPPOSITE),
@@ -81,7 +81,7 @@ def _without(rows: np.ndarray, column: int | None) -> np.ndarray:
 @pytest.mark.parametrize("kind", _KINDS)
 @pytest.mark.parametrize(("robot", "slip_changes"), [(_JACKAL, False), (_JACKAL, True), (_NARROW, True)], ids=["jackal", "slips", "narrow"])
 def test_healthy_robots_are_accused_of_nothing(kind: str, missing: int | None, robot: Robot, slip_changes: bool) -> None:
-    rng = np.random.default_rng([5, len(kind)])
+    rng = np.random.default_rng([5, _KINDS.index(kind)])
     found = [_compare(_without(_rows(rng, kind, slip_changes, robot), missing), robot)[2].declared for _ in range(500)]
     assert sum(map(bool, found)) == 0
 
@@ -92,7 +92,7 @@ def test_the_sensor_that_two_others_contradict_is_at_fault(name: str, kind: str)
     """Nearly all windows show it, of wheels, which slip for seconds, one in four; on one arc these may as well have a side that loses
     counts. None shows anything else."""
     column, factor, fault = _FAULTS[name]
-    rng, found = np.random.default_rng([6, len(kind)]), []
+    rng, found = np.random.default_rng([6, _KINDS.index(kind)]), []
     for _ in range(200):
         rows = _rows(rng, kind)
         rows[:, column] *= factor
@@ -115,5 +115,5 @@ def test_of_two_sensors_the_wheels_are_named_as_well(column: int, missing: int) 
 def test_turns_show_that_all_is_well_only_where_the_robot_turns() -> None:
     rng = np.random.default_rng(8)
     shown = {kind: sum(_compare(_rows(rng, kind))[0] for _ in range(100)) for kind in _KINDS}
-    assert shown["along a rail"] <= 5
+    assert max(shown["along a rail"], shown["straight"]) <= 5
     assert min(shown[kind] for kind in _TURNING) >= 90
