@@ -64,15 +64,13 @@ class NodeStatus:
 
     def report_problems(self, session: Session) -> None:
         """Report problems of the frames of scans and transforms, and faults of sensors, that are new."""
-        for problem in (session.pipeline.synchronizer.scans.frames.problem, self._inputs.transforms.problem):
-            self._report_once(problem, problem)
-        for fault, found in session.pipeline.checks.found.items():
-            self._report_once(fault.message, found.sentence)  # its numbers may change
-
-    def _report_once(self, problem: str | None, sentence: str | None) -> None:
-        if problem is not None and sentence is not None and problem not in self._reported:
-            self._reported.add(problem)
-            self._report(sentence)
+        problems = session.pipeline.synchronizer.scans.frames.problem, self._inputs.transforms.problem
+        reports = {problem: problem for problem in problems if problem is not None}
+        reports |= {fault.message: found.sentence for fault, found in session.pipeline.checks.found.items()}  # its numbers may change
+        for problem, sentence in reports.items():
+            if problem not in self._reported:
+                self._reported.add(problem)
+                self._report(sentence)
 
     def _with_roles(self, statuses: list[Status], discovery: TopicDiscovery) -> list[Status]:
         """``statuses``, with what is missing: a sensor that is not used though it is published is an error, and none is never "ok"."""

@@ -89,7 +89,7 @@ _PRIORS = np.array([row.prior for row in ROWS])
 _IS_NAMED = np.array([row.fault is not None for row in ROWS])
 _NOISE_RAD = np.array([5e-3, 1e-3, 5e-3])
 """Standard deviation of a bin's turn by wheels, gyro and LiDAR: 0.3 deg of a scan's turn; a cheap gyro's 0.002 rad/s/sqrt(Hz).
-A gyro in another unit has as much in that, or more [rad]."""
+A gyro in another unit has as much in that [rad]."""
 _BIAS_RAD_S = 0.025
 """Standard deviation of the gyro's bias: five prior sigmas of the shipped robots [rad/s]."""
 _INDEPENDENT = 0.3
@@ -215,7 +215,7 @@ def _add_bin(
             continue
         y = np.zeros(4)
         y[3] = z[s]
-        variance = _NOISE_RAD[s] ** 2 * max(h[s] ** 2, 1.0)
+        variance = _NOISE_RAD[s] ** 2 * h[s] ** 2
         if h[s] == 0.0:
             variance = unrelated[s]
         elif s == _WHEELS:
