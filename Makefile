@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 # Bytecode is kept, also where a container's environment says not to: else each process of the tests compiles all sources again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo demo-buildings test test-extended test-all test-ros2 check docs benchmark clean
+.PHONY: demo demo-buildings test test-extended test-all test-slow test-ros2 check docs benchmark clean
 
 .venv/installed: pyproject.toml constraints.txt
 	@echo "Making .venv with skidloc and what it needs (700 MB; a minute at the first time)."
@@ -68,6 +68,10 @@ test-extended: .venv/ready .venv/kernels
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "extended and not slow"
 
 test-all: test test-extended
+
+# Scenarios of ten seconds and more, and sweeps: before a release.
+test-slow: .venv/ready .venv/kernels
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "slow"
 
 # Real Kilted and Jazzy peers from the package index, in environments of their own (.ros2/); skipped with a reason where it is not reachable.
 test-ros2: .venv/ready

@@ -15,7 +15,7 @@ from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, Estimate
 from localization.events import Event
 from localization.lidar.losses import LidarLosses
 from localization.lifting import AttitudeTable, SpaceTable, Trajectory3
-from localization.maps import KeyframeMap, SpaceMap
+from localization.maps import KeyframeMap
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.trajectory import Trajectory
 from motion_models.robot import Mount, Robot
@@ -54,7 +54,7 @@ class Run:
     """Poses as they are published live, where there is hindsight: filtered, and without a LiDAR those that never jump."""
     lidar: LidarLosses | None = None
     """How long the LiDAR was lost; None where no scans were matched to a map."""
-    keyframes: KeyframeMap | SpaceMap | None = None
+    keyframes: KeyframeMap | None = None
     """The map as it can be saved, of an estimator with a map frame."""
     localization: Mapping[str, Any] | None = None
     """State, probability and times of the estimator that localizes in a saved map."""

@@ -53,14 +53,18 @@ def test_documents_have_commands() -> None:
     assert len(PAGES) >= 7
 
 
-@pytest.mark.parametrize("command", README_COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(each, marks=[pytest.mark.extended] if each.startswith("skidloc try") else []) for each in README_COMMANDS]
+)
 def test_command_of_a_readme_runs(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     enter_checkout(tmp_path, monkeypatch, part=10)
     assert main(shlex.split(command, comments=True)[1:]) == 0
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.stem in ("compare", "replay") else []) for page in PAGES]
+)
 def test_commands_of_a_page_run_one_after_another(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With drives in place of a reader's own."""
     enter_checkout(tmp_path, monkeypatch)

@@ -75,6 +75,7 @@ def test_tum_file_of_poses_in_space_has_eight_columns(tmp_path):
     assert not (tmp_path / "none.tum").exists()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("degrees", "mu"), [(5.0, 0.5), pytest.param(10.0, 0.8, marks=pytest.mark.extended)])
 def test_slope_drive_in_mujoco_slides_as_the_odometry_has_it(degrees, mu):
     """Rigid bodies and contacts that share nothing with the friction model: of the slide of two turns in place a quarter is left."""

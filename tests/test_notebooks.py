@@ -8,7 +8,6 @@ import sys
 import nbformat
 import pytest
 
-from tests.helpers.extended import cases
 from tests.helpers.notebooks import FOLDER, read, sources
 
 # Replacements that make a notebook shorter: the same cells, less data.
@@ -40,7 +39,17 @@ def test_notebooks_are_twelve_and_each_title_is_one_claim():
         assert not re.search(r"(from|import) tests\b", text)  # what is installed is enough
 
 
-@pytest.mark.parametrize("source", cases(sources(), [], [source.stem for source in sources()]))
+SLOW = ("0", "5", "7", "9")
+"""Notebooks of 40 s and more."""
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        pytest.param(source, id=source.stem, marks=pytest.mark.slow if source.stem.split("_")[0] in SLOW else pytest.mark.extended)
+        for source in sources()
+    ],
+)
 def test_notebook_runs(source, monkeypatch):
     """As a script, in its own folder."""
     monkeypatch.chdir(FOLDER)

@@ -50,7 +50,7 @@ def husky(tmp_path_factory):
     return out
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.xdist_group("aces")
 def test_replay_aces_fused_error_is_below_each_part(aces):
     found, metrics = results(aces)
@@ -73,7 +73,7 @@ def test_replay_aces_fused_error_is_below_each_part(aces):
     assert odometry["nis_mean"] is None
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_replay_with_positions_that_are_the_reference_holds_every_second_one_out(tmp_path, capsys):
     out, log = tmp_path / "with_gps", beginning_of(HUSKY, 5, tmp_path / "begin.bag")
     options = ("--robot", "husky_a200", "--model", "diff_drive", "--estimator")
@@ -175,6 +175,7 @@ def test_replay_every_format_gives_the_same_estimate(form, tmp_path, mcap_replay
     assert (tmp_path / "out" / name).read_bytes() == (mcap_replay / name).read_bytes()
 
 
+@pytest.mark.extended
 def test_replay_wheel_corrections_converge_to_the_slip(tmp_path):
     """The wheels turn 1.5 times as much as the robot; vaultbot's file has 1.875."""
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(30.0, multiplier=1.5))

@@ -71,6 +71,7 @@ def final_error(log, run):
     return float(np.hypot(*(true - found)[:2])), abs(math.remainder(true[2] - found[2], 2.0 * math.pi))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("model", "estimator", "gain"),
     [("friction", "odometry", 5.0), pytest.param("skid_steer", "ekf", 3.0, marks=pytest.mark.extended)],
@@ -83,6 +84,7 @@ def test_slope_drive_with_the_tilt_is_nearer_than_by_a_flat_model(on_slope, mode
     assert tilted < flat / gain
 
 
+@pytest.mark.extended
 def test_level_drive_is_the_same_to_the_last_bit_with_slopes(on_level):
     for estimator in ("odometry", "ekf"):
         with_slopes, without = run_of(on_level, estimator=estimator), run_of(on_level, estimator=estimator, config=FLAT)
@@ -90,6 +92,7 @@ def test_level_drive_is_the_same_to_the_last_bit_with_slopes(on_level):
         np.testing.assert_array_equal(with_slopes.trajectory.covariances, without.trajectory.covariances)
 
 
+@pytest.mark.extended
 def test_slope_covariance_of_odometry_holds_its_error(on_slope):
     run = run_of(on_slope, "friction")
     error, _ = final_error(on_slope, run)

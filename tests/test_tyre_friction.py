@@ -52,7 +52,10 @@ def drive_on_slope(stiffness, mu, seconds=90.0, seed=1):
     return filtered.tyres
 
 
-@pytest.mark.parametrize(("stiffness", "mu"), [(1.0, 1.0), (0.5, 1.0), (3.0, 1.0), (1.0, 0.7), (3.0, 1.4)])
+@pytest.mark.parametrize(
+    ("stiffness", "mu"),
+    [(3.0, 1.4), *(pytest.param(*each, marks=pytest.mark.extended) for each in ((1.0, 1.0), (0.5, 1.0), (3.0, 1.0), (1.0, 0.7)))],
+)
 def test_tyre_friction_is_that_of_the_turns_on_slopes(stiffness, mu):
     found = drive_on_slope(stiffness, mu)
     error = np.array(found.logs) - np.log([stiffness, mu])
@@ -60,6 +63,7 @@ def test_tyre_friction_is_that_of_the_turns_on_slopes(stiffness, mu):
     assert (np.sqrt(np.diagonal(found.cov)) < [0.8, 0.17]).all()
 
 
+@pytest.mark.extended
 def test_tyre_friction_tells_hard_from_soft_and_dry_from_wet():
     assert drive_on_slope(3.0, 1.0).logs[0] - drive_on_slope(0.5, 1.0).logs[0] > 0.8
     assert drive_on_slope(1.0, 1.3).logs[1] - drive_on_slope(1.0, 0.7).logs[1] > 0.3

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from localization.commands.common import new_folder, print_line, write_json
 from localization.errors import MapError
-from localization.maps import SavedMap, SpaceMap, load_map, save_map
+from localization.maps import SavedMap, load_map, save_map
 from localization.output import check_outputs
 
 
@@ -59,7 +59,7 @@ class MapExport:
 
         check_outputs(self.out)
         mapped = load_map(self.file).map
-        if isinstance(mapped, SpaceMap):
+        if mapped.is_in_space:
             grid = HeightSlice(mapped, self.heights or HEIGHTS_M).grid(self.resolution)
         elif self.heights is None:
             grid = draw_grid(mapped, self.resolution)
@@ -136,7 +136,7 @@ class Map:
 def summary(saved: SavedMap) -> dict[str, Any]:
     """Size, extent [m] and uncertainty of a map, and its provenance."""
     mapped = saved.map
-    points, n = mapped.points_in_map(), 3 if isinstance(mapped, SpaceMap) else 2
+    points, n = mapped.points_in_map(), 3 if mapped.is_in_space else 2
     size = np.ptp(points, axis=0) if len(points) else np.zeros(n)
     sigma = np.sqrt(np.trace(mapped.covariances[:, :n, :n], axis1=1, axis2=2)).max()
     return {

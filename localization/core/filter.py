@@ -14,8 +14,9 @@ from functools import cached_property
 import numpy as np
 from filterpy.kalman import predict
 
-from localization.core.state import Group, Layout, Perturbation, State
+from localization.core.state import Layout, Perturbation, State
 from localization.errors import EstimatorError
+from motion_models.groups import Group
 from motion_models.se2 import FloatArray
 
 _STEP_MOMENTS = np.array([[2.0 / 15.0, -0.1], [-0.1, 1.2]])

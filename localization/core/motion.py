@@ -16,9 +16,10 @@ import numpy as np
 
 from localization.bounded_settings import Settings
 from localization.core.filter import Transition, begin
-from localization.core.state import SE2, Group, Perturbation, State, Vector
+from localization.core.state import Perturbation, State, Vector
 from localization.events import Step
 from motion_models import se2
+from motion_models.groups import SE2, Group
 from motion_models.motion import Motion
 from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections
 from motion_models.robot import GyroNoise, WheelNoise

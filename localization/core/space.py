@@ -18,24 +18,11 @@ from localization.core.filter import Measurement, Transition, begin, set_margina
 from localization.core.state import Perturbation, State, Vector
 from localization.events import BodyTurn, Gravity, Step
 from motion_models import se3
+from motion_models.groups import SE3
 from motion_models.robot import GyroNoise
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY
 
-
-@dataclass(frozen=True)
-class PoseInSpace:
-    """SE(3): homogeneous matrices (4, 4) (`motion_models.se3`)."""
-
-    dim = 6
-    compose = staticmethod(se3.compose)
-    inverse = staticmethod(se3.inverse)
-    retract = staticmethod(se3.retract)
-    local = staticmethod(se3.local)
-    adjoint = staticmethod(se3.adjoint)
-
-
-SE3 = PoseInSpace()
 _LIFT = np.zeros((6, 3))
 """Matrix from planar tangents (x, y, yaw) to tangents of SE(3) (translation, rotation)."""
 _LIFT[[0, 1, 5], [0, 1, 2]] = 1.0

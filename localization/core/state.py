@@ -10,53 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motion_models import se2
+from motion_models.groups import Group
 from motion_models.se2 import FloatArray
 
 IntArray = NDArray[np.int64]
 
 _MIN_VARIANCE = 1e-14
 """Variance of a relative motion, at least: a tenth of a micrometre or microradian [m^2, rad^2]."""
-
-
-class Group(Protocol):
-    """A Lie group, by the arrays that stand for its elements."""
-
-    @property
-    def dim(self) -> int:
-        """Dimension of the tangent space."""
-
-    def compose(self, a: FloatArray, b: FloatArray, /) -> FloatArray:
-        """The product a * b."""
-
-    def inverse(self, a: FloatArray, /) -> FloatArray:
-        """The element with compose(a, inverse(a)) = identity."""
-
-    def retract(self, a: FloatArray, tangent: FloatArray, /) -> FloatArray:
-        """``a`` moved by a perturbation (dim,) on the right: a * exp(tangent)."""
-
-    def local(self, a: FloatArray, b: FloatArray, /) -> FloatArray:
-        """Tangent vector (dim,) that moves a to b: log(a^-1 b)."""
-
-    def adjoint(self, a: FloatArray, /) -> FloatArray:
-        """Matrix (dim, dim) with a * exp(t) = exp(Ad t) * a."""
-
-
-@dataclass(frozen=True)
-class PlanarPose:
-    """SE(2): poses x, y, yaw (`motion_models.se2`)."""
-
-    dim = 3
-    compose = staticmethod(se2.compose)
-    inverse = staticmethod(se2.inverse)
-    retract = staticmethod(se2.retract)
-    local = staticmethod(se2.local)
-    adjoint = staticmethod(se2.adjoint)
 
 
 @dataclass(frozen=True)
@@ -92,9 +56,6 @@ class Perturbation(Vector):
 
     of: str
     """Name of the pose."""
-
-
-SE2 = PlanarPose()
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,22 +7,20 @@ from dataclasses import dataclass, field
 
 from localization.core.motion import FilterConfig
 from localization.core.space import SpaceConfig
-from localization.errors import EstimatorError, MapError
+from localization.errors import EstimatorError
 from localization.estimate import Estimate
 from localization.estimators.baselines import DeadReckoning, LidarOdometry
 from localization.estimators.estimator import Estimator, LearnedParameter, Residuals
 from localization.estimators.fusion import EkfFusion
 from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.estimators.map_fusion import MapFusion
-from localization.estimators.map_merge import Merged, merge
+from localization.estimators.map_merge import merge_maps
 from localization.estimators.saved_map_fusion import PriorMap, SavedMapFusion
 from localization.estimators.space_choice import SpaceChoice
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
 from localization.estimators.space_map_fusion import SpaceMapFusion
-from localization.estimators.space_map_merge import merge_in_space
 from localization.lidar import LidarConfig, ScanMatchingSensor
-from localization.maps import KeyframeMap, SpaceMap
 from localization.maps.space_places import SpacePlaces
 from motion_models.base import MotionModel
 from motion_models.errors import no_such
@@ -42,6 +40,7 @@ __all__ = [
     "GraphFusion",
     "LearnedParameter",
     "MapFusion",
+    "Pose2",
     "PriorMap",
     "Residuals",
     "SavedMapFusion",
@@ -129,18 +128,3 @@ def make_localizing(
         return SpaceMapFusion(in_space, places, initial, is_recording)
     sensor = ScanMatchingSensor(mounts, config.lidar)
     return MapFusion(EkfFusion(model, make_corrections(model, form), robot, sensor, config.ekf), places, initial, is_recording)
-
-
-def merge_maps(
-    first: KeyframeMap | SpaceMap,
-    second: KeyframeMap | SpaceMap,
-    range_noise_m: float,
-    only_new: bool = False,
-    initial: Pose2 | None = None,
-) -> Merged[KeyframeMap] | Merged[SpaceMap]:
-    """`map_merge.merge` of two planar maps, or of two in space. Raises `MapError` for one of each, and where they share no place."""
-    if isinstance(first, SpaceMap) and isinstance(second, SpaceMap):
-        return merge_in_space(first, second, range_noise_m, only_new, initial)
-    if isinstance(first, SpaceMap) or isinstance(second, SpaceMap):
-        raise MapError("one map holds planar scans, the other clouds in space: they cannot be joined. Name two of the same kind.")
-    return merge(first, second, range_noise_m, only_new, initial)

@@ -14,7 +14,7 @@ from localization.estimate import Estimate, GyroCalibration
 from localization.events import PositionSample, Step
 from localization.lidar import LostScans
 from localization.lifting import Trajectory3
-from localization.maps import KeyframeMap, SpaceMap
+from localization.maps import KeyframeMap
 from localization.maps.grid import Grid
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray, Points2, Pose2
@@ -129,7 +129,7 @@ class Estimator(ABC):
         """Problems of the measurements so far."""
         return []
 
-    def keyframe_map(self) -> KeyframeMap | SpaceMap | None:
+    def keyframe_map(self) -> KeyframeMap | None:
         """Keyframes as they can be saved; None where the estimator has no map frame. Poses are smoothed after `finish`."""
         return None
 

@@ -14,22 +14,24 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from localization.bounded_settings import Positive, Settings, Signed
-from localization.core.state import SE2, Group
 from localization.errors import EstimatorError
 from localization.estimate import Estimate
 from localization.estimators.filtered_odometry import FilteredOdometry
 from localization.estimators.fusion import EkfFusion
+from localization.estimators.graph_in_plane import PlanarKeyframes
 from localization.estimators.graph_positions import GraphPositions
 from localization.estimators.keyframe_motion import MotionPreintegration, PreintegratedMotion
-from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph
+from localization.estimators.pose_graph import GraphUpdate, LivePoseGraph
 from localization.estimators.recorded_path import RecordedPath
 from localization.events import PositionSample, Step
 from localization.lidar import LidarConfig
 from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
+from localization.maps.keyframe_map import MappedKeyframe, MeasuredMotion, make_map
 from localization.trajectory import Trajectory
 from motion_models import se2
+from motion_models.groups import SE2, Group
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 _CONSTANT_SHARE = 1e-3
@@ -106,14 +108,15 @@ class Smoothing:
 
 
 class GraphFusion(FilteredOdometry[EkfFusion]):
-    """`EkfFusion` with a `PoseGraph` behind it."""
+    """`EkfFusion` with a `LivePoseGraph` behind it."""
 
     def __init__(self, odometry: EkfFusion, lidar: LidarConfig, config: GraphConfig, is_smoothing: bool):
         """``is_smoothing``: `finish` is to give the smoothed trajectory; memory then grows with the drive (`RecordedPath`)."""
         self.odometry, self._config = odometry, config
         corrections = odometry.noise.corrections
         radius_sigma = max(odometry.noise.config.wheel_radius_sigma, _NO_SIGMA)
-        self.graph = PoseGraph(block_diag(corrections.cov, radius_sigma**2), np.array([config.antenna_x_m, config.antenna_y_m]))
+        lever = np.array([config.antenna_x_m, config.antenna_y_m, 0.0])
+        self.graph = LivePoseGraph(PlanarKeyframes(), block_diag(corrections.cov, radius_sigma**2), lever)
         self._loops = LoopDetector(lidar)
         self._positions = GraphPositions(self.graph)
         self._smoothing = Smoothing(RecordedPath(SE2) if is_smoothing else None)
@@ -192,8 +195,8 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         update = GraphUpdate(pose)
         if k:
             wheels = self._since.wheels.with_corrections(odometry.state["corrections"])
-            between = self._between(k, wheels)
-            update = GraphUpdate(se2.compose(self.graph.pose(between.a), between.delta), wheels, self._epoch_cov(), (between,))
+            motion = self._motion(k, wheels)
+            update = GraphUpdate(se2.compose(self.graph.pose(motion.a), motion.delta), wheels, self._epoch_cov(), (motion,))
         self.graph.apply(update)
         self._smoothing.filter_covs.append(odometry.state.cov("pose"))
         if self._smoothing.path is not None:
@@ -211,20 +214,20 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         map_T_odom, cov = se2.compose(self.graph.pose(k), se2.inverse(pose)), self.graph.marginal(k)
         self._last = LastKeyframe(map_T_odom, cov, *((k, 0.0) if is_placed else (self._last.matched, lost_variance)))
 
-    def _between(self, k: int, wheels: PreintegratedMotion) -> BetweenMeasurement:
+    def _motion(self, k: int, wheels: PreintegratedMotion) -> MeasuredMotion:
         """Motion by gyro and scans to the next keyframe ``k``, from the one before; from the last with a matched scan, if a scan has shown
         where the robot is after keyframes without: their poses are uncertain, and what it shows is not about them."""
         state = self.odometry.state
         if self._is_found_again():
             delta, cov = state.between("key", "pose")
-            return BetweenMeasurement(self._last.matched, k, delta, np.asarray(np.linalg.inv(cov)))
+            return MeasuredMotion.by_cov(self._last.matched, k, delta, cov)
         delta, cov = self._since.moved
         D, radius = wheels.by_corrections, 1.0 + state.number("radius")
         by_wheels = wheels.delta * [radius, radius, 1.0]
         wheel_cov = wheels.cov + D @ state.cov("corrections", "radius") @ D.T
         if self._is_matched and cov[0, 0] > _OPEN_SHARE * wheel_cov[0, 0]:  # the way is the wheels' alone: it does not show their radius
-            return BetweenMeasurement(k - 1, k, delta, block_diag(_NO_INFORMATION, np.linalg.inv(cov[1:, 1:])))
-        return BetweenMeasurement(k - 1, k, *subtract_information(SE2, delta, cov, by_wheels, wheel_cov))
+            return MeasuredMotion(k - 1, k, delta, block_diag(_NO_INFORMATION, np.linalg.inv(cov[1:, 1:])))
+        return MeasuredMotion(k - 1, k, *subtract_information(SE2, delta, cov, by_wheels, wheel_cov))
 
     def _epoch_cov(self) -> FloatArray | None:
         """(c, c) by which the corrections may have changed, once a minute; None meanwhile."""
@@ -238,9 +241,8 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         self._loops.add(keyframe)
         loop = self._loops.detect(self.odometry.cell, self.graph.poses, self.graph.marginal)
         if loop is not None:
-            self.graph.apply(
-                GraphUpdate(betweens=(BetweenMeasurement(loop.a, loop.b, loop.delta, np.asarray(np.linalg.inv(loop.cov)), is_loop=True),))
-            )
+            closed = MeasuredMotion.by_cov(loop.a, loop.b, loop.delta, loop.cov, is_loop=True)
+            self.graph.apply(GraphUpdate(motions=(closed,)))
 
     @property
     def enu_T_map(self) -> Pose2 | None:
@@ -255,12 +257,13 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         if not self._smoothing.path.ends_at_node:
             self._add_keyframe(int(self._smoothing.path.stamps_ns[-1]))
         try:
-            poses, covs = self.graph.smooth()
+            smoothed = self.graph.smooth()
         except EstimatorError as error:
             self._smoothing.failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
-        covs = self._smoothing.covs = np.array([self._bound(*pair) for pair in zip(covs, self._smoothing.filter_covs, strict=True)])
-        return Trajectory(filtered.stamps_ns, *self._smoothing.path.through(poses, covs))
+        covs = [self._bound(*pair) for pair in zip(smoothed.covs, self._smoothing.filter_covs, strict=True)]
+        self._smoothing.covs = np.array(covs)
+        return Trajectory(filtered.stamps_ns, *self._smoothing.path.through(smoothed.poses, self._smoothing.covs))
 
     def parameters(self) -> Mapping[str, tuple[float, float]]:
         """Mean and sigma of what was estimated besides the pose, by name: by the filter, and radius and lever arm by the graph."""
@@ -277,7 +280,7 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         """Number of occurrences by name: those of the filter, keyframes, loops and positions."""
         found = {**self.odometry.counts(), "keyframes": self.graph.count}
         if self.lost is not None:
-            found["loops"] = sum(between.is_loop for update in self.graph.updates for between in update.betweens)
+            found["loops"] = len(self.graph.loops)
         return {**found, "positions": self._positions.count} if self._positions.count else found
 
     def warnings(self) -> list[str]:
@@ -287,23 +290,13 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
 
     def keyframe_map(self) -> KeyframeMap | None:
         """Keyframes as they can be saved; None before the first. Poses are smoothed after `finish`."""
-        keys, edges = self._loops.keyframes, [between for update in self.graph.updates for between in update.betweens]
+        keys, covs = self._loops.keyframes, self._smoothing.covs
         if not keys:
             return None
-        covs = self._smoothing.covs
-        return KeyframeMap(
-            stamps_ns=np.array([key.stamp_ns for key in keys], dtype=np.int64),
-            poses=self.graph.poses(),
-            covariances=np.array([self.graph.marginal(k) for k in range(len(keys))]) if covs is None else covs,
-            points=np.vstack([key.points for key in keys]).astype(np.float32),
-            counts=np.array([len(key.points) for key in keys], dtype=np.int64),
-            sensors=np.array([key.lidar for key in keys]),
-            edges=np.array([(edge.a, edge.b) for edge in edges], dtype=np.int64).reshape(-1, 2),
-            edge_deltas=np.array([edge.delta for edge in edges]).reshape(-1, 3),
-            edge_information=np.array([edge.information for edge in edges]).reshape(-1, 3, 3),
-            edge_is_loop=np.array([edge.is_loop for edge in edges], dtype=bool),
-            plane=self._positions.plane,
-        )
+        covs = np.array([self.graph.marginal(k) for k in range(len(keys))]) if covs is None else covs
+        mapped = zip(keys, self.graph.poses(), covs, strict=True)
+        keyframes = [MappedKeyframe(key.stamp_ns, pose, key.points, key.lidar, cov) for key, pose, cov in mapped]
+        return make_map(keyframes, self.graph.motions, self._positions.plane)
 
     def occupancy(self) -> Grid | None:
         """The map as a grid with free space, in the frame of the poses; None without points."""

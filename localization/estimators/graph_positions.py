@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from localization.core.state import State
-from localization.estimators.pose_graph import GraphUpdate, PoseGraph, PositionMeasurement
+from localization.estimators.pose_graph import GraphUpdate, LivePoseGraph, PositionMeasurement
 from localization.estimators.position_queue import PositionQueue, align_map
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS
@@ -17,7 +17,7 @@ from motion_models.se2 import Cov3, Pose2
 class GraphPositions:
     """`add` a position, `place` it at a keyframe once the odometry has come to its stamp, and let those placed `enter` the graph."""
 
-    def __init__(self, graph: PoseGraph) -> None:
+    def __init__(self, graph: LivePoseGraph) -> None:
         self._graph, self._queue = graph, PositionQueue()
         self._placed: list[PositionMeasurement] = []  # that wait for the map's heading
         self._origin: tuple[float, float, float] | None = None  # of their plane

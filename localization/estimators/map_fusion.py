@@ -15,12 +15,13 @@ import numpy as np
 from localization.errors import MapError
 from localization.estimate import Estimate
 from localization.estimators.fusion import EkfFusion
-from localization.estimators.recorded_drive import DriveKeyframe, RecordedDrive
+from localization.estimators.recorded_drive import RecordedDrive
 from localization.estimators.saved_map_fusion import KEYFRAME_ANGLE_RAD, KEYFRAME_DISTANCE_M, PriorMap, SavedMapFusion
 from localization.events import PositionSample, Step
 from localization.lidar.registration import is_narrow
 from localization.logs.reference_topics import in_plane
 from localization.maps import KeyframeMap
+from localization.maps.keyframe_map import MappedKeyframe
 from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from localization.maps.position_plane import PositionFix, PositionPlane
@@ -116,14 +117,14 @@ class MapFusion(SavedMapFusion[EkfFusion]):
 
     def _take_positions(self, until_ns: int, delta: Pose2) -> None:
         """Pass on the last position up to ``until_ns``, when the robot has moved by ``delta`` (3,) since the last keyframe."""
-        fix = self._positions.take(until_ns, self.localizer.places.plane)
+        fix = self._positions.take(until_ns, self.localizer.places.mapped.plane)
         if fix is not None:
             self.localizer.add_position(fix._replace(way_m=math.hypot(delta[0], delta[1])))
 
     def _record(self) -> None:
         if self._drive is not None and self.localizer.state == "localized":
             points, lidar = self.odometry.scan_points, self.odometry.lidar_position
-            self._drive.add(DriveKeyframe(self._end_ns, points, lidar, self.localizer.pose))
+            self._drive.add(MappedKeyframe(self._end_ns, self.localizer.pose, points, lidar, self.localizer.covariance))
 
     def _add_step(self) -> None:
         """Add the motion of the step: the filter's, or that of the wheels where that is narrower."""

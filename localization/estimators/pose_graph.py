@@ -1,10 +1,11 @@
-"""Pose graph in GTSAM: keyframes, tied by wheels, scan matching, loop closures and positions, with the motion model's corrections.
+"""Pose graph in GTSAM: keyframes, tied by wheels, scan matching, gravity, loop closures and positions, with the model's corrections.
 
-    x_k          keyframe poses ``map_T_body``
+    x_k          keyframe poses ``map_T_body``, of SE(2) or SE(3)
     c_j          corrections of the motion model (k, centre of rotation, ... by name): one vector for each minute or so, a random walk
     t, l         ``enu_T_map`` and the lever arm of the positions' antenna, if there are positions
 
-Incremental by ISAM2 (Kaess et al. 2012) on the way; Levenberg-Marquardt and marginals at the end. All perturbations act on the right.
+What differs between the plane and space is a `Keyframes`. A `PoseGraph` is solved once, by Levenberg-Marquardt; a `LivePoseGraph` also on
+the way, by ISAM2 (Kaess et al. 2012). All perturbations act on the right.
 """
 
 from __future__ import annotations
@@ -12,28 +13,27 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
-from localization.core.measurements.position import predict_position
-from localization.core.measurements.relative_pose import motion_residual
 from localization.errors import EstimatorError
 from localization.estimators.keyframe_motion import PreintegratedMotion
-from motion_models import se2
-from motion_models.se2 import Cov3, FloatArray, Pose2
+from localization.maps.keyframe_map import MeasuredMotion
+from motion_models.groups import PoseGroup, between
+from motion_models.se2 import FloatArray
 
-_ALIGNMENT, _LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
-_FIRST_SIGMA = np.array([1e-3, 1e-3, 1e-4])
-"""The first keyframe is the origin of the map [m, m, rad]."""
+ALIGNMENT, LEVER = gtsam.symbol("t", 0), gtsam.symbol("l", 0)
+"""Keys of ``enu_T_map`` and of the lever arm of the positions' antenna."""
+LEVER_SIGMA_M = 0.5
+"""Prior sigma of the antenna's lever arm around the given one, along each axis [m]: half of a robot's length."""
+ALIGNMENT_SIGMA = 1e3
+"""Prior sigma of ``enu_T_map`` [m, rad]."""
 _CAUCHY = 1.0
 """Scale of the robust loss of loop closures [sigma]."""
 _HUBER = 1.345
 """Scale of the robust loss of wheels and positions [sigma]: 95 % efficiency on Gaussian noise (Huber 1981)."""
-LEVER_SIGMA_M = 0.5
-"""Prior sigma of the antenna's lever arm around the given one, along each axis [m]: half of a robot's length."""
-_ALIGNMENT_SIGMA = np.array([1e3, 1e3, 1e3])
 _RELINEARIZE = 0.01
 """Change of a variable from which its factors are linearized anew [m, rad]. With GTSAM's 0.1 a loop that closes 0.15 m keeps the weight
 that its robust loss had before: sigma of the last pose of 41 was 0.14 m, where the batch solution has 0.026 m."""
@@ -45,180 +45,249 @@ _CONVERGED = 1e-6
 
 
 @dataclass(frozen=True)
-class BetweenMeasurement:
-    """A measured motion from keyframe ``a`` to keyframe ``b``, with the information (3, 3) of its right perturbation."""
+class GravityMeasurement:
+    """Gravity in the axes of keyframe ``k``."""
 
-    a: int
-    b: int
-    delta: Pose2
-    information: FloatArray
-    is_loop: bool = False
+    k: int
+    force: FloatArray
+    """(3,) upwards [m/s^2]."""
+    turned: FloatArray
+    """(3, 3) ``key_R_body`` at the measurement: the bias is constant in the body."""
+    variance: float
+    """[m^2/s^4]"""
 
 
 @dataclass(frozen=True)
 class PositionMeasurement:
-    """A position by GPS, at ``offset`` (3,) from keyframe ``k``."""
+    """A position, as by GPS, of the antenna of a body at ``offset`` from keyframe ``k``, (3,) in the plane or (4, 4) in space."""
 
     k: int
     offset: FloatArray
     position: FloatArray
-    """(2,) east, north [m]."""
+    """(2,) east and north [m]; in space also (3,), with up where that is measured."""
     cov: FloatArray
-    """(2, 2)"""
+    """(2, 2) or (3, 3)"""
 
 
 @dataclass(frozen=True)
 class GraphUpdate:
     """New variables and factors of one update. The same updates in the same order give the same graph to the last bit."""
 
-    pose: Pose2 | None = None
-    """(3,) initial value of the next keyframe, if there is one."""
+    pose: FloatArray | None = None
+    """Initial value of the next keyframe, if there is one."""
     wheels: PreintegratedMotion | None = None
     epoch_cov: FloatArray | None = None
     """(c, c) if the corrections go on as a new variable: how far they may have changed."""
-    betweens: tuple[BetweenMeasurement, ...] = ()
+    motions: tuple[MeasuredMotion, ...] = ()
+    gravities: tuple[GravityMeasurement, ...] = ()
     positions: tuple[PositionMeasurement, ...] = ()
-    alignment: Pose2 | None = None
-    """(3,) initial value of ``enu_T_map``, with the first positions."""
+    alignment: FloatArray | None = None
+    """Initial value of ``enu_T_map``, with the first positions: x, y and yaw, or x, y, z and yaw."""
+
+
+class Keyframes(Protocol):
+    """Poses of a group as GTSAM has them, and the factors that measure them."""
+
+    @property
+    def group(self) -> PoseGroup:
+        """SE(2) or SE(3)."""
+
+    @property
+    def rows(self) -> Sequence[int]:
+        """(dim,) rows of GTSAM's tangents in the order of the group's."""
+
+    def value(self, pose: FloatArray, /) -> Any:
+        """``pose`` as GTSAM has it."""
+
+    def pose(self, values: gtsam.Values, key: int, /) -> FloatArray:
+        """The pose ``key`` of ``values``."""
+
+    def poses(self, values: gtsam.Values, count: int, /) -> FloatArray:
+        """The first ``count`` keyframes of ``values``."""
+
+    def first(self, key: int, pose: FloatArray, /) -> gtsam.NonlinearFactor:
+        """The prior of the first keyframe, which is the origin of the map."""
+
+    def motion(self, a: int, b: int, delta: FloatArray, noise: gtsam.noiseModel.Base, /) -> gtsam.NonlinearFactor:
+        """The motion ``delta`` from the pose ``a`` to ``b``, with ``noise`` in GTSAM's order."""
+
+    def wheels(self, a: int, b: int, corrections: int, wheels: PreintegratedMotion, /) -> gtsam.CustomFactor:
+        """The motion model's prediction as a factor of two poses and of the ``corrections``."""
+
+    def gravity(self, measured: GravityMeasurement, /) -> gtsam.CustomFactor:
+        """Gravity at a keyframe."""
+
+    def bias_prior(self) -> tuple[int, gtsam.NonlinearFactor] | None:
+        """Key and prior, around zero, of the bias that all gravities share; None in the plane."""
+
+    def place(self, alignment: FloatArray, lever: FloatArray, /) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Priors and values of ``enu_T_map`` and of the antenna's ``lever`` arm."""
+
+    def alignment(self, values: gtsam.Values, /) -> FloatArray:
+        """``enu_T_map`` of ``values``."""
+
+    def position(self, measured: PositionMeasurement, /) -> gtsam.CustomFactor:
+        """t x_k (offset l) - p: where the antenna at lever arm l is, against the measured position."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedKeyframes:
+    """Keyframes by all measurements."""
+
+    poses: FloatArray
+    """(K, 3) or (K, 4, 4)"""
+    covs: FloatArray
+    """(K, dim, dim) of their right perturbations."""
+    group: PoseGroup
+    rows: Sequence[int]
+    marginals: gtsam.Marginals
+
+    def relative_cov(self, a: int, b: int) -> FloatArray:
+        """(dim, dim) covariance of the right perturbation of the motion from keyframe ``a`` to ``b``."""
+        keys = [gtsam.symbol("x", k) for k in (a, b)]
+        joint = self.marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+        cov = np.block([[joint.at(i, j)[np.ix_(self.rows, self.rows)] for j in keys] for i in keys])
+        J = np.hstack([-self.group.adjoint(between(self.group, self.poses[b], self.poses[a])), np.eye(self.group.dim)])
+        return np.asarray(J @ cov @ J.T)
 
 
 @dataclass
 class PoseGraph:
-    """Add keyframes by `apply`; `poses`, `corrections` and `marginal` are the estimates by all that was added."""
+    """`apply` update after update, and `smooth` all of them."""
 
+    keyframes: Keyframes
     prior_cov: FloatArray
-    """(c, c) of the corrections, around zero."""
-    lever: FloatArray = field(default_factory=lambda: np.zeros(2))
-    """(2,) of the positions' antenna in the body frame [m]."""
+    """(c, c) of the corrections, around zero; (0, 0) without such."""
+    lever: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the positions' antenna in the body frame [m]."""
     updates: list[GraphUpdate] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        params = gtsam.ISAM2Params()
-        params.relinearizeSkip = 1
-        params.setRelinearizeThreshold(_RELINEARIZE)
-        params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
-        self._isam, self.count, self._epochs = gtsam.ISAM2(params), 0, 0
-        self._values = gtsam.Values()
+        self.count, self._epochs = 0, 0
+        self._values, self._measured = gtsam.Values(), gtsam.NonlinearFactorGraph()
         updates, self.updates = self.updates, []
         for update in updates:
             self.apply(update)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"prior_cov": self.prior_cov, "lever": self.lever, "updates": self.updates}
+        return {name: getattr(self, name) for name in ("keyframes", "prior_cov", "lever", "updates")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__init__(**state)  # type: ignore[misc]
 
     def apply(self, update: GraphUpdate) -> None:
-        """Add ``update`` and solve."""
-        self.updates.append(update)
+        """Add ``update``."""
+        _, values = self._add(update)
+        self._values.insert(values)
+
+    def _add(self, update: GraphUpdate) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Its new factors but for loops, and its new values."""
         factors, values = self._factors(update)
-        with check_solvable():
-            self._isam.update(factors, values)
-            if any(between.is_loop for between in update.betweens) or update.alignment is not None:
-                self._iterate()
-            self._values = self._isam.calculateEstimate()
+        self.updates.append(update)
+        self._measured.push_back(factors)
+        self.count += update.pose is not None
+        return factors, values
 
-    def _iterate(self) -> None:
-        """Until nothing changes: a robust loss gives what was just closed its weight only step by step."""
-        for _ in range(_MAX_UPDATES):
-            if not self._isam.update().getVariablesRelinearized():
-                break
-
-    def pose(self, k: int) -> Pose2:
-        """(3,) ``map_T_body`` of keyframe ``k``."""
-        return _array(self._values.atPose2(gtsam.symbol("x", k)))
+    def pose(self, k: int) -> FloatArray:
+        """``map_T_body`` of keyframe ``k``."""
+        return self.keyframes.pose(self._values, gtsam.symbol("x", k))
 
     def poses(self) -> FloatArray:
-        """(count, 3)"""
-        values = gtsam.utilities.extractPose2(self._values)  # in order of keys: before x, there may be t
-        return np.asarray(values[len(values) - self.count :])
-
-    def marginal(self, k: int) -> Cov3:
-        """(3, 3) covariance of keyframe ``k``."""
-        return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))
-
-    def lever_arm(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (2,) and covariance (2, 2) of where the positions' antenna is in the body frame [m]."""
-        if not self._values.exists(_LEVER):
-            return self.lever, LEVER_SIGMA_M**2 * np.eye(2)
-        return np.asarray(self._values.atPoint2(_LEVER)), np.asarray(self._isam.marginalCovariance(_LEVER))
+        """(count, 3) or (count, 4, 4)"""
+        return self.keyframes.poses(self._values, self.count)
 
     @property
-    def enu_T_map(self) -> Pose2 | None:
-        """(3,) of the map in the plane of the positions; None without positions."""
-        return _array(self._values.atPose2(_ALIGNMENT)) if self._values.exists(_ALIGNMENT) else None
+    def motions(self) -> list[MeasuredMotion]:
+        """All motions by gyro and scans, and loops."""
+        return [motion for update in self.updates for motion in update.motions]
 
-    def alignment(self) -> tuple[Pose2, Cov3] | None:
-        """``enu_T_map`` (3,) and the covariance (3, 3) of its right perturbation; None without positions."""
-        pose = self.enu_T_map
-        return None if pose is None else (pose, np.asarray(self._isam.marginalCovariance(_ALIGNMENT)))
+    @property
+    def loops(self) -> list[MeasuredMotion]:
+        """All loop closures."""
+        return [motion for motion in self.motions if motion.is_loop]
+
+    @property
+    def enu_T_map(self) -> FloatArray | None:
+        """Pose of the map among the positions; None without such."""
+        return self.keyframes.alignment(self._values) if self._values.exists(ALIGNMENT) else None
 
     def position_errors(self) -> FloatArray:
         """(n,) normalised errors [sigma] of the positions by the present estimates."""
         positions = [position for update in self.updates for position in update.positions]
-        errors = [position_factor(position).unwhitenedError(self._values) for position in positions]  # whitened ones have the robust weight
+        factors = [self.keyframes.position(position) for position in positions]
+        errors = [factor.unwhitenedError(self._values) for factor in factors]  # whitened ones have the robust weight
         return np.array([np.sqrt(e @ np.linalg.solve(position.cov, e)) for e, position in zip(errors, positions, strict=True)])
 
-    def corrections(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (c,) and covariance (c, c) of the corrections."""
-        if not len(self.prior_cov) or not self.count:
-            return np.zeros(len(self.prior_cov)), self.prior_cov
-        key = gtsam.symbol("c", self._epochs)
-        return np.asarray(self._values.atVector(key)), np.asarray(self._isam.marginalCovariance(key))
-
-    def smooth(self) -> tuple[FloatArray, FloatArray]:
-        """Poses (count, 3) by all measurements, by Levenberg-Marquardt, and their covariances (count, 3, 3). Raises `EstimatorError`."""
-        graph, values = gtsam.NonlinearFactorGraph(), self._isam.calculateEstimate()
-        count, self.count, self._epochs = self.count, 0, 0
-        for update in self.updates:
-            graph.push_back(self._factors(update)[0])
-        assert self.count == count
+    def smooth(self) -> SmoothedKeyframes:
+        """The keyframes by all measurements. Raises `EstimatorError`."""
+        values, graph = self._start(), gtsam.NonlinearFactorGraph()
+        graph.push_back(self._measured)
         with check_solvable():
+            for loop in self.loops:
+                graph.add(self._motion(loop))
             values = levenberg_marquardt(graph, values)
             linear = graph.linearize(values)
-            marginals = gtsam.Marginals(linear, linear.optimize())
-            covs = np.array([marginals.marginalCovariance(gtsam.symbol("x", k)) for k in range(count)])
+            marginals, rows = gtsam.Marginals(linear, linear.optimize()), self.keyframes.rows
+            covs = np.array([marginals.marginalCovariance(gtsam.symbol("x", k))[np.ix_(rows, rows)] for k in range(self.count)])
         self._values = values
-        if not (np.isfinite(self.poses()).all() and np.isfinite(covs).all()):
+        poses = self.poses()
+        if not (np.isfinite(poses).all() and np.isfinite(covs).all()):
             raise EstimatorError("the pose graph has no finite solution. Check the log with `skidloc info`, and the robot file's noise.")
-        return self.poses(), covs
+        return SmoothedKeyframes(poses, covs, self.keyframes.group, rows, marginals)
+
+    def _start(self) -> gtsam.Values:
+        """Where loops are closed as if they were right: a robust loss does not feel what is hundreds of its scales away."""
+        if not self.loops:
+            return self._values
+        closed = gtsam.NonlinearFactorGraph()
+        closed.push_back(self._measured)
+        for loop in self.loops:
+            closed.add(self._motion(loop, is_robust=False))
+        with check_solvable():
+            return levenberg_marquardt(closed, self._values)
+
+    def _motion(self, motion: MeasuredMotion, is_robust: bool = True) -> gtsam.NonlinearFactor:
+        rows = self.keyframes.rows
+        noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(motion.information[np.ix_(rows, rows)])
+        if motion.is_loop and is_robust:
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
+        return self.keyframes.motion(gtsam.symbol("x", motion.a), gtsam.symbol("x", motion.b), motion.delta, noise)
 
     def _factors(self, update: GraphUpdate) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        kind, factors, values = self.keyframes, gtsam.NonlinearFactorGraph(), gtsam.Values()
+        k = self.count - (update.pose is None)
         if update.pose is not None:
             self._add_keyframe(update.pose, factors, values)
-        k = self.count - 1
         if update.epoch_cov is not None:
             self._add_correction_epoch(update.epoch_cov, factors, values)
         if update.wheels is not None:
-            factors.add(wheel_factor(k - 1, k, gtsam.symbol("c", self._epochs), update.wheels))
-        for between in update.betweens:
-            noise: gtsam.noiseModel.Base = gtsam.noiseModel.Gaussian.Information(between.information)
-            if between.is_loop:
-                noise = robust_loop_noise(noise)
-            a, b = (gtsam.symbol("x", i) for i in (between.a, between.b))
-            factors.add(gtsam.BetweenFactorPose2(a, b, gtsam.Pose2(*between.delta), noise))
+            factors.add(kind.wheels(gtsam.symbol("x", k - 1), gtsam.symbol("x", k), gtsam.symbol("c", self._epochs), update.wheels))
+        for motion in update.motions:
+            if not motion.is_loop:
+                factors.add(self._motion(motion))
+        for gravity in update.gravities:
+            factors.add(kind.gravity(gravity))
         if update.alignment is not None:
-            sigma = gtsam.noiseModel.Diagonal.Sigmas
-            factors.add(gtsam.PriorFactorPose2(_ALIGNMENT, gtsam.Pose2(*update.alignment), sigma(_ALIGNMENT_SIGMA)))
-            factors.add(gtsam.PriorFactorPoint2(_LEVER, self.lever, sigma(np.full(2, LEVER_SIGMA_M))))
-            values.insert(_ALIGNMENT, gtsam.Pose2(*update.alignment))
-            values.insert(_LEVER, self.lever)
+            of_place, place = kind.place(update.alignment, self.lever)
+            factors.push_back(of_place)
+            values.insert(place)
         for position in update.positions:
-            factors.add(position_factor(position))
+            factors.add(kind.position(position))
         return factors, values
 
-    def _add_keyframe(self, pose: Pose2, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        key = gtsam.symbol("x", self.count)
-        values.insert(key, gtsam.Pose2(*pose))
-        if not self.count:
-            factors.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(*pose), gtsam.noiseModel.Diagonal.Sigmas(_FIRST_SIGMA)))
-            if len(self.prior_cov):
-                prior = np.zeros(len(self.prior_cov))
-                factors.add(gtsam.PriorFactorVector(gtsam.symbol("c", 0), prior, gtsam.noiseModel.Gaussian.Covariance(self.prior_cov)))
-                values.insert(gtsam.symbol("c", 0), prior)
-        self.count += 1
+    def _add_keyframe(self, pose: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        key, bias = gtsam.symbol("x", self.count), self.keyframes.bias_prior()
+        values.insert(key, self.keyframes.value(pose))
+        if self.count:
+            return
+        factors.add(self.keyframes.first(key, pose))
+        if len(self.prior_cov):
+            prior = np.zeros(len(self.prior_cov))
+            factors.add(gtsam.PriorFactorVector(gtsam.symbol("c", 0), prior, gtsam.noiseModel.Gaussian.Covariance(self.prior_cov)))
+            values.insert(gtsam.symbol("c", 0), prior)
+        if bias is not None:
+            factors.add(bias[1])
+            values.insert(bias[0], np.zeros(3))
 
     def _add_correction_epoch(self, cov: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         before, after = gtsam.symbol("c", self._epochs), gtsam.symbol("c", self._epochs + 1)
@@ -227,45 +296,62 @@ class PoseGraph:
         self._epochs += 1
 
 
-def wheel_factor(a: int, b: int, corrections: int, wheels: PreintegratedMotion) -> gtsam.CustomFactor:
-    """log((delta exp(D (c - c0)))^-1 (x_a^-1 x_b)): the motion model's prediction as a factor of both poses and the corrections."""
-    keys = [gtsam.symbol("x", a), gtsam.symbol("x", b)]
-    has_corrections = wheels.by_corrections.any()
-    if has_corrections:
-        keys.append(corrections)
+@dataclass
+class LivePoseGraph(PoseGraph):
+    """A `PoseGraph` that is solved at each update: `poses`, `corrections` and `marginal` are the estimates by all that was added."""
 
-    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
-        D = wheels.by_corrections
-        shift = D @ (values.atVector(corrections) - wheels.at) if has_corrections else np.zeros(3)
-        predicted = se2.retract(wheels.delta, shift)
-        residual, by_a, by_b = motion_residual(_array(values.atPose2(keys[0])), _array(values.atPose2(keys[1])), predicted)
-        if H is not None:
-            H[0], H[1] = np.asfortranarray(by_a), np.asfortranarray(by_b)
-            if has_corrections:
-                by_predicted = -by_b @ se2.adjoint(se2.exp(-residual))
-                H[2] = np.asfortranarray(by_predicted @ se2.right_jacobian(shift) @ D)
-        return residual
+    def __post_init__(self) -> None:
+        params = gtsam.ISAM2Params()
+        params.relinearizeSkip = 1
+        params.setRelinearizeThreshold(_RELINEARIZE)
+        params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
+        self._isam = gtsam.ISAM2(params)
+        super().__post_init__()
 
-    return robust_factor(keys, wheels.cov, error)
+    def apply(self, update: GraphUpdate) -> None:
+        """Add ``update`` and solve. Raises `EstimatorError` where there is no solution."""
+        factors, values = self._add(update)
+        loops = [motion for motion in update.motions if motion.is_loop]
+        for loop in loops:
+            factors.add(self._motion(loop))
+        with check_solvable():
+            self._isam.update(factors, values)
+            if loops or update.alignment is not None:
+                self._iterate()
+            self._values = self._isam.calculateEstimate()
 
+    def _start(self) -> gtsam.Values:
+        """Loops have their robust weight by now."""
+        return self._isam.calculateEstimate()
 
-def position_factor(position: PositionMeasurement) -> gtsam.CustomFactor:
-    """t x_k (offset l) - p: where the antenna at lever arm l is, against the measured position."""
-    key = gtsam.symbol("x", position.k)
+    def _iterate(self) -> None:
+        """Until nothing changes: a robust loss gives what was just closed its weight only step by step."""
+        for _ in range(_MAX_UPDATES):
+            if not self._isam.update().getVariablesRelinearized():
+                break
 
-    def error(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
-        enu_T_map, map_T_key, lever = _array(values.atPose2(_ALIGNMENT)), _array(values.atPose2(key)), np.asarray(values.atPoint2(_LEVER))
-        predicted, *jacobians = predict_position(enu_T_map, map_T_key, position.offset, lever)
-        if H is not None:
-            H[0], H[1], H[2] = map(np.asfortranarray, jacobians)
-        return np.asarray(predicted - position.position)
+    def marginal(self, k: int) -> FloatArray:
+        """(dim, dim) covariance of keyframe ``k``."""
+        rows = self.keyframes.rows
+        return np.asarray(self._isam.marginalCovariance(gtsam.symbol("x", k)))[np.ix_(rows, rows)]
 
-    return robust_factor([_ALIGNMENT, key, _LEVER], position.cov, error)
+    def lever_arm(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (2,) and covariance (2, 2) of where the positions' antenna is in the body frame [m]."""
+        if not self._values.exists(LEVER):
+            return self.lever[:2], LEVER_SIGMA_M**2 * np.eye(2)
+        return np.asarray(self._values.atPoint2(LEVER)), np.asarray(self._isam.marginalCovariance(LEVER))
 
+    def alignment(self) -> tuple[FloatArray, FloatArray] | None:
+        """``enu_T_map`` (3,) and the covariance (3, 3) of its right perturbation; None without positions."""
+        pose = self.enu_T_map
+        return None if pose is None else (pose, np.asarray(self._isam.marginalCovariance(ALIGNMENT)))
 
-def robust_loop_noise(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
-    """``noise`` of a loop closure, with a Cauchy loss: one that is wrong pulls little."""
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(_CAUCHY), noise)
+    def corrections(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (c,) and covariance (c, c) of the corrections."""
+        if not len(self.prior_cov) or not self.count:
+            return np.zeros(len(self.prior_cov)), self.prior_cov
+        key = gtsam.symbol("c", self._epochs)
+        return np.asarray(self._values.atVector(key)), np.asarray(self._isam.marginalCovariance(key))
 
 
 def robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., FloatArray]) -> gtsam.CustomFactor:
@@ -303,7 +389,3 @@ def check_solvable() -> Iterator[None]:
             "the pose graph cannot be solved: some covariances are far smaller than others. Check those of the positions and the robot "
             f"file's noise. (GTSAM: {str(error).strip().splitlines()[0]})"
         ) from error
-
-
-def _array(pose: gtsam.Pose2) -> FloatArray:
-    return np.array([pose.x(), pose.y(), pose.theta()])

@@ -3,62 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
-
-import numpy as np
 
 from localization.maps import KeyframeMap
 from localization.maps.changes import Changes, find_changes
+from localization.maps.keyframe_map import MappedKeyframe, make_map
 from localization.maps.place_search import PlaceMap
-from motion_models.se2 import FloatArray, Points2, Pose2
 
 _LISTED_CHANGES = 5
 _LEAST_CHANGED = 0.05
 """Share of the walls that are changed, from which on it is a note: halves of fr079 and MIT-CSAIL differ by 0.005 to 0.03, by doors."""
 
 
-@dataclass(frozen=True, eq=False)
-class DriveKeyframe:
-    """A keyframe that was localized in the map."""
-
-    stamp_ns: int
-    points: Points2
-    """(N, 2) of its scan in the body frame [m]."""
-    lidar: FloatArray
-    """(2,) where the LiDAR is in the body frame [m]."""
-    pose: Pose2
-    """(3,) ``map_T_body``."""
-
-
 class RecordedDrive:
     """`add` keyframe after keyframe, and `compare` all of them with the map at the end."""
 
     def __init__(self) -> None:
-        self._keys: list[DriveKeyframe] = []
+        self._keys: list[MappedKeyframe] = []
         self._changes: Changes | None = None
 
-    def add(self, key: DriveKeyframe) -> None:
+    def add(self, key: MappedKeyframe) -> None:
         """Keep ``key``."""
         self._keys.append(key)
 
     def keyframe_map(self) -> KeyframeMap | None:
         """The keyframes as a map in the frame of the saved one; None without such."""
-        if not self._keys:
-            return None
-        n = len(self._keys)
-        return KeyframeMap(
-            stamps_ns=np.array([key.stamp_ns for key in self._keys], dtype=np.int64),
-            poses=np.array([key.pose for key in self._keys]),
-            covariances=np.zeros((n, 3, 3)),
-            points=np.vstack([key.points for key in self._keys]).astype(np.float32),
-            counts=np.array([len(key.points) for key in self._keys], dtype=np.int64),
-            sensors=np.array([key.lidar for key in self._keys]),
-            edges=np.empty((0, 2), np.int64),
-            edge_deltas=np.empty((0, 3)),
-            edge_information=np.empty((0, 3, 3)),
-            edge_is_loop=np.empty(0, dtype=bool),
-        )
+        return make_map(self._keys) if self._keys else None
 
     def compare(self, places: PlaceMap) -> None:
         """Find what has changed since the map ``places`` was built."""

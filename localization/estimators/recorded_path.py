@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.core.state import Group
 from localization.trajectory import IntArray
+from motion_models.groups import Group
 from motion_models.se2 import FloatArray
 
 

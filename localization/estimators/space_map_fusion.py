@@ -6,7 +6,7 @@ As in the plane (`map_fusion`), the filter never depends on the map: ``odom_T_bo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,26 +15,14 @@ from localization.estimate import Estimate
 from localization.estimators.saved_map_fusion import KEYFRAME_ANGLE_RAD, KEYFRAME_DISTANCE_M, PriorMap, SavedMapFusion
 from localization.estimators.space_fusion import SpaceFusion
 from localization.events import Step
-from localization.maps import SpaceMap
+from localization.maps import KeyframeMap
+from localization.maps.keyframe_map import MappedKeyframe, make_map
 from localization.maps.space_localizer import SpaceLocalizer, SpaceMotion
-from localization.maps.space_map import in_units
 from localization.maps.space_places import SpacePlaces
 from localization.space_pose import Pose3
 from localization.trajectory import Trajectory
 from motion_models import se2, se3
 from motion_models.se2 import Cov3, FloatArray, Pose2
-from motion_models.se3 import Transform3
-
-
-@dataclass(frozen=True, eq=False)
-class _DriveKeyframe:
-    stamp_ns: int
-    cloud: FloatArray
-    lidar: FloatArray
-    pose: Transform3
-    """(4, 4) in the map."""
-    cov: FloatArray
-    """(6, 6)"""
 
 
 class SpaceMapFusion(SavedMapFusion[SpaceFusion]):
@@ -48,7 +36,7 @@ class SpaceMapFusion(SavedMapFusion[SpaceFusion]):
         self.localizer = SpaceLocalizer(places, initial, is_background=True)
         self._has_key, self._end_ns = False, 0
         self._cloud: FloatArray | None = None  # of a keyframe that is due
-        self._drive: list[_DriveKeyframe] | None = [] if is_recording else None
+        self._drive: list[MappedKeyframe] | None = [] if is_recording else None
 
     def step(self, step: Step) -> Estimate:
         """The filter's estimate in the frame of the map, as seen from above. Raises `EstimatorError` for planar scans."""
@@ -87,7 +75,7 @@ class SpaceMapFusion(SavedMapFusion[SpaceFusion]):
     def _record(self, cloud: FloatArray) -> None:
         if self._drive is not None and self.localizer.state == "localized":
             lidar, pose = self.odometry.lidar_position, self.localizer.pose
-            self._drive.append(_DriveKeyframe(self._end_ns, cloud, lidar, pose, self.localizer.covariance))
+            self._drive.append(MappedKeyframe(self._end_ns, pose, cloud, lidar, self.localizer.covariance))
 
     def _motion_since_keyframe(self) -> SpaceMotion:
         return SpaceMotion(*self.odometry.state.between("key", "pose")) if self._has_key else SpaceMotion(np.eye(4), np.zeros((6, 6)))
@@ -126,20 +114,6 @@ class SpaceMapFusion(SavedMapFusion[SpaceFusion]):
         self.run_deferred()
         self.localizer.finish_search()
 
-    def keyframe_map(self) -> SpaceMap | None:
+    def keyframe_map(self) -> KeyframeMap | None:
         """The drive's keyframes where they were localized in the map; None without such, or where they were not kept."""
-        if not self._drive:
-            return None
-        points, counts = in_units([key.cloud for key in self._drive])
-        return SpaceMap(
-            stamps_ns=np.array([key.stamp_ns for key in self._drive], dtype=np.int64),
-            poses=np.array([key.pose for key in self._drive]),
-            covariances=np.array([0.5 * (key.cov + key.cov.T) for key in self._drive]),
-            points=points,
-            counts=counts,
-            sensors=np.array([key.lidar for key in self._drive]),
-            edges=np.empty((0, 2), np.int64),
-            edge_deltas=np.empty((0, 4, 4)),
-            edge_information=np.empty((0, 6, 6)),
-            edge_is_loop=np.empty(0, dtype=bool),
-        )
+        return make_map(self._drive) if self._drive else None

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.core.space import SE3
 from localization.errors import EstimatorError
+from localization.estimators.pose_graph import GraphUpdate, PoseGraph
 from localization.estimators.recorded_path import RecordedPath
-from localization.estimators.space_graph import SpaceGraph
 from localization.lidar.cloud_loops import find_loops
 from localization.lifting import SpaceTable, Trajectory3
-from localization.maps import SpaceMap
-from localization.maps.space_map import in_units
+from localization.maps import KeyframeMap
+from localization.maps.keyframe_map import MappedKeyframe, MeasuredMotion, make_map
 from localization.space_pose import Pose3
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se3
+from motion_models.groups import SE3
 from motion_models.se2 import FloatArray, Pose2
 
 
@@ -25,11 +25,11 @@ class SpaceSmoothing:
         """``range_noise_m``: sigma of a range [m]. With ``has_loops``, clouds of a place that was visited again tie its keyframes."""
         self.path = RecordedPath(SE3)
         self._range_noise_m, self._has_loops = range_noise_m, has_loops
-        self._clouds: list[FloatArray | None] = []  # in the body frame
+        self._clouds: list[FloatArray] = []  # in the body frame
         self._sensors: list[FloatArray] = []
         self.trajectory: Trajectory3 | None = None
         """Poses in space by all measurements, once smoothed."""
-        self.map: SpaceMap | None = None
+        self.map: KeyframeMap | None = None
         """Keyframes as they can be saved, once smoothed."""
         self.failure = ""
         """Why the trajectory could not be smoothed."""
@@ -37,10 +37,10 @@ class SpaceSmoothing:
     def add_keyframe(self, cloud: FloatArray | None, sensor: FloatArray) -> None:
         """The newest element of the path is a keyframe with ``cloud`` (N, 3), measured from ``sensor`` (3,), in the body frame [m]."""
         self.path.add_node()
-        self._clouds.append(None if cloud is None else cloud.astype(np.float32))
+        self._clouds.append(np.empty((0, 3), np.float32) if cloud is None else cloud.astype(np.float32))
         self._sensors.append(sensor)
 
-    def finish(self, graph: SpaceGraph, map_T_odom: Pose2, filtered: Trajectory) -> Trajectory | None:
+    def finish(self, graph: PoseGraph, map_T_odom: Pose2, filtered: Trajectory) -> Trajectory | None:
         """The trajectory that ``graph`` smooths, in the map, projected to the plane at the stamps of ``filtered``; None where it fails, or
         with one keyframe."""
         stamps = self.path.stamps_ns
@@ -49,14 +49,17 @@ class SpaceSmoothing:
         try:
             keyframes = graph.smooth()
             if self._has_loops:
-                graph.loops = find_loops(self._clouds, keyframes.poses, keyframes.relative_cov, self._range_noise_m)
+                found = find_loops(self._clouds, keyframes.poses, keyframes.relative_cov, self._range_noise_m)
+                closed = [MeasuredMotion.by_cov(loop.a, loop.b, loop.delta, loop.cov, is_loop=True) for loop in found]
+                graph.apply(GraphUpdate(motions=tuple(closed)))
             if graph.loops:
                 keyframes = graph.smooth()
         except EstimatorError as error:
             self.failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
             return None
         to_map = se3.lift(map_T_odom)
-        self.map = self._make_map(graph, stamps[self.path.nodes], to_map @ keyframes.poses, keyframes.covs)
+        mapped = zip(stamps[self.path.nodes].tolist(), to_map @ keyframes.poses, self._clouds, self._sensors, keyframes.covs, strict=True)
+        self.map = make_map([MappedKeyframe(*key) for key in mapped], graph.motions)
         smoothed, covs = self.path.through(keyframes.poses, keyframes.covs)
         return self._project(filtered, stamps, to_map @ smoothed, covs)
 
@@ -74,20 +77,3 @@ class SpaceSmoothing:
                 planar_covs[row] = above
         self.trajectory = table.trajectory()
         return Trajectory(filtered.stamps_ns, planar, planar_covs)
-
-    def _make_map(self, graph: SpaceGraph, stamps_ns: IntArray, poses: FloatArray, covs: FloatArray) -> SpaceMap:
-        """The map of keyframes at ``stamps_ns`` (K,), smoothed to ``poses`` (K, 4, 4) with covariances (K, 6, 6)."""
-        betweens, loops = graph.betweens, graph.loops
-        points, counts = in_units([np.empty((0, 3)) if cloud is None else cloud.astype(float) for cloud in self._clouds])
-        return SpaceMap(
-            stamps_ns=stamps_ns,
-            poses=poses,
-            covariances=0.5 * (covs + covs.swapaxes(1, 2)),
-            points=points,
-            counts=counts,
-            sensors=np.array(self._sensors),
-            edges=np.array([(b.k, b.k + 1) for b in betweens] + [(loop.a, loop.b) for loop in loops], dtype=np.int64).reshape(-1, 2),
-            edge_deltas=np.array([b.delta for b in betweens] + [loop.delta for loop in loops]).reshape(-1, 4, 4),
-            edge_information=np.array([b.information for b in betweens] + [np.linalg.inv(loop.cov) for loop in loops]).reshape(-1, 6, 6),
-            edge_is_loop=np.arange(len(betweens) + len(loops)) >= len(betweens),
-        )

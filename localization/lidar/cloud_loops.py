@@ -89,13 +89,13 @@ def make_map_closures(cell: float) -> Any:
 
 
 def find_loops(
-    clouds: Sequence[FloatArray | None], poses: FloatArray, relative_cov: Callable[[int, int], FloatArray], noise_m: float
+    clouds: Sequence[FloatArray], poses: FloatArray, relative_cov: Callable[[int, int], FloatArray], noise_m: float
 ) -> list[CloudLoop]:
-    """Loops among keyframes with ``clouds``, (N, 3) each in the body frame or None, at ``poses`` (K, 4, 4), whose z axis is upright.
+    """Loops among keyframes with ``clouds``, (N, 3) each in the body frame, at ``poses`` (K, 4, 4), whose z axis is upright.
 
     ``relative_cov(a, b)`` (6, 6): covariance of the right perturbation of ``a_T_b`` by the odometry; ``noise_m``: sigma of a range.
     """
-    with_cloud = [k for k, cloud in enumerate(clouds) if cloud is not None and len(cloud)]
+    with_cloud = [k for k, cloud in enumerate(clouds) if len(cloud)]
     if not with_cloud:
         return []
     cell = choose_voxel_size(np.asarray(clouds[with_cloud[0]]))
@@ -116,7 +116,7 @@ def find_loops(
     return found
 
 
-def _local_map(clouds: Sequence[FloatArray | None], poses: FloatArray, keys: list[int], cell: float) -> _LocalMap:
+def _local_map(clouds: Sequence[FloatArray], poses: FloatArray, keys: list[int], cell: float) -> _LocalMap:
     key = keys[len(keys) // 2]
     level = np.eye(4)
     level[:3, :3] = se3.rotation(np.array([0.0, 0.0, -np.arctan2(poses[key][1, 0], poses[key][0, 0])])) @ poses[key][:3, :3]

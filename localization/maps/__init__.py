@@ -2,6 +2,5 @@
 
 from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.map_file import SavedMap, load_map, save_map
-from localization.maps.space_map import SpaceMap
 
-__all__ = ["KeyframeMap", "SavedMap", "SpaceMap", "load_map", "save_map"]
+__all__ = ["KeyframeMap", "SavedMap", "load_map", "save_map"]

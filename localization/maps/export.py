@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from localization.maps.grid import Grid
 from localization.maps.keyframe_map import KeyframeMap
-from localization.maps.space_map import SpaceMap
 
 _OCCUPIED, _FREE = 0, 254
 """Grey values of map_server and nav2."""
@@ -21,7 +20,7 @@ _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 as free."""
 
 
-def exports(grid: Grid, mapped: KeyframeMap | SpaceMap) -> dict[str, bytes]:
+def exports(grid: Grid, mapped: KeyframeMap) -> dict[str, bytes]:
     """Contents of map.pgm, map.yaml, map.png and map.ply, by name. Points are those of ``mapped``."""
     image = _image(grid)
     height, width = image.shape

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.errors import MapError
-from localization.maps.keyframe_map import IntArray, KeyframeMap
+from localization.maps.keyframe_map import KeyframeMap
+from localization.trajectory import IntArray
 from motion_models import se2
 from motion_models.compiled import kernel, subroutine
 from motion_models.se2 import FloatArray, Points2

@@ -15,7 +15,6 @@ from scipy import ndimage
 from localization.errors import MapError
 from localization.maps.grid import FREE, Beams, Grid, cast_beams
 from localization.maps.keyframe_map import KeyframeMap
-from localization.maps.space_map import SpaceMap
 from localization.trajectory import IntArray
 from motion_models import se2, se3
 from motion_models.se2 import FloatArray
@@ -65,7 +64,7 @@ def find_ground(points: FloatArray) -> Ground:
 class HeightSlice:
     """The part of a map within a range of heights above the ground, as `keyframes` of planar scans and as `grid`."""
 
-    def __init__(self, mapped: SpaceMap, heights: tuple[float, float] = HEIGHTS_M) -> None:
+    def __init__(self, mapped: KeyframeMap, heights: tuple[float, float] = HEIGHTS_M) -> None:
         """``heights``: lowest and highest of what is a wall [m]. Raises `MapError` where nothing stands there."""
         if not 0.0 <= heights[0] < heights[1] < math.inf:
             raise MapError(
@@ -91,7 +90,7 @@ class HeightSlice:
         return cast_beams(self._beams, self._is_wall, resolution, free)
 
     @staticmethod
-    def _from_above(mapped: SpaceMap, walls: FloatArray, keys: IntArray) -> KeyframeMap:
+    def _from_above(mapped: KeyframeMap, walls: FloatArray, keys: IntArray) -> KeyframeMap:
         yaws = np.arctan2(mapped.poses[:, 1, 0], mapped.poses[:, 0, 0])
         level = np.array([np.kron(np.eye(2), se3.rotation(np.array([0.0, 0.0, -yaw]))) for yaw in yaws])
         level = level @ np.array([np.kron(np.eye(2), R) for R in mapped.poses[:, :3, :3]])

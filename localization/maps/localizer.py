@@ -138,7 +138,7 @@ class Localizer(BackgroundSearcher[PlanarSearch]):
     def covariance(self) -> Cov3:
         """(3, 3) of the right perturbation of `pose`, with the map's own; of a place that is not known, with the extent of the map."""
         if self.state == "localized" or (self.state == "searching" and self._area.is_reckoned):
-            return np.asarray(self._at.cov + self.places.map_cov(self.pose))
+            return np.asarray(self._at.cov + self.places.mapped.cov_at(self.pose))
         return self._at.cov if self._area.is_given else np.asarray(self._at.cov + self.places.extent_cov)
 
     def add(self, points: Points2, delta: Pose2, cov: Cov3) -> None:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from localization.errors import MapError
 from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.position_plane import plane_from_json
-from localization.maps.space_map import SpaceMap
 from localization.output import whole_file
 from motion_models.input_files import open_input
 from motion_models.se2 import FloatArray
@@ -61,7 +60,7 @@ _SHAPES: Mapping[str, tuple[str, tuple[str | int, ...]]] = {
     "edge_information": ("<f8", ("E", 3, 3)),
     "edge_is_loop": ("|b1", ("E",)),
 }
-"""Type and shape of each array, by its name in `KeyframeMap`; equal letters are equal numbers."""
+"""Type and shape of each array of a planar map, by its name in `KeyframeMap`; equal letters are equal numbers."""
 _SPACE_SHAPES: Mapping[str, tuple[str, tuple[str | int, ...]]] = {
     **_SHAPES,
     "poses": ("<f8", ("K", 4, 4)),
@@ -71,7 +70,7 @@ _SPACE_SHAPES: Mapping[str, tuple[str, tuple[str | int, ...]]] = {
     "edge_deltas": ("<f8", ("E", 4, 4)),
     "edge_information": ("<f8", ("E", 6, 6)),
 }
-"""Types and shapes of the arrays of a `SpaceMap`."""
+"""Types and shapes of the arrays of a map in space."""
 _SHAPES_OF = {PLANAR: _SHAPES, SPACE: _SPACE_SHAPES}
 _ORTHONORMAL = 1e-6
 """Largest entry of R^T R - I of a rotation."""
@@ -81,26 +80,26 @@ _ORTHONORMAL = 1e-6
 class SavedMap:
     """A map, and where it comes from."""
 
-    map: KeyframeMap | SpaceMap
+    map: KeyframeMap
     provenance: Mapping[str, Any]
     """Log and its fingerprint, robot, model, corrections, mounts by frame, versions of libraries."""
 
     def planar(self, path: Path, use: str) -> KeyframeMap:
         """The map of planar scans. Raises `MapError` for one in space; ``path`` is that of its file, ``use`` what needs a planar map."""
-        if isinstance(self.map, SpaceMap):
+        if self.map.is_in_space:
             raise MapError(f"map '{path}' holds clouds in space, and {use} takes maps of planar scans. Name a map of a planar drive.")
         return self.map
 
 
 def save_map(path: Path, saved: SavedMap) -> None:
     """Write ``saved``: the file is whole, or it does not exist. Raises `OutputError` rather than overwrite, `MapError` if it is invalid."""
-    version = SPACE if isinstance(saved.map, SpaceMap) else PLANAR
+    version = SPACE if saved.map.is_in_space else PLANAR
     arrays = {name: np.ascontiguousarray(getattr(saved.map, name), dtype) for name, (dtype, _) in _SHAPES_OF[version].items()}
     _check(arrays, _SHAPES_OF[version], path)
     members = {name: _npy(array) for name, array in arrays.items()}
     digests = {name: hashlib.sha256(data).hexdigest() for name, data in members.items()}
     header = {"format": _FORMAT, "version": version, "sha256": digests, "provenance": saved.provenance}
-    if isinstance(saved.map, KeyframeMap) and saved.map.plane is not None:
+    if saved.map.plane is not None:
         header["positions"] = saved.map.plane.as_json()
     text = json.dumps(header, indent=1, ensure_ascii=False, sort_keys=True, allow_nan=False) + "\n"
     with whole_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
@@ -128,7 +127,7 @@ def load_map(path: Path) -> SavedMap:
     except _DAMAGE as error:
         raise MapError(f"map '{path}' is truncated, damaged, or no map file ({_reason(error)}). Write it again by --save-map.") from error
     _check(arrays, shapes, path)
-    return SavedMap(SpaceMap(**arrays) if shapes is _SPACE_SHAPES else KeyframeMap(**arrays, plane=plane), header["provenance"])
+    return SavedMap(KeyframeMap(**arrays, plane=plane), header["provenance"])
 
 
 def _read_header(archive: zipfile.ZipFile, path: Path) -> dict[str, Any]:

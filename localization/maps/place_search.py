@@ -130,18 +130,12 @@ class PlaceMap:
         self._starts = self._free_blocks(keyframes)
         self.search_s = _SEARCH_S + _SEARCH_S_PER_BLOCK * len(self._starts)
         """Time after which the result of a search beside the estimates is due [s]."""
-        self._poses, self._covs, self.plane = keyframes.poses, keyframes.covariances, keyframes.plane
+        self.mapped = keyframes
         low, high = points.min(axis=0), points.max(axis=0)
         self.centre: Pose2 = np.array([*(0.5 * (low + high)), 0.0])
         """(3,) the middle of the map."""
         self.extent_cov: Cov3 = np.diag(np.array([*np.full(2, 0.5 * np.hypot(*(high - low))), math.pi]) ** 2)
         """(3, 3) of a pose that may be anywhere in it."""
-
-    def map_cov(self, pose: Pose2) -> Cov3:
-        """(3, 3) the map's own covariance at ``pose`` (3,), a right perturbation of it: that of the nearest keyframe."""
-        k = int(np.argmin(np.hypot(*(self._poses[:, :2] - pose[:2]).T)))
-        A = se2.adjoint(se2.inverse(se2.between(self._poses[k], pose)))
-        return np.asarray(A @ self._covs[k] @ A.T)
 
     def _score_images(self) -> tuple[FloatArray, ...]:
         fine = self._walls.levels[0]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from localization.maps.height_slice import HEIGHTS_M, find_ground
-from localization.maps.space_map import SpaceMap
+from localization.maps.keyframe_map import KeyframeMap
 from motion_models.se2 import FloatArray
 
 _BEAM_M = 0.1
@@ -18,7 +16,7 @@ _LEAST_PASSES = 4
 """Keyframes of the drive that look through a column, from which on what stood there is gone: free for certain, as in the plane."""
 
 
-def find_gone(mapped: SpaceMap, drive: SpaceMap, cell: float) -> NDArray[np.bool_]:
+def find_gone(mapped: KeyframeMap, drive: KeyframeMap, cell: float) -> NDArray[np.bool_]:
     """(M,) which points of ``mapped`` are gone by the clouds of ``drive``, whose poses are in its frame.
 
     Candidates stand above the ground, with no point of the drive within ``cell`` [m]. Beams that pass one and end a cell behind it look
@@ -41,13 +39,6 @@ def find_gone(mapped: SpaceMap, drive: SpaceMap, cell: float) -> NDArray[np.bool
             passes[np.unique(column[is_passed])] += 1
     gone[candidates] = passes[column] >= _LEAST_PASSES
     return gone
-
-
-def without(mapped: SpaceMap, gone: NDArray[np.bool_]) -> SpaceMap:
-    """``mapped`` without the points that are ``gone`` (M,)."""
-    keys = np.repeat(np.arange(len(mapped.counts)), mapped.counts)
-    counts = np.bincount(keys[~gone], minlength=len(mapped.counts))
-    return replace(mapped, points=mapped.points[~gone], counts=counts)
 
 
 def _is_passed(points: FloatArray, ends: FloatArray, behind_m: float) -> NDArray[np.bool_]:

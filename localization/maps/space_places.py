@@ -17,7 +17,6 @@ from localization.lidar.scan_matcher import MIN_POINTS
 from localization.maps.height_slice import HEIGHTS_M, HeightSlice, find_ground
 from localization.maps.keyframe_map import KeyframeMap
 from localization.maps.place_search import PlaceMap
-from localization.maps.space_map import SpaceMap
 from motion_models import se3
 from motion_models.se2 import Cov3, FloatArray, Pose2
 from motion_models.se3 import Transform3
@@ -64,9 +63,9 @@ class SpacePlace:
 class SpacePlaces:
     """The surfaces of a map in space, as clouds are matched to them."""
 
-    def __init__(self, mapped: SpaceMap, range_noise_m: float) -> None:
+    def __init__(self, mapped: KeyframeMap, range_noise_m: float) -> None:
         """``range_noise_m``: sigma of a range, added to the thickness of surfaces [m]. Raises `MapError` without points."""
-        clouds = mapped.clouds()
+        clouds = mapped.scans()
         if not len(mapped.points):
             raise MapError("the map has no points, so nothing can be localized in it. Build it from a log with clouds of a 3D LiDAR.")
         cell = choose_voxel_size(next(cloud for cloud in clouds if len(cloud)))
@@ -147,9 +146,9 @@ Places = PlaceMap | SpacePlaces
 """A map as scans or clouds are localized in it."""
 
 
-def make_places(mapped: KeyframeMap | SpaceMap, range_noise_m: float) -> Places:
+def make_places(mapped: KeyframeMap, range_noise_m: float) -> Places:
     """``mapped`` as scans or clouds are localized in it, with a sigma of a range [m]. Raises `MapError` without points."""
-    return SpacePlaces(mapped, range_noise_m) if isinstance(mapped, SpaceMap) else PlaceMap(mapped, range_noise_m)
+    return SpacePlaces(mapped, range_noise_m) if mapped.is_in_space else PlaceMap(mapped, range_noise_m)
 
 
 def _compare(match: CloudMatch, n_points: int) -> SpacePlace:

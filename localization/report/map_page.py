@@ -14,7 +14,6 @@ from localization.maps.export import png
 from localization.maps.grid import Grid, draw_grid
 from localization.maps.height_slice import HeightSlice
 from localization.maps.keyframe_map import KeyframeMap
-from localization.maps.space_map import SpaceMap
 from localization.report import page as html
 from localization.report.interactive import grid_layer, numbers
 from localization.trajectory import IntArray
@@ -30,11 +29,11 @@ _MARK_M = 0.8
 """Least side of the square that marks a change [m]."""
 
 
-def map_page(name: str, mapped: KeyframeMap | SpaceMap, sentences: Sequence[str], provenance: Mapping[str, Any]) -> str:
+def map_page(name: str, mapped: KeyframeMap, sentences: Sequence[str], provenance: Mapping[str, Any]) -> str:
     """HTML of the whole page of ``mapped``, in one file; one in space is seen from above, with walls of `height_slice.HEIGHTS_M`.
 
     Raises `MapError` where it has no points."""
-    if isinstance(mapped, SpaceMap):
+    if mapped.is_in_space:
         upright = HeightSlice(mapped)
         planar, grid = upright.keyframes, upright.grid(_cell_of(mapped.points_in_map()[:, :2]))
     else:

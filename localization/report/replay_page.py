@@ -14,7 +14,6 @@ from scipy.stats import chi2
 
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
-from localization.maps import KeyframeMap
 from localization.report import figures
 from localization.report import page as html
 from localization.report.interactive import Scans, explorer
@@ -136,7 +135,9 @@ def _sections(
 def _grid_blocks(runs: Sequence[PlottedRun]) -> list[html.Block]:
     """The grid of the last map of a graph, or of a drive in a saved map; and what of the saved map has changed."""
     mapped = [(run.result.run, run.result.run.keyframes) for run in runs]
-    planar = [(run, keyframes) for run, keyframes in mapped if isinstance(keyframes, KeyframeMap) and len(keyframes.points)]
+    planar = [
+        (run, keyframes) for run, keyframes in mapped if keyframes is not None and not keyframes.is_in_space and len(keyframes.points)
+    ]
     if not planar:
         return []
     run, keyframes = planar[-1]

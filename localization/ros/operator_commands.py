@@ -20,7 +20,7 @@ from localization.estimators import PriorMap, SavedMapFusion
 from localization.logs.decode import UnusableError, frame_name
 from localization.logs.fused_messages import odom_axes
 from localization.logs.serialization import decoder
-from localization.maps import KeyframeMap, SavedMap, SpaceMap, load_map, save_map
+from localization.maps import KeyframeMap, SavedMap, load_map, save_map
 from localization.maps.space_places import Places, make_places
 from localization.output import versions
 from localization.ros.gnss import GeodeticMap
@@ -197,7 +197,7 @@ class OperatorCommands:
         """Write the map as it is into the new file ``name``, beside the estimates; what comes of it is reported."""
         session = self._node.session
         mapped, estimate = session.pipeline.estimator.keyframe_map(), session.health.estimate
-        if not isinstance(mapped, KeyframeMap) or not str(name).strip():
+        if mapped is None or mapped.is_in_space or not str(name).strip():
             text = "give the name of a new file." if mapped is not None else "this estimator has no map of its own. Use graph."
             if estimate is not None and estimate.in_space is not None:
                 text = "poses are in space, whose map is made from the whole drive: record it, and use `skidloc replay --save-map`."
@@ -239,7 +239,7 @@ class OperatorCommands:
         threading.Thread(target=self._draw, args=(str(path), mapped, noise_m), name="load map", daemon=True).start()
         return ServiceReply(True, f"'{path}' is being loaded")
 
-    def _draw(self, path: str, mapped: KeyframeMap | SpaceMap, range_noise_m: float) -> None:
+    def _draw(self, path: str, mapped: KeyframeMap, range_noise_m: float) -> None:
         try:
             self._loaded.put((path, make_places(mapped, range_noise_m)))
         except MapError as error:

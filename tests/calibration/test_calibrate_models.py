@@ -145,6 +145,7 @@ def test_fit_of_simulated_drives_covers_the_truth(name: str) -> None:
     assert 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 40) < inside / total <= 1.0
 
 
+@pytest.mark.extended
 def test_fit_of_errors_shared_in_groups_has_wider_sigmas() -> None:
     """Ten maneuvers of a group repeat one error: the sandwich over groups must know, the plain inverse cannot."""
     rng = np.random.default_rng(4)

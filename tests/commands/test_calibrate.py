@@ -128,7 +128,7 @@ def shifted_slope(bag: Path) -> tuple[float, float]:
     return misfit(best)[1], float(best)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_calibrate_by_gyro_of_a_husky_fits_k_and_no_distance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = run(
         tmp_path, HUSKY, "--out", tmp_path / "husky.toml", "--export", "diff_drive_controller", "--export-out", tmp_path / "c.yaml"
@@ -197,6 +197,7 @@ def heading_errors(robot_file: str) -> np.ndarray:
     return np.array(errors)
 
 
+@pytest.mark.extended
 def test_calibrate_by_lidar_betters_another_drive(tmp_path: Path, aces_part: Path) -> None:
     report = run(tmp_path, aces_part, "--robot", "aces", "--model", "icr", "--out", tmp_path / "aces.toml")
     assert report["witness"] == {"part": "scan matching of /scan"}
@@ -248,7 +249,7 @@ def in_place(cg: tuple[float, float]) -> tuple[float, float]:
     return float(wz * g.track_width_m / (4.0 * g.wheel_radius_m)), float(-vy / wz)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_calibrate_by_reference_fits_the_change_with_the_cg(tmp_path: Path) -> None:
     cgs = [(x, 0.0) for x in (-0.06, -0.03, 0.0, 0.03, 0.06, 0.09)]
     wheels, cg, poses = drive(cgs)
@@ -346,6 +347,7 @@ def made_windows(model_name: str, n: int = 24, seed: int = 0) -> list[Maneuver]:
     return found
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", list(MODELS))
 def test_calibrate_out_of_every_model_is_read_back(tmp_path: Path, name: str) -> None:
     """Fitted, written, read: the very numbers, and the ties among them."""
@@ -451,6 +453,7 @@ def test_calibrate_without_motion_names_what_to_drive(tmp_path: Path, capsys: py
     assert "turning in place to each side" in message
 
 
+@pytest.mark.extended
 def test_calibrate_without_a_motion_reference_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wheels, cg, _ = drive([(0.0, 0.0)])
     bag = bags.write_mcap(tmp_path / "run.mcap", wheel_records(wheels, cg))
@@ -583,7 +586,7 @@ def test_calibrate_with_bad_options_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert list(tmp_path.iterdir()) == [there]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_calibrate_writes_the_clock_that_its_errors_are_without(tmp_path: Path) -> None:
     """Wheels stamped 90 ms early: calibrated again, the robot file has the errors that were promised for it."""
     log, first, second = (
@@ -600,7 +603,7 @@ def test_calibrate_writes_the_clock_that_its_errors_are_without(tmp_path: Path) 
     assert kept["before"][0] == pytest.approx(promised["after"][0], rel=0.2)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_calibrate_against_a_late_reference_promises_what_it_writes(tmp_path: Path) -> None:
     """The reference's clock is not the robot's: [clock] stays, and what it explains is no gain of the robot file."""
     log, first = diagnosis_drives.bag(tmp_path / "drive.mcap", {"wheel_time_offset": -0.09}, 7, "husky_a200"), tmp_path / "1.json"

@@ -60,6 +60,7 @@ def test_check_compares_gps_where_the_first_minute_is_too_even(tmp_path: Path) -
     assert 0.95 < float(row["second_source"].split("distance ")[1].split()[0]) < 1.05
 
 
+@pytest.mark.extended
 def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
     whole = (CASES / "base-log" / "log.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 7 // 10])
@@ -74,6 +75,7 @@ def test_check_of_a_log_that_breaks_off_says_so(tmp_path: Path) -> None:
     assert "its end is missing" in row["advice"]
 
 
+@pytest.mark.extended
 def test_check_with_inverted_side_writes_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = check(tmp_path, CASES / "H06-right-side-inverted" / "log.mcap")
     assert quantities(found, "contradiction") == {"sensors"}
@@ -134,6 +136,7 @@ SPOILED = cases(
 )
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("text", "change"), SPOILED)
 def test_check_of_reference_names_its_unit_and_clock(tmp_path: Path, text: str, change: dict[str, float]) -> None:
     reference = spoiled_reference(tmp_path / "reference.tum", **change)
@@ -142,7 +145,7 @@ def test_check_of_reference_names_its_unit_and_clock(tmp_path: Path, text: str, 
     assert [text in row["advice"] for row in found["rows"] if row["quantity"] == "reference"] == [True]
 
 
-@pytest.mark.parametrize("command", ["calibrate", "diagnose", "weigh"])
+@pytest.mark.parametrize("command", cases(["calibrate", "diagnose", "weigh"], usual=["calibrate"]))
 @pytest.mark.parametrize(("text", "change"), SPOILED)
 def test_spoiled_reference_is_named_and_nothing_is_fitted_to_it(
     tmp_path: Path, command: str, text: str, change: dict[str, float], capsys: pytest.CaptureFixture[str]
@@ -155,6 +158,7 @@ def test_spoiled_reference_is_named_and_nothing_is_fitted_to_it(
     assert not out.exists()
 
 
+@pytest.mark.extended
 def test_check_with_a_wrong_radius_has_k_of_the_measured_one(tmp_path: Path) -> None:
     """No sentence on what only follows from the radius, and a robot file in which radius and k belong together."""
     vehicle = Vehicle(0.165, 0.555, 0.512, 0.5, scan_hz=8.0, beams=180, seed=77)

@@ -28,6 +28,7 @@ DATA = Path(__file__).parents[1] / "data"
 GRID = DATA / "vaultbot" / "rotation_grid.csv"
 
 
+@pytest.mark.extended
 @pytest.mark.rendered
 def test_diagnose_table_writes_findings_page_and_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, again = tmp_path / "out", tmp_path / "again"
@@ -75,7 +76,7 @@ def test_diagnose_corrected_robot_names_its_causes_no_more(tmp_path: Path) -> No
     assert not {"diagonal_load", "track_width"} & after
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "effect"),
     [
@@ -246,7 +247,7 @@ def test_diagnose_reference_sigma_without_reference_is_refused(tmp_path: Path, c
     assert "--reference-sigma is the noise of a reference" in capsys.readouterr().err
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")  # windows that the replayed run does not cover are left out
 def test_diagnose_reference_that_is_off_is_no_part_of_the_check(tmp_path: Path) -> None:
     """Wheels 4 % larger, a marker 0.12 m ahead: the corrected robot predicts what the reference would have measured without that."""
@@ -258,7 +259,7 @@ def test_diagnose_reference_that_is_off_is_no_part_of_the_check(tmp_path: Path) 
     assert max(after["x"], after["y"]) < 0.01
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize(("cause", "size"), [("gyro_time_offset", 0.07), ("gyro_scale", 0.05)])
 def test_diagnose_gyro_is_corrected_in_the_robot_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], cause: str, size: float) -> None:
     """Its clock in [clock], its scale in the unit of [imu]; the check reads the log again with the written file."""
@@ -275,7 +276,7 @@ def test_diagnose_gyro_is_corrected_in_the_robot_file(tmp_path: Path, capsys: py
     assert set(found["replays"]) == {"odometry", "ekf"}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [34, 35])
 def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
     """A healthy robot that skids: effects that diff_drive does not have are unexplained, without a cause in their place, and no term is
@@ -290,7 +291,7 @@ def test_diagnose_by_a_simpler_model_names_what_the_suited_one_finds(tmp_path: P
     assert "which suits" not in capsys.readouterr().out
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_lidar_beside_tf_static_is_corrected_in_the_robot_file(tmp_path: Path) -> None:
     """The log's transform is wrong by 60 mm: the file's mount goes before it, in every command."""
     log = bag(tmp_path / "drive.mcap", {"lidar_offset_x": 0.06}, 31, "husky_a200")

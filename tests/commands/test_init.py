@@ -55,6 +55,7 @@ def test_sides_follow_the_spelling_of_manufacturers(names: tuple[str, str]) -> N
     assert sides(["caster_left_wheel", *names]) == ((names[0],), (names[1],))
 
 
+@pytest.mark.extended
 def test_init_of_a_pioneer_finds_its_drivers_constants(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Radius and track by the log itself: fr079's odometry over its wheel rates (0.0955 m, multiplier 1)."""
     out = tmp_path / "pioneer.toml"
@@ -115,6 +116,7 @@ def answer(monkeypatch: pytest.MonkeyPatch, answers: Iterable[str]) -> None:
     monkeypatch.setattr("rich.console.Console.input", read)
 
 
+@pytest.mark.extended
 def test_init_in_a_terminal_asks_again_after_hostile_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     answer(monkeypatch, ["maybe", "diff_drive", "-3", "nan", "0.1", "33", "[bold]", "0.33", "1e999", "", "0.25", "", "1.03", "n"])
     out = tmp_path / "r.toml"
@@ -135,6 +137,7 @@ def test_init_in_a_terminal_without_answers_names_the_options(
     assert not (tmp_path / "r.toml").exists()
 
 
+@pytest.mark.extended
 def test_init_topic_options_go_before_guesses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = ["--track-width-m", "0.33", "--wheelbase-m", "0.25", "--wheel-radius-m", "0.1"]
     base = ["init", str(PIONEER), "--out", str(tmp_path / "r.toml"), *given]

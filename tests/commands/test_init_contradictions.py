@@ -29,6 +29,7 @@ def case(tmp_path: Path, name: str) -> Robot:
     return init(tmp_path, CASES / name / "log.mcap", "--urdf", str(CASES / name / "robot.urdf"))
 
 
+@pytest.mark.extended
 def test_init_with_names_against_positions_takes_the_logs_sides(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = case(tmp_path, "H01-urdf-names-against-sides")
     assert {*robot.joints.left} == {"front_left_wheel", "rear_left_wheel"}
@@ -38,6 +39,7 @@ def test_init_with_names_against_positions_takes_the_logs_sides(tmp_path: Path, 
     assert "CONTRADICTION: left wheels = front_right_wheel" in (tmp_path / "r.toml").read_text()
 
 
+@pytest.mark.extended
 def test_init_with_plugin_against_joints_takes_what_the_log_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = case(tmp_path, "H02-urdf-plugin-contradicts-joints")
     assert (robot.geometry.track_width_m, robot.geometry.wheel_radius_m) == (0.35, 0.12)
@@ -55,6 +57,7 @@ def test_init_with_an_inverted_side_names_it_and_fits_the_radius(tmp_path: Path,
     assert "the right side (front_right_wheel, rear_right_wheel) is inverted" in capsys.readouterr().out
 
 
+@pytest.mark.extended
 def test_init_with_a_cg_beside_a_symmetric_robot_names_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     init(tmp_path, BASE_LOG, "--urdf", str(CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"))
     printed = capsys.readouterr().out
@@ -120,12 +123,14 @@ def test_init_with_a_mecanum_controller_is_refused_by_name(tmp_path: Path, capsy
 _RPM_LOG = CASES / "H13-wheel-rates-in-rpm" / "log.mcap"
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("known", "radius"), [("0.165", 0.165), ("0.15", 0.15)])
 def test_init_with_rates_in_rpm_writes_their_unit(known: str, radius: float, tmp_path: Path) -> None:
     robot = init(tmp_path, _RPM_LOG, "--wheel-radius-m", known, "--track-width-m", "0.57", "--wheelbase-m", "0.51")
     assert (robot.joints.rate_unit_rad_s, robot.geometry.wheel_radius_m) == (pytest.approx(0.10472, rel=1e-4), radius)
 
 
+@pytest.mark.extended
 def test_init_with_rates_in_rpm_and_a_wrong_urdf_has_both(tmp_path: Path) -> None:
     robot = init(tmp_path, _RPM_LOG, "--urdf", str(CASES / "H10-urdf-base-inertial-axes-swapped" / "robot.urdf"))
     assert robot.joints.rate_unit_rad_s == pytest.approx(0.10472, rel=1e-4)
@@ -197,6 +202,7 @@ def test_init_of_a_urdf_with_an_axle_in_place_of_two_asks_for_the_sides(tmp_path
     assert "left_wheel of the URDF may be front_left_wheel or rear_left_wheel" in capsys.readouterr().err.replace("\n", " ")
 
 
+@pytest.mark.extended
 def test_init_decides_sides_by_the_gyro_where_no_odometry_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     vehicle = Vehicle(seed=301)
     log = write(tmp_path / "log.mcap", vehicle, drive(vehicle), Publishing())

@@ -78,6 +78,7 @@ DESCRIPTIONS = {
 USUAL = ["numbered, the URDF turned about", "controller with a broadcaster", "radius twice"]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", cases(list(DESCRIPTIONS), usual=USUAL))
 def test_init_with_a_description_has_the_robots_lengths_and_sides(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     row = DESCRIPTIONS[name]

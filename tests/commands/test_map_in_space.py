@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from localization.cli import main
-from localization.maps import SavedMap, SpaceMap, load_map, save_map
+from localization.maps import SavedMap, load_map, save_map
 from localization.trajectory import read_tum
 from tests.helpers import bags, hill_log, hill_map, rooms, square_room
 from tests.helpers.hill_scans import make_scene, scans
@@ -34,7 +34,7 @@ def test_drive_over_hills_is_saved_and_localized_in_its_own_map(log: Path, tmp_p
     path = tmp_path / "hill.skidmap"
     assert replay(log, tmp_path / "first", "--estimator", "graph", "--save-map", path) == 0
     saved = load_map(path)
-    assert isinstance(saved.map, SpaceMap)
+    assert saved.map.is_in_space
     assert len(saved.map.poses) >= 3  # of the way after the IMU has shown the slope
     assert saved.provenance["robot"] == "husky_a200"
     more = "--initial-pose", 0.3, -0.4, 10, "--extend-map", tmp_path / "more.skidmap"
@@ -52,7 +52,7 @@ def test_drive_over_hills_is_saved_and_localized_in_its_own_map(log: Path, tmp_p
     np.testing.assert_allclose(last[:2], localized[-1, 1:3], atol=1e-9)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_planar_map_for_a_robot_on_hills_is_refused(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     save_map(tmp_path / "room.skidmap", square_room.saved())
     assert replay(log, tmp_path / "out", "--estimator", "map", "--map", tmp_path / "room.skidmap") == 2

@@ -43,7 +43,7 @@ def drawn(width):
     return console.file.getvalue().splitlines()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("width", cases([16, 30, 45, 80, 132, 300], ("45",)))
 def test_terminal_view_fits_any_width_and_loses_nothing(width):
     lines = drawn(width)
@@ -54,6 +54,7 @@ def test_terminal_view_fits_any_width_and_loses_nothing(width):
         assert wanted in text
 
 
+@pytest.mark.extended
 def test_terminal_view_has_a_row_for_each_subject_and_warning():
     rows = {line.split()[0]: line for line in drawn(300)}
     assert list(rows) == ["state", "pose", "sigma", "motion", "rates", "learned", "wheels", "messages"]
@@ -87,6 +88,7 @@ def test_online_of_a_log_corrects_what_contradicts_the_robot_file(case, tmp_path
     assert np.linalg.norm(read_tum(tmp_path / "run.tum").poses[-1, :2]) == pytest.approx(np.linalg.norm(true), abs=0.05)
 
 
+@pytest.mark.extended
 def test_online_of_a_log_with_a_turned_lidar_writes_what_replay_does(tmp_path):
     vehicle = Vehicle(0.11, 0.4, 0.3, 0.55, scan_hz=8.0, beams=180, seed=78)
     motion = drive(vehicle)

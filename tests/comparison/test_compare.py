@@ -77,6 +77,7 @@ def table(tmp_path_factory):
     return out
 
 
+@pytest.mark.extended
 def test_compare_numbers_are_those_of_replay(table, tmp_path):
     assert main(["replay", str(logs(3)[1]), "--robot", "vaultbot", *PAIRS, "--out", str(tmp_path / "replayed")]) == 0
     metrics = json.loads((tmp_path / "replayed" / "metrics.json").read_text())
@@ -133,7 +134,7 @@ def test_compare_again_skips_finished_logs(table, tmp_path, asked, capsys):
     assert len(asked) == 3
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_compare_log_under_several_names_counts_once(table, tmp_path, monkeypatch, capsys):
     copy, linked = tmp_path / "copy.mcap", tmp_path / "linked.mcap"
     copy.write_bytes(logs(3)[1].read_bytes())
@@ -155,7 +156,7 @@ def test_compare_half_a_table_is_completed(table, tmp_path):
     assert out.read_bytes() == table.read_bytes()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_compare_broken_log_is_reported_and_the_others_finished(table, tmp_path, capsys):
     broken, absent = tmp_path / "broken.mcap", tmp_path / "absent.mcap"
     broken.write_bytes(logs(3)[0].read_bytes()[:40])
@@ -444,7 +445,7 @@ def compare_until_a_log_is_done(out, address):
     return running
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_dask_killed_worker_gives_the_same_table(table, tmp_path, cluster):
     out = tmp_path / "table.csv"
     address, _, workers = cluster
@@ -476,6 +477,7 @@ def test_dask_lost_scheduler_ends_the_comparison_and_keeps_results(table, tmp_pa
     assert out.read_bytes() == table.read_bytes()
 
 
+@pytest.mark.extended
 def test_dask_missing_scheduler_is_refused(tmp_path, capsys, monkeypatch):
     pytest.importorskip("distributed", reason="the extra 'dask' is not installed")
     monkeypatch.setattr("localization.comparison.jobs.CONNECT_TIMEOUT_S", 1.0)

@@ -51,6 +51,7 @@ def compare(manifest, out, *arguments):
     )
 
 
+@pytest.mark.extended
 def test_fleet_run_is_kept_by_log_and_resumed(tmp_path, asked, capsys):
     first, second = (str(path) for path in logs(2))
     (tmp_path / "bad.mcap").write_bytes(b"no log")
@@ -110,6 +111,7 @@ def test_fleet_bad_manifest_is_refused(header, row, message, tmp_path, capsys):
     assert message in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.extended
 def test_fleet_log_of_a_store_is_read_and_an_absent_one_named(tmp_path, asked, monkeypatch, capsys):
     fsspec = pytest.importorskip("fsspec")
     fsspec.filesystem("memory").pipe("/bucket/drive.mcap", logs(1)[0].read_bytes())

@@ -22,10 +22,11 @@ from localization.core.filter import (
     update,
 )
 from localization.core.measurements.scan import key_scan_transition, measure_scan
-from localization.core.state import SE2, Layout, Perturbation, State, Vector
+from localization.core.state import Layout, Perturbation, State, Vector
 from localization.errors import EstimatorError
 from localization.lidar import KeyScanError
 from motion_models import se2
+from motion_models.groups import SE2
 
 
 def hat(v):

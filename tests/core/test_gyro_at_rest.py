@@ -60,6 +60,7 @@ def constant_rate(rate: float, seconds: float) -> np.ndarray:
     return np.full(round(seconds * RATE_HZ), rate)
 
 
+@pytest.mark.extended
 def test_two_seconds_of_rest_know_a_mems_bias_to_the_noise_of_the_gyro():
     """NEES of the bias over draws, of the published yaw after a minute that is driven straight on, and its error."""
     bias_nees, yaw_nees, yaw_errors = [], [], []

@@ -14,9 +14,10 @@ from localization.core.measurements.position import transform_point
 from localization.core.measurements.relative_pose import motion_residual
 from localization.core.measurements.scan import measure_scan
 from localization.core.measurements.turn import measure_turn
-from localization.core.state import SE2, Layout, State, Vector
+from localization.core.state import Layout, State, Vector
 from localization.events import Turn
 from motion_models import se2
+from motion_models.groups import SE2
 
 POSES = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1)).map(np.array)
 

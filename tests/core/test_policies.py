@@ -59,6 +59,7 @@ def test_wheel_noise_scale_is_of_driving_wheels_alone():
         np.testing.assert_allclose(noise.start_step(STATE, step), 1e-4 * np.eye(3))
 
 
+@pytest.mark.extended
 def test_sweep_slip_of_scans_whose_stamps_jitter_leads_nowhere():
     """Stamps 7 ms apart, of sweeps of 42 ms, give twists of 10 m/s, with which 250 of 512 poses were up to 0.38 m off at 0.03 m."""
     outcome = fault_drives.run(fault_drives.in_room(0, 1), jitter_scan_stamps(0.03, 7))

@@ -12,6 +12,7 @@ from localization.events import Event, ImuSample, Scan
 from localization.pipeline import Pipeline, Trial
 from motion_models import se2
 from motion_models.registry import make_model
+from tests.helpers.extended import cases
 from tests.helpers.fault_drives import FaultDrive, in_room
 
 
@@ -36,7 +37,7 @@ SENSORS: dict[str, Callable[[Event], bool]] = {
 }
 
 
-@pytest.mark.parametrize("sensors", SENSORS)
+@pytest.mark.parametrize("sensors", cases(SENSORS, usual=["wheels, gyro, LiDAR", "wheels"]))
 def test_published_twist_is_consistent_under_the_noise_of_the_robot_file(sensors: str) -> None:
     """NEES per degree of freedom of the twist, and of its turn rate alone, over two drives with each set of sensors."""
     found, of_turns = [], []

@@ -26,7 +26,7 @@ def _drive(folder: Path, effects: dict[str, float], seed: int, route: str) -> Dr
     return drive_of_log(open_log(bag(folder / f"{seed}.mcap", effects, seed, "husky_a200", drive(route)), load_robot("husky_a200")))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_from_healthy_drive_names_the_fault_alone(tmp_path: Path) -> None:
     model = make_model("friction", load_robot("husky_a200"))
     cause, size = _FAULT
@@ -45,6 +45,7 @@ def test_estimate_baseline_of_short_drive_is_refused(tmp_path: Path) -> None:
         estimate_baseline(short, make_model("friction", short.robot))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("factors", "kind"),
     [

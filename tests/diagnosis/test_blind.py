@@ -88,7 +88,7 @@ def test_diagnose_two_causes_names_both(diagnosed: Diagnosed) -> None:
         assert sizes[cause] == pytest.approx(size, rel=0.25)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_weak_cause_is_suspected_but_not_named(diagnosed: Diagnosed) -> None:
     found = diagnosed({"diagonal_load": 0.041}, 452)
     assert found.verdict == "consistent"
@@ -147,7 +147,7 @@ def test_diagnose_turns_that_a_tolerated_floor_explains_are_consistent(diagnosed
     assert 0.005 < size < found.tolerances["friction_anisotropy"]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_nonlinear_cause_has_its_size(diagnosed: Diagnosed) -> None:
     """3 cm are a quarter of the way to a small robot's axle: how much it turns goes with the square of that."""
     found = diagnosed({"cg_offset_x": 0.03}, 432, "jackal")
@@ -166,7 +166,7 @@ def test_diagnose_wet_patch_is_unexplained(diagnosed: Diagnosed) -> None:
     assert "not in a way that has a name: " in found.sentence
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_minor_second_cause_keeps_the_first(diagnosed: Diagnosed) -> None:
     """The second is no larger than robots ever differ from their files."""
     found = diagnosed({"diagonal_load": 0.15, "cg_offset_y": 0.003}, 434)

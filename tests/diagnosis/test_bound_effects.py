@@ -55,6 +55,7 @@ def extension_of(measured: Drive, model: str = MODEL) -> Extension:
     return found
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", cases(FOREIGN, ["slip when accelerating"]))
 def test_extend_foreign_effect_has_its_own_law_and_no_cause(name: str) -> None:
     effect, expected, size = FOREIGN[name]
@@ -108,7 +109,7 @@ def test_extend_healthy_drive_has_no_term_and_no_effect(seed: int) -> None:
     assert extended(nominal(seed)).extension is None
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_extend_gyro_that_feels_accelerations_is_named_as_such(tmp_path: Path) -> None:
     """Among causes it would be the gyro's clock, 26 ms off."""
     robot = load_robot("husky_a200")

@@ -75,6 +75,7 @@ def effects() -> list[Any]:
     return [pytest.param(*p.values, id=p.id, marks=[*p.marks, *([_OF_A_CAUSE] if p.id == "pioneer_3dx_4" else [])]) for p in found]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("name", "seed"), effects())
 def test_extend_finds_a_random_effect_and_its_file_drives_better(tmp_path: Path, name: str, seed: int) -> None:
     """What the effect adds to the error of other windows falls by 70 % at least with the file that was written."""
@@ -97,7 +98,7 @@ def test_extend_of_a_drive_without_an_effect_writes_nothing(tmp_path: Path, name
     assert not load_robot(tmp_path / "out" / "robot.toml").terms
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_extend_law_outside_the_library_gets_terms_near_it() -> None:
     """A law that is far larger than the noise, which it hides: by it the drive's noise is 40 times the reference's. No product of whole
     powers is the law, so that several share it."""
@@ -120,6 +121,7 @@ def check_of(extended: ExtendedResult) -> HandoverCheck:
     return extended.extension.check
 
 
+@pytest.mark.extended
 def test_extend_keeps_the_notes_of_the_first_diagnosis(tmp_path: Path) -> None:
     """Of a robot file with terms of another model."""
     name, seed = "pioneer_3dx", 0
@@ -135,6 +137,7 @@ def test_extend_keeps_the_notes_of_the_first_diagnosis(tmp_path: Path) -> None:
     assert any("terms of its file are of full_linear" in note for note in content["notes"])
 
 
+@pytest.mark.extended
 def test_extend_where_some_windows_have_headings_alone_replays_the_others() -> None:
     """Along walls scans fix no position: such windows take no part in x and y, and the others do."""
     name, seed = "pioneer_3dx", 3
@@ -169,7 +172,7 @@ def test_extend_effect_of_four_powers_is_found_and_its_file_drives_better(seed: 
     assert after - floor < 0.09 * (before - floor), (hidden, extended.robot.terms[model])  # of squares: 70 % of the root mean square
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_find_terms_sigmas_are_those_of_their_errors() -> None:
     """The root mean square of errors over sigmas is within the 99 % interval of chi squared; the selection of terms among candidates is
     part of it."""

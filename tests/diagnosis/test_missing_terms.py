@@ -78,6 +78,7 @@ def test_term_columns_of_a_rise_equal_those_of_its_limit() -> None:
     assert columns[late, :, 1] == pytest.approx(columns[late, :, 0], abs=1e-6)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.extended)])
 def test_extend_finds_what_fades(seed: int) -> None:
     """exp(-t/12) is 1 - rise(t,12): neither term is an improvement by itself."""
@@ -87,6 +88,7 @@ def test_extend_finds_what_fades(seed: int) -> None:
     assert result.robot is not None
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("component", "text"),
     [
@@ -104,6 +106,7 @@ def test_extend_finds_what_acts_to_one_side(component: str, text: str) -> None:
     assert result.robot is not None
 
 
+@pytest.mark.extended
 def test_extend_writes_nothing_of_a_side_that_the_drive_did_not_take() -> None:
     """Without right turns wz is max(wz,0)."""
     drawn = drive_with(400, 0, term("wz", "max(wz,0)", 0.4)).maneuvers
@@ -112,6 +115,7 @@ def test_extend_writes_nothing_of_a_side_that_the_drive_did_not_take() -> None:
     assert result.robot is None or all("max(" not in name for name in names(result))
 
 
+@pytest.mark.extended
 def test_extend_writes_no_term_that_holds_in_a_part_of_the_drive() -> None:
     """A law that begins at three quarters of the drive: terms describe it by the motions of that part."""
     effect: Effect = lambda m: (np.where(m.t > 60.0, 0.3 * m.v * np.abs(m.v), 0.0), 0.0, 0.0)  # noqa: E731
@@ -121,6 +125,7 @@ def test_extend_writes_no_term_that_holds_in_a_part_of_the_drive() -> None:
     assert result.robot is None
 
 
+@pytest.mark.extended
 def test_extend_writes_no_term_that_is_a_guess_for_the_other_side() -> None:
     """The robot turned left whenever it drove ahead, and right whenever it drove back: v |v| is v^2 sign(wz)."""
     drawn = drive_with(400, 0, term("vy", "v*abs(v)", 0.2)).maneuvers
@@ -132,6 +137,7 @@ def test_extend_writes_no_term_that_is_a_guess_for_the_other_side() -> None:
     assert result.robot is None
 
 
+@pytest.mark.extended
 def test_extend_corrects_by_the_half_that_has_the_motions() -> None:
     """Every other block of four windows has hardly any way ahead: there v wz and min(v, 0) wz are nearly one term."""
     hidden = (term("vy", "min(v,0)*wz", -0.2), term("vy", "v*wz", -0.2))
@@ -145,6 +151,7 @@ def test_extend_corrects_by_the_half_that_has_the_motions() -> None:
     assert result.extension.check.shown[0] == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("hidden", "count", "along"),
     [
@@ -179,6 +186,7 @@ def test_gains_in_speed_and_in_turning_rate_that_are_alike_are_a_clock(turning: 
     assert missing_terms._with_clock_for_gains(problem, causes, candidates, (1, 2, 3)) == expected
 
 
+@pytest.mark.extended
 def test_extend_rows_begin_with_the_plain_model_and_name_the_term() -> None:
     measured = drive_with(40, 3, term("vy", "wz*abs(wz)", 0.1))
     row, plain = (d.diagnosis.discrepancy["y"] for d in (extended(measured).found, examine(measured, MODEL)))

@@ -36,6 +36,7 @@ def test_diagnose_contacts_that_creep_by_rate_are_no_cause() -> None:
     assert found.verdict == "consistent"
 
 
+@pytest.mark.extended
 def test_diagnose_grip_beside_a_healthy_drive_has_the_error_of_the_response() -> None:
     """A healthy drive does not show how contacts respond: laws and stiffnesses that were measured on robots differ by 8.5 % in that."""
     drive, split = law_drive("husky_a200"), 0.3
@@ -85,7 +86,7 @@ def test_diagnose_contacts_of_the_model_have_no_note() -> None:
     assert not any("not those of the friction model" in note for note in found.warnings)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_load_on_other_contacts_has_the_error_of_the_model() -> None:
     found = diagnosed(dataclasses.replace(_CREEPING, cg=(0.06, 0.0)), 5)
     load = next(f for f in found.findings if f.cause in ("cg_offset_x", "payload"))

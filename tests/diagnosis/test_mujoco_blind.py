@@ -34,7 +34,7 @@ def test_diagnose_mujoco_hidden_cause_is_named() -> None:
     assert named[cause] == pytest.approx(size, rel=0.3)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_mujoco_height_of_the_cg_is_named_on_a_level_floor() -> None:
     """The centripetal force of curves shifts loads; without the height as a candidate a track 155 mm wider was named."""
     found = diagnose_mujoco("husky_a200", "tour", {"cg_height": 0.2}, 7312, healthy("husky_a200")).diagnosis
@@ -43,7 +43,7 @@ def test_diagnose_mujoco_height_of_the_cg_is_named_on_a_level_floor() -> None:
     assert abs(only.size - 0.2) < 3.0 * only.sigma
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_m", [0.0, 0.02])
 def test_diagnose_stiff_contacts_nothing_wrong_or_the_right_shift(tmp_path: Path, shift_m: float) -> None:
     """MuJoCo's contacts are eight times as stiff as the file's: a healthy Jackal is consistent, and a CG that lies farther ahead is found
@@ -66,7 +66,7 @@ def test_diagnose_stiff_contacts_nothing_wrong_or_the_right_shift(tmp_path: Path
     assert sizes["cg_offset_x"] == pytest.approx(shift_m, rel=0.25)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1001, 1009])
 def test_diagnose_creeping_contacts_of_a_healthy_robot_are_consistent(number: int) -> None:
     """Friction that grows to 0.15 m/s of slip: about the file's contacts a Warthog's wheels would shrink by 1 %, and a Husky's be late."""

@@ -95,7 +95,7 @@ def test_diagnose_68_rotations_names_neither_treads_nor_cg(of_rotations: Diagnos
     assert not named & {"tread_asymmetry", "cg_offset_x", "cg_offset_y", "lidar_yaw"}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_drive_husky_turns_less_and_slips_on_arcs() -> None:
     """Ends of a fifth of the windows; the whole is in the benchmark."""
     robot = drive_husky.robot()
@@ -147,7 +147,7 @@ def test_diagnose_corrected_robot_is_not_corrected_again() -> None:
     assert "lidar_offset_x" not in {f.cause for f in found.findings}
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_clockwise_rotations_separate_treads() -> None:
     """Treads, and little else: the warp is separated from them by how its effect changes with the centre of gravity."""
     one, both = (known(rotations_driven(rates, 0)) for rates in ((0.3, 0.3), (0.3, -0.3)))

@@ -42,7 +42,7 @@ def test_weigh_on_a_slope_gives_height_of_the_cg_and_mu():
     assert np.abs(case.z).max() < 3.5
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_weigh_on_a_slope_in_mujoco_gives_height_and_mu():
     """Coulomb's friction of rigid bodies, which the friction model does not describe."""
     pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")

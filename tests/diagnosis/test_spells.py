@@ -60,6 +60,7 @@ def times_s(found: DiagnosisResult) -> list[float]:
     return [*(float(t) for t in found.predictor.drive.starts_s), float(found.predictor.window_times_s[1][-1])]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("first", "last"), [(22, COUNT), pytest.param(12, 28, marks=pytest.mark.extended)])
 def test_examine_cause_in_a_part_of_the_drive_has_its_moments(first: int, last: int) -> None:
     found = examined(first, last, 3)
@@ -134,7 +135,7 @@ def _with_pick_up(robot: Robot, config: ExperimentConfig) -> Iterator[Phase]:
         yield phase
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_payload_taken_up_on_the_way_is_payload_from_then(tmp_path: Path) -> None:
     """The robot drives straight on before and after it takes the load up, which hardly shows it: the interval is these six seconds."""
     nominal = load_robot("husky_a200")

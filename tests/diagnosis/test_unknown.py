@@ -42,7 +42,7 @@ _PUNCTURE_SHARE = -0.05 / 1.05
 """Of the left radii: the left wheels turn 5 % faster for the same way."""
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_diagnose_puncture_is_two_causes_from_one_moment(nominal: Drive) -> None:
     """Tyres of one side that shrink on the way are a difference of both sides and half as much of the mean, from then on."""
     found = diagnose(UNKNOWN[PUNCTURE](nominal), make_model("friction", nominal.robot))

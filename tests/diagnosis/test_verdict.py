@@ -149,6 +149,7 @@ def measured(about: Linearization, rows: FloatArray, sigmas: FloatArray) -> Line
     return dataclasses.replace(about, rows=rows, linear=rows, noise=noise, problem=problem)
 
 
+@pytest.mark.extended
 def test_attribute_rows_unequal_noise_is_weighed_alike_in_all_columns(rotations: Linearization) -> None:
     """Every third window is ten times noisier and follows its noise, the others have five times theirs: the row shows that."""
     sigmas = np.where(np.arange(len(rotations.rows))[:, None] % 3 == 0, 0.05, 0.005) * np.ones((1, len(CHANNELS)))
@@ -187,6 +188,7 @@ def test_attribute_rows_noise_of_headings_that_the_gyro_does_not_have_is_no_erro
     assert row.status == status
 
 
+@pytest.mark.extended
 def test_find_trends_in_noise_are_as_rare_as_their_p_value() -> None:
     """At most 11 of 300 drives have one at a significance of 1 % (binomial, 99.99 %), and each drive has one that is there."""
     drive = law_drive("turtlebot3_burger")

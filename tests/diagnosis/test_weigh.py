@@ -48,6 +48,7 @@ def _bag(folder: Path, phases, effects: dict[str, float], lidar: str = "2d") -> 
     return path
 
 
+@pytest.mark.extended
 def test_weigh_hidden_payload_reports_cg_load_and_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag, robot = _bag(tmp_path, _turns, {"payload": _PAYLOAD_KG}), load_robot("husky_a200")
     out, numbers = tmp_path / "loaded.toml", tmp_path / "weighing.json"
@@ -83,6 +84,7 @@ def test_weighing_p_values_of_a_right_file_are_uniform() -> None:
     assert kstest([_weighing((x, y)).p_value for x, y in draws.tolist()], "uniform").pvalue > 1e-3
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("factor", "kind"),
     [
@@ -109,16 +111,19 @@ def test_weigh_left_out_rotations_of_the_thesis_have_their_cg() -> None:
     assert np.sqrt(np.mean(errors**2, axis=0)).max() < 0.01
 
 
+@pytest.mark.extended
 def test_weigh_straight_drive_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["weigh", str(_bag(tmp_path, _straight, {})), "--robot", "husky_a200"]) == 2
     assert "Turn in place for 15 s to each side" in capsys.readouterr().err
 
 
+@pytest.mark.extended
 def test_weigh_headings_alone_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["weigh", str(_bag(tmp_path, _turns, {}, lidar="none")), "--robot", "husky_a200"]) == 2
     assert "record a LiDAR, or name a --reference" in capsys.readouterr().err
 
 
+@pytest.mark.extended
 def test_weigh_robot_with_casters_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = tmp_path / "casters.toml"
     robot.write_text(robot_toml(dataclasses.replace(load_robot("husky_a200"), drive=DIFF_DRIVE)))
@@ -126,7 +131,7 @@ def test_weigh_robot_with_casters_is_refused(tmp_path: Path, capsys: pytest.Capt
     assert "turns on casters" in capsys.readouterr().err
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_weigh_on_other_contacts_widens_interval_and_says_why() -> None:
     """MuJoCo's contacts turn a robot otherwise than the friction model: corrections absorb the load, and noise is hardly more."""
     pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")

@@ -7,6 +7,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from localization.estimators import Estimate
@@ -50,6 +51,7 @@ def normalised(pose: FloatArray, cov: FloatArray, truth: FloatArray) -> float:
     return float(error @ np.linalg.solve(cov, error))
 
 
+@pytest.mark.extended
 def test_covariances_of_both_frames_equal_monte_carlo_scatter() -> None:
     corrected, continuous = [], []
     for seed in range(DRIVES):
@@ -73,6 +75,7 @@ def test_odometry_at_rest_moves_by_less_than_the_pose() -> None:
     assert of_pose > 20.0 * of_odometry
 
 
+@pytest.mark.extended
 def test_corrected_pose_is_the_better_one_at_the_end() -> None:
     """The bias that is measured at rest corrects the way before: why both are estimated. An error of the radius is in both alike."""
     errors = []

@@ -352,7 +352,7 @@ def round_trip(form, seed):
     return np.array(drifts), np.stack([each[:, :3].mean(axis=1), each[:, -3:].mean(axis=1)], axis=1)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_cg_field_of_a_posture_returns_with_the_posture():
     found = {form: [round_trip(form, seed) for seed in range(10)] for form in ("constant", "cg_field")}
     drift = {form: np.array([d for d, _ in runs])[:, 3:] for form, runs in found.items()}

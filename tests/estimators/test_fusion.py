@@ -92,6 +92,7 @@ def test_ekf_in_rooms_errs_by_millimetres(walls: np.ndarray) -> None:
         assert radians < most_rad
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("walls", [LAB, pytest.param(HALL, marks=pytest.mark.extended)])
 def test_ekf_in_rooms_has_consistent_nees(walls: np.ndarray) -> None:
     """Eight drives of 10 s but for the first two seconds; errors of one drive are correlated, so the band is that of eight drives."""
@@ -155,6 +156,7 @@ def test_ekf_there_and_back_in_a_corridor_stays_on_its_map(seed: int) -> None:
     assert sigma > 0.003  # a share of a way of 40 m that is known to 0.1 m
 
 
+@pytest.mark.extended
 def test_ekf_in_bare_corridor_keeps_the_wheels_length() -> None:
     noise = WheelNoise(lateral_m2_per_m=1e-6, yaw_rad2_per_m=1e-5)
     drive = rooms.drive_through(CORRIDOR, rooms.path((1, 0, 0), (30, 0.5, 0.0), (1, 0, 0)), 0, (0.0, 0.1, 0.02), noise=noise)

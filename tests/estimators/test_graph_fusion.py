@@ -12,13 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from localization.core.motion import FilterConfig
-from localization.core.state import SE2
 from localization.errors import EstimatorError
 from localization.estimate_table import EstimateTable, trajectory
 from localization.estimators import Estimate, EstimatorConfig
 from localization.estimators.graph_fusion import subtract_information
 from localization.estimators.keyframe_motion import MotionPreintegration
-from localization.estimators.pose_graph import PoseGraph
+from localization.estimators.pose_graph import LivePoseGraph
 from localization.evaluation.consistency import nees
 from localization.events import PositionSample, Scan, WheelSample
 from localization.log_replay import replay
@@ -28,6 +27,7 @@ from localization.ros.state_serialization import deserialize, serialize
 from localization.simulation import world
 from localization.trajectory import Trajectory
 from motion_models import se2
+from motion_models.groups import SE2
 from motion_models.motion import Motion
 from motion_models.online_calibration import add_correction_parameters, make_corrections
 from motion_models.registry import make_model
@@ -121,7 +121,7 @@ def errors_on_second_visit(drive: rooms.Drive, poses: np.ndarray) -> np.ndarray:
 # --- loops about a building
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_graph_around_building_closes_loop() -> None:
     """After it, live poses are nearer the place of the first visit than the odometry's, and smoothed trajectories nearer the truth: in the
     mean of four drives, as drift differs by chance."""
@@ -142,7 +142,7 @@ def test_graph_around_building_closes_loop() -> None:
     assert after < 0.8 * before
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
     """Five minutes of fr079, after each of which corrections may change: GTSAM's marginals were indefinite at a sigma of 1e-6."""
     run = BUILDINGS["fr079"].open().until(300.0).run("graph", "skid_steer")
@@ -150,6 +150,7 @@ def test_graph_with_corrections_that_hardly_change_is_solved() -> None:
     assert (np.linalg.eigvalsh(run.trajectory.covariances) > 0.0).all()
 
 
+@pytest.mark.extended
 def test_graph_with_loop_moves_map_and_not_odometry() -> None:
     """The pose in the map jumps where the loop closes; odom -> base_link moves as the robot does (REP-105)."""
     jumps = ((estimated(seed)[0], np.diff([e.map_T_odom for e in estimated(seed)[0]], axis=0)) for seed in range(4))
@@ -170,6 +171,7 @@ def test_graph_odometry_equals_filter_with_same_corrections() -> None:
     assert all(np.array_equal(a.odometry[0], b.pose) for a, b in zip(ours[:8], theirs[:8], strict=True))
 
 
+@pytest.mark.extended
 def test_graph_with_wrong_wheels_estimates_radius_scale() -> None:
     """Radius by the scans along the way, k by the turns; both within 3 sigma, and with more certainty than at first."""
     estimates, pipeline = estimated()
@@ -264,6 +266,7 @@ def test_graph_with_empty_scans_closes_no_loops() -> None:
     assert np.isfinite(smoothed(estimates, pipeline).poses).all()
 
 
+@pytest.mark.extended
 def test_graph_of_wheels_alone_has_keyframes() -> None:
     """Without LiDAR and positions it is dead reckoning, with a covariance that grows."""
     drive = around()
@@ -308,6 +311,7 @@ def test_graph_with_positions_corrects_wrong_wheels() -> None:
     assert np.sqrt(np.mean(with_fixes**2)) < 0.2 * np.sqrt(np.mean(without**2))
 
 
+@pytest.mark.extended
 def test_graph_with_outlier_position_keeps_poses() -> None:
     clean, pipeline = driven_with(positions(around()))
     spoilt, _ = driven_with(positions(around(), spoil={40: np.array([50.0, 0.0])}))
@@ -436,6 +440,7 @@ def test_graph_resumed_after_loops_equals_uncut_bitwise() -> None:
     assert dict(pipeline.estimator.parameters()) == dict(resumed.estimator.parameters())
 
 
+@pytest.mark.extended
 def test_graph_replay_equals_live_bitwise() -> None:
     drive, (estimates, pipeline) = around(), estimated()
     live = make_pipeline(drive, is_smoothing=False)
@@ -454,6 +459,7 @@ def test_graph_replay_equals_live_bitwise() -> None:
 # --- parts
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("has_lidar", [True, False])
 def test_graph_without_loops_is_as_certain_as_the_filter(has_lidar):
     """In a bare corridor scans show the heading and one axis; without scans wheels count once, and the radius is its prior in both."""
@@ -483,7 +489,7 @@ def test_smoothed_poses_between_keyframes_have_the_noise_of_scans() -> None:
     assert (np.sqrt(covs[early, 0, 0]) > 0.4 * np.sqrt(run.live.covariances[live][early, 0, 0])).all()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_graph_with_a_field_of_corrections_can_be_smoothed() -> None:
     """Prior sigmas of a field over the CG differ by a factor of 1,500, and corrections are 16 variables in a row."""
     run = BUILDINGS["fr079"].open().run("graph", "skid_steer", "cg_field")
@@ -492,11 +498,11 @@ def test_graph_with_a_field_of_corrections_can_be_smoothed() -> None:
 
 
 def test_graph_that_cannot_be_smoothed_keeps_its_live_poses(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: PoseGraph) -> None:
+    def fail(self: LivePoseGraph) -> None:
         raise EstimatorError("the pose graph cannot be solved.")
 
     drive = around()
-    monkeypatch.setattr(PoseGraph, "smooth", fail)
+    monkeypatch.setattr(LivePoseGraph, "smooth", fail)
     (run,) = replay(drive.events[:600], [Trial(make_model("diff_drive", rooms.ROBOT), "graph")], rooms.ROBOT, drive.mounts, True)
     assert run.live is None
     assert len(run.trajectory) > 50

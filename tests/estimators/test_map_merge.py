@@ -9,7 +9,7 @@ import pytest
 
 from localization.cli import main
 from localization.errors import MapError
-from localization.estimators.map_merge import merge
+from localization.estimators import merge_maps
 from localization.maps import SavedMap, load_map, save_map
 from motion_models import se2
 from tests.helpers import floor_plan
@@ -29,7 +29,7 @@ def second():
 
 
 def test_merge_moves_the_second_map_into_the_first() -> None:
-    found = merge(FIRST, second(), 0.02)
+    found = merge_maps(FIRST, second(), 0.02)
     poses = found.map.poses[len(FIRST.poses) :]
     np.testing.assert_array_equal(found.map.poses[: len(FIRST.poses)], FIRST.poses)
     assert np.hypot(*(poses[:, :2] - WAY[:, :2]).T).max() < 0.05
@@ -44,7 +44,7 @@ def test_merge_moves_the_second_map_into_the_first() -> None:
 def test_merge_of_two_buildings_is_refused() -> None:
     hall = floor_plan.make_map(floor_plan.HALL, floor_plan.path((1, 1), (8, 1), step=1.8))
     with pytest.raises(MapError, match="could not be joined"):
-        merge(FIRST, hall, 0.02)
+        merge_maps(FIRST, hall, 0.02)
 
 
 def test_map_merge_command_writes_a_map_with_both_sources(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:

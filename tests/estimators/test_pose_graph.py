@@ -12,9 +12,11 @@ from scipy.stats import chi2
 
 from localization.errors import EstimatorError
 from localization.estimators import pose_graph
+from localization.estimators.graph_in_plane import PlanarKeyframes
 from localization.estimators.keyframe_motion import PreintegratedMotion
-from localization.estimators.pose_graph import BetweenMeasurement, GraphUpdate, PoseGraph, PositionMeasurement
+from localization.estimators.pose_graph import GraphUpdate, LivePoseGraph, PositionMeasurement
 from localization.evaluation.consistency import nees
+from localization.maps.keyframe_map import MeasuredMotion
 from localization.ros.state_serialization import deserialize, serialize
 from motion_models import se2
 
@@ -22,29 +24,29 @@ COV = np.diag([0.02, 0.02, 0.01]) ** 2
 LOOP_COV = np.diag([0.02, 0.02, 0.005]) ** 2
 ARC = np.array([1.0, 0.0, 2.0 * math.pi / 20])
 """Twenty of them are a circle."""
-NO_CORRECTIONS = np.zeros((0, 0))
+NO_CORRECTIONS, KEYFRAMES = np.zeros((0, 0)), PlanarKeyframes()
 
 
 def inverse(cov: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.inv(cov))
 
 
-def circles(n: int, rng: np.random.Generator | None = None, scale: float = 1.0) -> tuple[PoseGraph, np.ndarray]:
+def circles(n: int, rng: np.random.Generator | None = None, scale: float = 1.0) -> tuple[LivePoseGraph, np.ndarray]:
     """Graph and truth (n, 3) of a drive along ``ARC``, with noise of ``scale`` times that which the graph is given; loops are not closed.
     After 40 keyframes it turns the other way."""
-    graph, truth = PoseGraph(NO_CORRECTIONS), [np.zeros(3)]
+    graph, truth = LivePoseGraph(KEYFRAMES, NO_CORRECTIONS), [np.zeros(3)]
     graph.apply(GraphUpdate(truth[0]))
     for k in range(1, n):
         noise = np.zeros(3) if rng is None else scale * rng.multivariate_normal(np.zeros(3), COV)
         arc = ARC if k <= 40 else ARC * [1.0, 1.0, -1.0]
         measured = se2.compose(arc, se2.exp(noise))
         truth.append(se2.compose(truth[-1], arc))
-        graph.apply(GraphUpdate(se2.compose(graph.pose(k - 1), measured), betweens=(BetweenMeasurement(k - 1, k, measured, inverse(COV)),)))
+        graph.apply(GraphUpdate(se2.compose(graph.pose(k - 1), measured), motions=(MeasuredMotion(k - 1, k, measured, inverse(COV)),)))
     return graph, np.array(truth)
 
 
-def loop(truth: np.ndarray, a: int, b: int, error: np.ndarray) -> BetweenMeasurement:
-    return BetweenMeasurement(a, b, se2.compose(se2.between(truth[a], truth[b]), se2.exp(error)), inverse(LOOP_COV), is_loop=True)
+def loop(truth: np.ndarray, a: int, b: int, error: np.ndarray) -> MeasuredMotion:
+    return MeasuredMotion(a, b, se2.compose(se2.between(truth[a], truth[b]), se2.exp(error)), inverse(LOOP_COV), is_loop=True)
 
 
 def distances(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -86,7 +88,7 @@ def assert_jacobians_are_numeric(factor: gtsam.CustomFactor, values: gtsam.Value
 def test_wheel_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wheels = PreintegratedMotion(rng.normal(size=3), np.eye(3), rng.normal(size=(3, 2)), 0.1 * rng.normal(size=2))
-    factor = pose_graph.wheel_factor(0, 1, gtsam.symbol("c", 0), wheels)
+    factor = KEYFRAMES.wheels(gtsam.symbol("x", 0), gtsam.symbol("x", 1), gtsam.symbol("c", 0), wheels)
     start, values = 5.0 * rng.normal(size=3), gtsam.Values()
     values.insert(gtsam.symbol("x", 0), gtsam.Pose2(*start))
     values.insert(gtsam.symbol("x", 1), gtsam.Pose2(*se2.compose(start, se2.compose(wheels.delta, 0.1 * rng.normal(size=3)))))
@@ -99,7 +101,7 @@ def test_position_factor_has_numeric_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     enu_T_map, pose, offset, lever = 5.0 * rng.normal(size=3), 5.0 * rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
     antenna = se2.transform(se2.compose(enu_T_map, se2.compose(pose, offset)), lever)
-    factor = pose_graph.position_factor(PositionMeasurement(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
+    factor = KEYFRAMES.position(PositionMeasurement(3, offset, antenna + np.array([0.2, -0.3]), np.eye(2)))
     values = gtsam.Values()
     values.insert(gtsam.symbol("t", 0), gtsam.Pose2(*enu_T_map))
     values.insert(gtsam.symbol("x", 3), gtsam.Pose2(*pose))
@@ -132,12 +134,13 @@ def test_pose_graph_with_loop_spreads_the_drift() -> None:
     graph, truth = circles(41, np.random.default_rng(1))
     before = distances(graph.poses(), truth)
     sigma = np.sqrt(np.trace(graph.marginal(40)[:2, :2]))
-    graph.apply(GraphUpdate(betweens=(loop(truth, 0, 40, np.zeros(3)), loop(truth, 1, 39, np.zeros(3)))))
+    graph.apply(GraphUpdate(motions=(loop(truth, 0, 40, np.zeros(3)), loop(truth, 1, 39, np.zeros(3)))))
     live = distances(graph.poses(), truth)
     assert before[-1] > 0.1
     assert live[-1] < 0.3 * before[-1]
     live_sigma = np.sqrt(np.trace(graph.marginal(40)[:2, :2]))
-    poses, covs = graph.smooth()
+    smoothed = graph.smooth()
+    poses, covs = smoothed.poses, smoothed.covs
     assert live_sigma == pytest.approx(np.sqrt(np.trace(covs[40][:2, :2])), rel=0.25)  # loops' weights are those of closed loops
     assert live_sigma < 0.3 * sigma
     assert poses.shape == (41, 3)
@@ -148,15 +151,15 @@ def test_pose_graph_with_loop_spreads_the_drift() -> None:
 def test_pose_graph_with_wrong_loop_keeps_poses() -> None:
     graph, truth = circles(41, np.random.default_rng(2))
     right = tuple(loop(truth, k, k + 20, np.zeros(3)) for k in range(10, 20))
-    graph.apply(GraphUpdate(betweens=right))
-    alone = graph.smooth()[0]
-    graph.apply(GraphUpdate(betweens=(loop(truth, 5, 30, np.array([4.0, -2.0, 0.5])),)))
-    assert distances(graph.smooth()[0], alone).max() < 0.02
+    graph.apply(GraphUpdate(motions=right))
+    alone = graph.smooth().poses
+    graph.apply(GraphUpdate(motions=(loop(truth, 5, 30, np.array([4.0, -2.0, 0.5])),)))
+    assert distances(graph.smooth().poses, alone).max() < 0.02
 
 
 def test_pose_graph_on_turns_estimates_corrections() -> None:
     """Wheels turn by a tenth more than they say; k is a factor of turns, known to a tenth at first."""
-    graph, pose = PoseGraph(np.diag([0.1, 0.02]) ** 2), np.zeros(3)
+    graph, pose = LivePoseGraph(KEYFRAMES, np.diag([0.1, 0.02]) ** 2), np.zeros(3)
     graph.apply(GraphUpdate(pose))
     by = np.column_stack([[0.0, 0.0, ARC[2]], [1.0, 0.0, 0.0]])
     said = ARC * [1.0, 1.0, 1.0 / 1.1]
@@ -166,7 +169,7 @@ def test_pose_graph_on_turns_estimates_corrections() -> None:
         wheels = PreintegratedMotion(said, wheel_cov, by / 1.1, np.zeros(2))
         walk = 1e-8 * np.eye(2) if k in (20, 40) else None
         pose = se2.compose(graph.pose(k - 1), measured)
-        graph.apply(GraphUpdate(pose, wheels, walk, (BetweenMeasurement(k - 1, k, measured, inverse(COV)),)))
+        graph.apply(GraphUpdate(pose, wheels, walk, (MeasuredMotion(k - 1, k, measured, inverse(COV)),)))
     mean, cov = graph.corrections()
     sigma = np.sqrt(np.diag(cov))
     assert sigma[0] < 0.02
@@ -185,8 +188,9 @@ def test_pose_graph_over_fifty_drives_has_consistent_nees(is_smoothed: bool) -> 
         rng = np.random.default_rng(seed)
         graph, truth = circles(31, rng)
         ends = [(a, a + 20, rng.multivariate_normal(np.zeros(3), LOOP_COV)) for a in (2, 5, 8)]
-        graph.apply(GraphUpdate(betweens=tuple(loop(truth, *end) for end in ends)))
-        pose, cov = (part[30] for part in graph.smooth()) if is_smoothed else (graph.pose(30), graph.marginal(30))
+        graph.apply(GraphUpdate(motions=tuple(loop(truth, *end) for end in ends)))
+        smoothed = graph.smooth() if is_smoothed else None
+        pose, cov = (graph.pose(30), graph.marginal(30)) if smoothed is None else (smoothed.poses[30], smoothed.covs[30])
         found.append(nees(se2.log(se2.between(truth[30], pose))[None], cov[None])[0])
     assert 1.5 < np.mean(found) < chi2.ppf(0.995, 150) / 50
 
@@ -196,12 +200,12 @@ def test_pose_graph_over_fifty_drives_has_consistent_nees(is_smoothed: bool) -> 
 
 def with_positions(
     outlier_m: float = 0.0, lever: np.ndarray | None = None, given: np.ndarray | None = None
-) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
+) -> tuple[LivePoseGraph, np.ndarray, np.ndarray]:
     """Drifting odometry with a fix at each keyframe, turned and moved against the map. Returns graph, truth, and the alignment."""
     rng, enu_T_map = np.random.default_rng(4), np.array([100.0, -50.0, 0.7])
     lever = np.zeros(2) if lever is None else lever
     graph, truth = circles(61, rng, scale=3.0)
-    graph = PoseGraph(NO_CORRECTIONS, np.zeros(2) if given is None else given, graph.updates)
+    graph = LivePoseGraph(KEYFRAMES, NO_CORRECTIONS, np.zeros(3) if given is None else np.append(given, 0.0), graph.updates)
     fixes = se2.transform(se2.compose(enu_T_map, truth), lever) + rng.normal(0.0, 0.1, (61, 2))
     fixes[30, 0] += outlier_m
     found = tuple(PositionMeasurement(k, np.zeros(3), fixes[k], 0.01 * np.eye(2)) for k in range(61))
@@ -212,13 +216,13 @@ def with_positions(
 def test_pose_graph_with_positions_reduces_drift() -> None:
     alone, truth = circles(61, np.random.default_rng(4), scale=3.0)
     graph = with_positions()[0]
-    before, after = distances(alone.poses(), truth).max(), distances(graph.smooth()[0], truth).max()
+    before, after = distances(alone.poses(), truth).max(), distances(graph.smooth().poses, truth).max()
     assert before > 0.5
     assert after < 0.5 * before
 
 
 def test_graph_with_outlier_position_keeps_poses() -> None:
-    poses, spoilt = (with_positions(outlier)[0].smooth()[0] for outlier in (0.0, 50.0))
+    poses, spoilt = (with_positions(outlier)[0].smooth().poses for outlier in (0.0, 50.0))
     assert distances(poses, spoilt).max() < 0.1
 
 
@@ -254,11 +258,13 @@ def test_pose_graph_with_singular_covariance_raises_estimator_error() -> None:
 
 def test_pose_graph_deserialized_equals_original_bitwise() -> None:
     graph, truth = circles(30, np.random.default_rng(5))
-    graph.apply(GraphUpdate(betweens=(loop(truth, 2, 22, np.zeros(3)),)))
+    graph.apply(GraphUpdate(motions=(loop(truth, 2, 22, np.zeros(3)),)))
     resumed = deserialize(*serialize(graph))
     for one in (graph, resumed):
-        one.apply(GraphUpdate(se2.compose(one.pose(29), ARC), betweens=(BetweenMeasurement(29, 30, ARC, inverse(COV)),)))
-        one.apply(GraphUpdate(betweens=(loop(truth, 5, 25, np.zeros(3)),)))
+        one.apply(GraphUpdate(se2.compose(one.pose(29), ARC), motions=(MeasuredMotion(29, 30, ARC, inverse(COV)),)))
+        one.apply(GraphUpdate(motions=(loop(truth, 5, 25, np.zeros(3)),)))
     assert np.array_equal(graph.poses(), resumed.poses())
     assert np.array_equal(graph.marginal(30), resumed.marginal(30))
-    assert all(np.array_equal(a, b) for a, b in zip(graph.smooth(), resumed.smooth(), strict=True))
+    one, other = graph.smooth(), resumed.smooth()
+    assert np.array_equal(one.poses, other.poses)
+    assert np.array_equal(one.covs, other.covs)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.core.state import SE2
 from localization.estimators.recorded_path import RecordedPath, through_nodes
+from motion_models.groups import SE2
 
 
 def test_through_nodes_moves_poses_by_travelled_share():

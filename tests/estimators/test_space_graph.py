@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from localization.core.measurements.position import predict_position_in_space
-from localization.core.space import SE3
+from localization.estimators.graph_in_space import SpaceKeyframes
 from localization.estimators.keyframe_motion import PreintegratedMotion
+from localization.estimators.pose_graph import GraphUpdate, GravityMeasurement, PoseGraph, PositionMeasurement
 from localization.estimators.recorded_path import through_nodes
-from localization.estimators.space_graph import Between, GravityMeasurement, SpaceGraph, SpacePosition
-from localization.lidar.cloud_loops import CloudLoop
+from localization.maps.keyframe_map import MeasuredMotion
 from motion_models import se2, se3
+from motion_models.groups import SE3
 from motion_models.slope import GRAVITY
 
 _PLANAR = [0, 1, 5]
@@ -25,39 +27,40 @@ _STEP = np.array([0.8, 0.05, 0.0, 0.0, 0.0, 0.6])
 _FIRST_SIGMAS = np.array([1e-3, 1e-3, 1e-3, 1e-4])
 
 
-def _drawn(rng: np.random.Generator) -> tuple[SpaceGraph, np.ndarray]:
+def _drawn(rng: np.random.Generator) -> tuple[PoseGraph, np.ndarray]:
     """A drive around a hill with all that the graph measures, and its true poses."""
     bias, corrections = _BIAS_SIGMA * rng.normal(size=3), _CORRECTION_SIGMAS * rng.normal(size=2)
     x, y, z, yaw = _FIRST_SIGMAS * rng.normal(size=4)
     true = [se3.exp(np.array([x, y, z, 0.0, 0.0, yaw])) @ se3.exp(np.array([0.0, 0.0, 0.0, *(0.1 * rng.normal(size=2)), 0.0]))]
-    graph = SpaceGraph(np.diag(_CORRECTION_SIGMAS**2), _BIAS_SIGMA, [np.eye(4)])
+    graph = PoseGraph(SpaceKeyframes(_BIAS_SIGMA), np.diag(_CORRECTION_SIGMAS**2))
+    graph.apply(GraphUpdate(np.eye(4)))
     for k in range(6):
         tangent = _STEP + np.array([0.0, 0.0, 0.02 * rng.normal(), *(0.05 * rng.normal(size=2)), 0.0])
         true.append(true[-1] @ se3.exp(tangent))
         delta = se3.exp(tangent)
         noise = _BETWEEN_SIGMAS * rng.normal(size=6)
-        graph.betweens.append(Between(k, delta @ se3.exp(noise), np.diag(1.0 / _BETWEEN_SIGMAS**2)))
+        motion = MeasuredMotion.by_cov(k, k + 1, delta @ se3.exp(noise), np.diag(_BETWEEN_SIGMAS**2))
         planar = se2.exp(se3.log(delta)[_PLANAR])
         error = _BY_CORRECTIONS @ corrections + _WHEEL_SIGMAS * rng.normal(size=3)
         predicted = se2.compose(planar, se2.inverse(se2.exp(error)))
-        graph.wheels.append(PreintegratedMotion(predicted, np.diag(_WHEEL_SIGMAS**2), _BY_CORRECTIONS, np.zeros(2)))
-        graph.poses.append(graph.poses[-1] @ graph.betweens[-1].delta)
+        wheels = PreintegratedMotion(predicted, np.diag(_WHEEL_SIGMAS**2), _BY_CORRECTIONS, np.zeros(2))
         force = GRAVITY * true[k][2, :3] + bias + _GRAVITY_SIGMA * rng.normal(size=3)
-        graph.gravities.append(GravityMeasurement(k, force, np.eye(3), _GRAVITY_SIGMA**2))
+        gravity = GravityMeasurement(k, force, np.eye(3), _GRAVITY_SIGMA**2)
+        graph.apply(GraphUpdate(graph.pose(k) @ motion.delta, wheels, motions=(motion,), gravities=(gravity,)))
     return graph, np.array(true)
 
 
 _ENU_T_MAP, _POSITION_SIGMA, _LEVER_SIGMAS = np.array([300.0, -200.0, 40.0, 2.0]), 0.03, np.array([0.5, 0.5, 1.0])
 
 
-def _with_positions(graph: SpaceGraph, true: np.ndarray, rng: np.random.Generator) -> None:
+def _with_positions(graph: PoseGraph, true: np.ndarray, rng: np.random.Generator) -> None:
     """Positions near each keyframe, of every second one without the height."""
-    lever = _LEVER_SIGMAS * rng.normal(size=3)
+    lever, positions = _LEVER_SIGMAS * rng.normal(size=3), []
     for k, pose in enumerate(true):
         offset, n = se3.exp(0.1 * rng.normal(size=6)), 3 - k % 2
         at = predict_position_in_space(_ENU_T_MAP, pose, offset, lever)[0] + _POSITION_SIGMA * rng.normal(size=3)
-        graph.positions.append(SpacePosition(k, offset, at[:n], _POSITION_SIGMA**2 * np.eye(n)))
-    graph.alignment = _ENU_T_MAP + np.array([0.5, -0.5, 0.5, 0.1])
+        positions.append(PositionMeasurement(k, offset, at[:n], _POSITION_SIGMA**2 * np.eye(n)))
+    graph.apply(GraphUpdate(positions=tuple(positions), alignment=_ENU_T_MAP + np.array([0.5, -0.5, 0.5, 0.1])))
 
 
 @pytest.mark.parametrize("has_positions", [False, True])
@@ -82,14 +85,17 @@ def test_loop_in_space_takes_off_drift_as_its_covariance_has_it():
     for _ in range(15):
         graph, true = _drawn(rng)
         before, delta = graph.smooth().relative_cov(0, 6), se3.inverse(true[0]) @ true[6]
-        graph.loops = [CloudLoop(0, 6, delta @ se3.exp(sigmas * rng.normal(size=6)), np.diag(sigmas**2))]
+        closed = MeasuredMotion.by_cov(0, 6, delta @ se3.exp(sigmas * rng.normal(size=6)), np.diag(sigmas**2), is_loop=True)
+        graph.apply(GraphUpdate(motions=(closed,)))
         found = graph.smooth()
         error = se3.local(found.poses[-1], true[-1])
         nees.append(error @ np.linalg.solve(found.covs[-1], error))
         assert np.trace(found.relative_cov(0, 6)) < 0.1 * np.trace(before)
     assert 3.0 < np.mean(nees) < 8.3
-    graph.betweens[2] = Between(2, graph.betweens[2].delta @ se3.exp(np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])), np.eye(6))
-    poses = graph.smooth().poses
+    k, update = 3, graph.updates[3]
+    off = MeasuredMotion(2, 3, update.motions[0].delta @ se3.exp(np.array([2.0, 0.0, 0.0, 0.0, 0.0, 0.0])), np.eye(6))
+    updates = [replace(update, motions=(off,)) if i == k else each for i, each in enumerate(graph.updates)]
+    poses = PoseGraph(graph.keyframes, graph.prior_cov, updates=updates).smooth().poses
     assert np.linalg.norm(se3.local(poses[0], poses[6])[:3] - se3.log(delta)[:3]) < 0.02
 
 

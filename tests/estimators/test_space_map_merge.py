@@ -10,7 +10,7 @@ import pytest
 from localization.cli import main
 from localization.errors import MapError
 from localization.estimators import merge_maps
-from localization.maps import SavedMap, SpaceMap, load_map, save_map
+from localization.maps import KeyframeMap, SavedMap, load_map, save_map
 from motion_models import se3
 from tests.helpers import floor_plan, hill_map
 
@@ -32,12 +32,12 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def first(scene) -> SpaceMap:
+def first(scene) -> KeyframeMap:
     return hill_map.make_map(scene)
 
 
 @pytest.fixture(scope="module")
-def second(scene) -> SpaceMap:
+def second(scene) -> KeyframeMap:
     """In a frame of its own; its poses drift by 0.1 m."""
     there = hill_map.make_map(scene, _SECOND)
     own = se3.inverse(_ORIGIN) @ there.poses
@@ -49,6 +49,7 @@ def true_poses() -> np.ndarray:
     return np.array([hill_map.on_hills(*place) for place in _SECOND])
 
 
+@pytest.mark.slow
 def test_merge_in_space_moves_the_second_map_into_the_first(first, second) -> None:
     found = merge_maps(first, second, 0.02)
     n = len(first.poses)
@@ -65,6 +66,7 @@ def test_merge_in_space_moves_the_second_map_into_the_first(first, second) -> No
     assert (np.linalg.eigvalsh(found.map.covariances)[:, 0] > 0.0).all()
 
 
+@pytest.mark.slow
 def test_extension_in_space_adds_what_the_map_does_not_have(first, second) -> None:
     found = merge_maps(first, second, 0.02, only_new=True)
     added = found.map.stamps_ns[len(first.poses) :] // 10**9
@@ -74,6 +76,7 @@ def test_extension_in_space_adds_what_the_map_does_not_have(first, second) -> No
     assert again.added <= 1
 
 
+@pytest.mark.slow
 def test_extension_in_space_removes_what_is_gone(first, scene) -> None:
     nearest = np.argsort(np.hypot(*scene.trees[:, :2].T))
     felled = dataclasses.replace(scene, trees=scene.trees[nearest[4:]])
@@ -84,6 +87,7 @@ def test_extension_in_space_removes_what_is_gone(first, scene) -> None:
     assert merge_maps(first, again, 0.02).removed == 0
 
 
+@pytest.mark.slow
 def test_maps_of_other_hills_or_of_one_kind_each_are_not_merged(first, scene) -> None:
     poses = [se3.exp(np.array([0.6 * i, 0.0, 0.0, 0.0, 0.0, 0.0])) for i in range(4)]
     there = hill_map.make_map(scene, hill_map.WAY[:4])
@@ -100,5 +104,5 @@ def test_map_merge_command_joins_maps_in_space(first, second, tmp_path, capsys: 
     assert main(["map", "merge", *(str(tmp_path / f"{name}.skidmap") for name in "ab"), "--out", str(tmp_path / "c.skidmap")]) == 0
     assert "keyframes of" in capsys.readouterr().out
     found = load_map(tmp_path / "c.skidmap")
-    assert isinstance(found.map, SpaceMap)
+    assert found.map.is_in_space
     assert len(found.map.poses) == len(first.poses) + len(_SECOND)

@@ -129,6 +129,7 @@ def test_reference_of_hardly_any_motion_is_not_judged():
     assert compare_reference(_reference(), [still]).sentences == ()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("rate", "words"), [(0.01, "faster"), (-0.01, "slower")])
 def test_reference_whose_clock_runs_at_another_rate_is_named(rate, words):
     reference = _reference()

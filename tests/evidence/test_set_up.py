@@ -82,7 +82,7 @@ def test_a_log_is_asked_once_until_it_changes(tmp_path: Path, monkeypatch: pytes
     assert len(asked) == 2
 
 
-@pytest.mark.parametrize(("kind", "reversed_"), [("left", LEFT), ("right", RIGHT), ("one", ("rear_left_wheel",))])
+@pytest.mark.parametrize(("kind", "reversed_"), cases([("left", LEFT), ("right", RIGHT), ("one", ("rear_left_wheel",))], usual=["left"]))
 def test_reversed_wheels_are_corrected_by_a_gyro_alone(tmp_path: Path, kind: str, reversed_: tuple[str, ...]) -> None:
     found = set_up_of(drive(tmp_path / "log.mcap", signs(kind)))
     assert found.robot.joints.reversed == reversed_
@@ -104,6 +104,7 @@ def test_one_side_in_another_unit_is_corrected(tmp_path: Path, side: str, unit: 
     np.testing.assert_allclose(found.robot.geometry.radius_multipliers, multipliers, rtol=1e-6)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("is_gyro", [False, True])
 def test_two_sources_that_contradict_blame_none(tmp_path: Path, is_gyro: bool) -> None:
     names = (*LEFT, *RIGHT) if is_gyro else (*RIGHT, *LEFT)
@@ -130,6 +131,7 @@ def test_an_encoder_that_counts_nothing_is_left_out(tmp_path: Path) -> None:
     assert f"{LEFT[1]} counts nothing while another wheel of its side turns" in found.sentences[0]
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("unit", "name"), [(math.tau / 60.0, "rpm"), (DEG, "deg/s"), (1.0 / 0.165, "m/s")])
 def test_units_of_velocities_alone_are_corrected(tmp_path: Path, unit: float, name: str) -> None:
     found = set_up_of(drive(tmp_path / "log.mcap", scaled(None, unit)))
@@ -170,6 +172,7 @@ def test_positions_that_are_reset_once_are_no_counter(tmp_path: Path) -> None:
     assert set_up_of(drive(tmp_path / "log.mcap", reset)).sentences == ()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("is_first", "since_s", "until_s"), [(True, None, 30.0), (False, 30.0, None)], ids=["until", "since"])
 def test_velocities_that_double_within_a_log_are_named_with_the_time(
     tmp_path: Path, is_first: bool, since_s: float | None, until_s: float | None
@@ -221,6 +224,7 @@ def test_faults_beside_a_lidar_are_found_together(tmp_path: Path, name: str) -> 
     assert (found.verdict, faults(found)) == ("certain", right)
 
 
+@pytest.mark.extended
 def test_gyro_reversed_beside_a_turned_lidar_leaves_the_gyro_open_and_turns_the_lidar(tmp_path: Path) -> None:
     """Left and right exchanged beside a LiDAR upside down turn alike, and gravity measures that the gyro is upright.
 
@@ -243,6 +247,7 @@ def test_lidar_at_the_rear_that_is_described_at_the_front_or_a_robot_whose_front
     assert found.keys == {}
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("degrees", [0.0, 3.0])
 def test_lidar_yaw_of_a_few_degrees_is_kept(tmp_path: Path, degrees: float) -> None:
     assert scanned(tmp_path, Publishing(lidar_yaw=math.radians(degrees))).sentences == ()
@@ -258,6 +263,7 @@ def test_mounts_by_two_rows_have_both_corrections() -> None:
 NO_GYRO = replace(SCANNING, imu_hz=0.0)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("late_s", [0.5, -1.5])
 def test_clock_of_two_sources_that_is_not_the_recorders_is_corrected(tmp_path: Path, late_s: float) -> None:
     found = scanned(tmp_path, Publishing(offsets_s={"/scan": late_s}), NO_GYRO)
@@ -276,6 +282,7 @@ def test_clocks_of_two_sources_are_brought_together(tmp_path: Path) -> None:
     assert found.robot.clock.sigma_s == pytest.approx(0.5, abs=0.04)
 
 
+@pytest.mark.extended
 def test_answers_do_not_depend_on_the_names_of_the_sides(tmp_path: Path) -> None:
     """A fault and its mirror image have the same probability."""
     made: list[Callable[[], SetUp]] = [

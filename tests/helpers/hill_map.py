@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from localization.maps import SpaceMap
-from localization.maps.space_map import in_units
+from localization.maps import KeyframeMap
+from localization.maps.keyframe_map import in_units
 from motion_models import se3
 from motion_models.robot_file import load_robot
 from tests.helpers.hill_scans import MOUNT, Scene, make_scene, scans
@@ -49,12 +49,12 @@ def _standing(pose: np.ndarray, way: np.ndarray) -> HillDrive:
     return HillDrive(load_robot("husky_a200"), {}, [], stamps, positions, np.tile(pose[:3, :3], (n, 1, 1)))
 
 
-def make_map(scene: Scene, way: tuple[tuple[float, float, float], ...] = WAY, sigma: float = 1e-3) -> SpaceMap:
+def make_map(scene: Scene, way: tuple[tuple[float, float, float], ...] = WAY, sigma: float = 1e-3) -> KeyframeMap:
     """Keyframes along ``way``, tied in a row, with covariances of ``sigma`` [m, rad]."""
     poses = np.array([on_hills(*place) for place in way])
     points, counts = in_units([cloud_at(pose, scene, seed) for seed, pose in enumerate(poses)])
     n = len(poses)
-    return SpaceMap(
+    return KeyframeMap(
         stamps_ns=np.arange(n) * 10**9,
         poses=poses,
         covariances=np.tile(sigma**2 * np.eye(6), (n, 1, 1)),

@@ -81,7 +81,7 @@ def _leveled(pose: np.ndarray) -> np.ndarray:
 def _loops(monkeypatch, clouds: list[np.ndarray], poses: np.ndarray, proposed: np.ndarray, sigma: float = 0.3) -> list[CloudLoop]:
     monkeypatch.setattr(cloud_loops, "make_map_closures", lambda cell: _Proposing(se3.inverse(proposed)))
     apart = np.repeat(poses[4:5], _WITHOUT_CLOUD, axis=0)
-    keyframes, keyframe_poses = [*clouds[:5], *[None] * _WITHOUT_CLOUD, *clouds[5:]], np.vstack([poses[:5], apart, poses[5:]])
+    keyframes, keyframe_poses = [*clouds[:5], *[np.empty((0, 3))] * _WITHOUT_CLOUD, *clouds[5:]], np.vstack([poses[:5], apart, poses[5:]])
     return find_loops(keyframes, keyframe_poses, lambda a, b: _cov(b - a, sigma, 0.01), _NOISE_M)
 
 

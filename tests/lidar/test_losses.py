@@ -131,6 +131,7 @@ def test_verdict_without_reference_reports_lost_lidar() -> None:
     assert "Not recommended is ekf with skid_steer: LiDAR lost for 60 %" in text
 
 
+@pytest.mark.extended
 def test_page_with_lost_run_marks_it() -> None:
     runs = [replace(run("skid_steer", "ekf", 0.01), lidar=BRIEFLY), replace(run("diff_drive", "ekf", 0.2, seed=1), lidar=ALL_LOST)]
     text = page(HEAD, score(runs, track()), track())

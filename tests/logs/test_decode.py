@@ -571,6 +571,7 @@ def test_odometry_arcs_are_converted_exactly(steps: list[tuple[float, float]], h
         pose = following
 
 
+@pytest.mark.extended
 def test_husky_wheel_rates_reproduce_its_odometry() -> None:
     """Real log: the recovered wheels, integrated by the driver's geometry, give back the pose that the driver published."""
     robot = load_robot("husky_a200")

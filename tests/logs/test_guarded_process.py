@@ -23,6 +23,7 @@ def _work(jobs: Any, results: Any) -> None:
         results.put(f"done: {job}")
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("job", "is_hanging", "message"),
     [("spin", True, "of CPU time"), ("wait", True, "after 0 s of CPU time"), ("die", False, "died with code 7")],

@@ -77,6 +77,7 @@ def test_hostile_cases_of_one_seed_repeat_and_contain_all_faults() -> None:
     assert all(case.file_fault or case.sensor_fault == "none" or is_affected(case.source, case.sensor_fault) for case in chosen)
 
 
+@pytest.mark.extended
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(form=st.sampled_from(sorted(bags.FORMATS)), changes=fuzz.CHANGES, of_metadata=st.booleans())
 def test_changed_bytes_of_any_log_are_read_or_refused(form: str, changes: list, of_metadata: bool) -> None:

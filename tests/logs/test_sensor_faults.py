@@ -246,6 +246,7 @@ def zeros(message, later: int):
     return bags.joint_state(later, position=(0.0,) * 4, velocity=(0.0,) * 4)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("first", [lambda m: m, rates_only], ids=["angles and rates", "rates"])
 def test_second_publisher_of_rates_only_loses_no_distance(tmp_path: Path, first: Callable) -> None:
     single = wheels_of(opened(tmp_path, [(t, first(m) if t == "/joint_states" else m, s) for t, m, s in drive(20.0)]))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.estimators.map_merge import merge
+from localization.estimators import merge_maps
 from localization.maps.changes import find_changes
 from localization.maps.grid import draw_grid
 from localization.maps.place_search import PlaceMap
@@ -46,7 +46,7 @@ def test_find_changes_names_a_new_box_and_a_missing_one():
 
 def test_merge_of_what_is_new_redraws_changed_places():
     second = floor_plan.make_map(CHANGED, np.vstack([SECOND, SECOND]))
-    found = merge(floor_plan.make_map(), second, 0.02, only_new=True)
+    found = merge_maps(floor_plan.make_map(), second, 0.02, only_new=True)
     assert 5 < found.added < len(second.poses)
     grid = draw_grid(found.map, 0.1)
     assert 100 in cells(grid, 5.85, 5.05)
@@ -55,5 +55,5 @@ def test_merge_of_what_is_new_redraws_changed_places():
 
 @pytest.mark.extended
 def test_merge_of_what_is_new_leaves_out_what_the_map_has():
-    same = merge(floor_plan.make_map(), floor_plan.make_map(poses=SECOND), 0.02, only_new=True)
+    same = merge_maps(floor_plan.make_map(), floor_plan.make_map(poses=SECOND), 0.02, only_new=True)
     assert same.added < 0.2 * len(SECOND)

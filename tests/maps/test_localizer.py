@@ -240,6 +240,7 @@ def test_localizer_back_at_the_border_of_the_map_takes_its_pose_at_once() -> Non
     assert math.hypot(*(localizer.pose[:2] - way[-1, :2])) < 0.03
 
 
+@pytest.mark.extended
 def test_localizer_with_scans_beyond_walls_and_in_free_space_doubts(office: PlaceMap) -> None:
     """As after it was carried unnoticed: 75 % of the points are where the map has nothing, 10 % in free space."""
     localizer = Localizer(office)

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from localization.maps.space_changes import find_gone, without
+from localization.maps.space_changes import find_gone
 from motion_models import se3
 from tests.helpers import hill_map
 from tests.helpers.hills import terrain
@@ -42,7 +42,7 @@ def test_find_gone_returns_cut_trees_alone(scene, mapped) -> None:
     assert of_cut.sum() > 50
     assert gone[of_cut].mean() > 0.8
     assert not (gone & ~near_trees(points, cut)).any()
-    left = without(mapped, gone)
+    left = mapped.without(gone)
     assert left.counts.sum() == len(left.points) == len(points) - gone.sum()
     np.testing.assert_allclose(left.points_in_map(), points[~gone])
 
@@ -55,5 +55,5 @@ def test_find_gone_in_an_unchanged_scene_returns_nothing(scene, mapped) -> None:
 
 
 def test_find_gone_by_a_drive_without_points_returns_nothing(mapped) -> None:
-    empty = without(mapped, np.ones(len(mapped.points), dtype=bool))
+    empty = mapped.without(np.ones(len(mapped.points), dtype=bool))
     assert not find_gone(mapped, empty, _CELL_M).any()

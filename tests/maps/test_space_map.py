@@ -13,10 +13,10 @@ from PIL import Image
 
 from localization.cli import main
 from localization.errors import MapError
-from localization.maps import SavedMap, SpaceMap, load_map, save_map
+from localization.maps import KeyframeMap, SavedMap, load_map, save_map
 from localization.maps.height_slice import HeightSlice, find_ground
+from localization.maps.keyframe_map import POINT_UNIT_M, in_units
 from localization.maps.map_file import PLANAR, SPACE
-from localization.maps.space_map import POINT_UNIT_M, in_units
 from motion_models import se3
 from tests.helpers import hill_map, square_room
 from tests.helpers.hills import terrain
@@ -41,10 +41,10 @@ def file(hills, tmp_path_factory) -> Path:
     return path
 
 
-def test_map_in_space_saved_and_loaded_is_equal_to_the_last_bit(file: Path, hills: SpaceMap, tmp_path: Path) -> None:
+def test_map_in_space_saved_and_loaded_is_equal_to_the_last_bit(file: Path, hills: KeyframeMap, tmp_path: Path) -> None:
     found = load_map(file)
-    assert isinstance(found.map, SpaceMap)
-    for field in dataclasses.fields(SpaceMap):
+    assert found.map.is_in_space
+    for field in dataclasses.fields(KeyframeMap):
         np.testing.assert_array_equal(getattr(found.map, field.name), getattr(hills, field.name))
     save_map(tmp_path / "again.skidmap", found)
     assert (tmp_path / "again.skidmap").read_bytes() == file.read_bytes()
@@ -58,7 +58,7 @@ def test_map_file_has_a_version_of_its_own_in_space_alone(file: Path, tmp_path: 
     for path, version in ((tmp_path / "room.skidmap", PLANAR), (file, SPACE)):
         with zipfile.ZipFile(path) as archive:
             assert json.loads(archive.read("skidmap.json"))["version"] == version
-    assert not isinstance(load_map(tmp_path / "room.skidmap").map, SpaceMap)
+    assert not load_map(tmp_path / "room.skidmap").map.is_in_space
 
 
 def test_clouds_in_units_are_within_half_a_unit_and_far_points_left_out() -> None:
@@ -77,13 +77,13 @@ def test_clouds_in_units_are_within_half_a_unit_and_far_points_left_out() -> Non
         ("sensors", np.zeros((9, 2))),
     ],
 )
-def test_save_of_a_map_in_space_that_is_none_is_refused(hills: SpaceMap, tmp_path: Path, name: str, bad: np.ndarray) -> None:
+def test_save_of_a_map_in_space_that_is_none_is_refused(hills: KeyframeMap, tmp_path: Path, name: str, bad: np.ndarray) -> None:
     with pytest.raises(MapError, match=name):
         save_map(tmp_path / "bad.skidmap", SavedMap(dataclasses.replace(hills, **{name: bad}), {}))
     assert not list(tmp_path.iterdir())
 
 
-def test_load_of_damaged_and_cut_maps_in_space_raises_map_errors(hills: SpaceMap, tmp_path: Path) -> None:
+def test_load_of_damaged_and_cut_maps_in_space_raises_map_errors(hills: KeyframeMap, tmp_path: Path) -> None:
     few = dataclasses.replace(hills, points=hills.points[:0], counts=0 * hills.counts)
     path, rng = tmp_path / "few.skidmap", random.Random(0)
     save_map(path, SavedMap(few, {}))
@@ -99,7 +99,7 @@ def test_load_of_damaged_and_cut_maps_in_space_raises_map_errors(hills: SpaceMap
         assert k < 40, "a file that is cut off gave a map"
 
 
-def test_covariance_of_a_map_in_space_is_that_of_the_nearest_keyframe(hills: SpaceMap) -> None:
+def test_covariance_of_a_map_in_space_is_that_of_the_nearest_keyframe(hills: KeyframeMap) -> None:
     """Of a keyframe's heading, off by a milliradian, a pose two metres ahead is off by two millimetres to the left."""
     covs = np.zeros((len(hills.poses), 6, 6))
     covs[4, 5, 5] = 1e-6
@@ -108,7 +108,7 @@ def test_covariance_of_a_map_in_space_is_that_of_the_nearest_keyframe(hills: Spa
     np.testing.assert_allclose(np.sqrt(np.diagonal(turned.cov_at(pose))), [0.0, 4e-4, 0.0, 0.0, 0.0, 1e-3], atol=1e-12)
 
 
-def test_ground_below_a_cloud_is_that_of_the_hills(hills: SpaceMap) -> None:
+def test_ground_below_a_cloud_is_that_of_the_hills(hills: KeyframeMap) -> None:
     """Between rings, too, and below trees and walls: where nine keyframes have seen it, it is within decimetres."""
     at = np.random.default_rng(2).uniform(-8.0, 8.0, (400, 2))
     points = np.column_stack([at, terrain(at[:, 0], at[:, 1])])
@@ -117,7 +117,7 @@ def test_ground_below_a_cloud_is_that_of_the_hills(hills: SpaceMap) -> None:
     assert np.quantile(np.abs(off), 0.95) < 0.2
 
 
-def test_slice_has_trees_and_walls_and_ground_between_is_free(hills: SpaceMap, scene) -> None:
+def test_slice_has_trees_and_walls_and_ground_between_is_free(hills: KeyframeMap, scene) -> None:
     found = HeightSlice(hills)
     grid = found.grid(0.1)
     walls = found.keyframes.points_in_map()
@@ -130,14 +130,14 @@ def test_slice_has_trees_and_walls_and_ground_between_is_free(hills: SpaceMap, s
     assert (grid.cells == 100).sum() > 200
 
 
-def test_slice_where_nothing_stands_and_heights_that_are_none_are_named(hills: SpaceMap) -> None:
+def test_slice_where_nothing_stands_and_heights_that_are_none_are_named(hills: KeyframeMap) -> None:
     with pytest.raises(MapError, match="nothing stands between 40 and 50 m"):
         HeightSlice(hills, (40.0, 50.0))
     with pytest.raises(MapError, match="no range above the ground"):
         HeightSlice(hills, (1.0, 0.5))
 
 
-def test_map_commands_of_a_map_in_space(file: Path, hills: SpaceMap, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_map_commands_of_a_map_in_space(file: Path, hills: KeyframeMap, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "info", str(file), "--json", str(tmp_path / "info.json")]) == 0
     assert "9 keyframes in space" in capsys.readouterr().out
     assert len(json.loads((tmp_path / "info.json").read_text())["size_m"]) == 3

@@ -120,6 +120,7 @@ def printed(page: str) -> str:
     return page.replace("@media screen", "@media (width < 0)").replace("@media print", "@media screen")
 
 
+@pytest.mark.extended
 def test_printed_page_has_still_figures_and_no_controls(tmp_path: Path):
     script = """const shown = query => [...document.querySelectorAll(query)].map(e => getComputedStyle(e).display !== "none");
     found.still = shown("section.static"); found.drawn = shown(".explorer"); found.filters = shown("input.filter");

@@ -100,6 +100,7 @@ def test_explorer_data_has_times_without_a_matched_scan():
     assert data["reference"]["t"][-1] == pytest.approx(40.0)
 
 
+@pytest.mark.extended
 def test_static_page_has_no_script():
     found, reference = results()
     assert "<script" not in page(HEAD, found, reference, is_interactive=False)
@@ -114,6 +115,7 @@ def test_explorer_data_has_errors_aligned_at_the_start():
     assert plain["position"][-1] == pytest.approx(1.0, abs=0.02)  # half of that where the whole path is aligned
 
 
+@pytest.mark.extended
 def test_explorer_run_that_diverged_does_not_set_the_scale():
     found, reference = results()
     far = dataclasses.replace(found[0].run, trajectory=Trajectory(STAMPS, POSES * [100.0, 1, 1], None))
@@ -121,6 +123,7 @@ def test_explorer_run_that_diverged_does_not_set_the_scale():
     assert borders["x"][1] < 40.0
 
 
+@pytest.mark.extended
 def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     found, reference = results()
     seen = run_in_page(page(HEAD, found, reference), PROBE, tmp_path, "--window-size=390,900")

@@ -61,6 +61,7 @@ def test_summary_of_covariances_too_large_takes_the_errors_found():
     assert "% less than dead reckoning" in text
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("jitter_m", "drift_m", "expected"), [(0.1, 0.0, "consistent"), (0.0, 0.6, "overconfident"), (0.1, 1.2, "overconfident")]
 )

@@ -397,6 +397,7 @@ def test_serialize_does_not_write_shared_objects():
     assert deserialize(*serialize([pair, model], {"model": model}), {"model": model})[1] is model
 
 
+@pytest.mark.extended
 def test_checkpoint_killed_at_any_moment_is_whole(tmp_path):
     """kill -9, twenty times, while states of a megabyte are written one after another."""
     path, rng = tmp_path / "state", np.random.default_rng(0)

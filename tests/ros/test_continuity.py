@@ -101,6 +101,7 @@ def started(transport: TimedTransport, estimator: str = "ekf", files: Files | No
     return node, reports
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("compiled_at_s", [6.0, pytest.param(13.0, marks=pytest.mark.extended)])
 def test_tf_of_a_node_that_compiles_on_the_way_has_no_jump(compiled_at_s):
     transport = TimedTransport(drive_log())
@@ -120,6 +121,7 @@ def lose(topic: str, begin_s: float, end_s: float):
     return spoil
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("graph", marks=pytest.mark.extended)])
 def test_tf_of_a_lidar_that_is_lost_and_found_has_no_jump(estimator):
     transport = TimedTransport(drive_log(), lose("/scan", 4.0, 12.0))
@@ -128,6 +130,7 @@ def test_tf_of_a_lidar_that_is_lost_and_found_has_no_jump(estimator):
     settled(transport)
 
 
+@pytest.mark.extended
 def test_estimates_of_a_lidar_that_is_found_jump():
     """Else the test above could not fail."""
     transport = TimedTransport(drive_log(), lose("/scan", 4.0, 12.0))
@@ -137,6 +140,7 @@ def test_estimates_of_a_lidar_that_is_found_jump():
     assert off[:, :2].max() > 0.02
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("compiled_at_s", [pytest.param(0.0, marks=pytest.mark.extended), 9.0])
 def test_tf_through_a_gap_of_the_wheels_goes_on(compiled_at_s):
     """Interim odometry, too: its pose is uncertain by the gap, and it does not end."""
@@ -149,6 +153,7 @@ def test_tf_through_a_gap_of_the_wheels_goes_on(compiled_at_s):
     settled(transport)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("estimator", "topic", "data"),
     [
@@ -169,6 +174,7 @@ def test_tf_of_a_node_that_begins_anew_has_no_jump(estimator, topic, data):
     settled(transport)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("compiled_at_s", [0.0, pytest.param(4.0, marks=pytest.mark.extended)])
 def test_tf_of_a_node_that_is_resumed_has_no_jump(compiled_at_s, tmp_path: Path):
     def rest(messages):
@@ -219,6 +225,7 @@ def test_tf_of_a_node_that_finds_its_wheels_reversed_has_no_jump(tmp_path: Path)
     check_continuity(transport, is_rewired=True)
 
 
+@pytest.mark.extended
 def test_tf_of_a_node_that_loads_another_map_has_no_jump(tmp_path: Path):
     log = open_log(drive_log(), ROBOT)
     keyframes = replay(log.events(), [Trial(make_model("skid_steer", ROBOT), "graph")], ROBOT, log.mounts, True)[0].keyframes

@@ -62,6 +62,7 @@ def test_dashboard_sends_the_whole_drive_to_a_late_page(served):
     assert min(len(content["map"][0]), len(content["scan"][0])) > 100
 
 
+@pytest.mark.extended
 def test_dashboard_page_draws_the_drive_in_a_browser(served, tmp_path):
     dashboard, _ = served
     if CHROMIUM is None:

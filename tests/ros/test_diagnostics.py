@@ -121,7 +121,7 @@ def _wheels(count: int, first_ns: int = 0, period_ns: int = 20_000_000) -> list[
     return [WheelSample(first_ns + i * period_ns, np.zeros(2), np.zeros(2)) for i in range(count)]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_doctor_tyres_differ_reports_remedy(tmp_path: Path) -> None:
     robot = load_robot("husky_a200")
     sensors = SensorConfig(scanner=ScannerConfig(rate_hz=5.0, beams=121))

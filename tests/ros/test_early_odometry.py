@@ -7,6 +7,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
 from localization.logs.topic_roles import TopicOverrides
 from localization.pipeline import Trial
@@ -43,6 +44,7 @@ def test_early_odometry_imports_no_package_of_the_estimator() -> None:
     assert done.stdout == "[]\n"
 
 
+@pytest.mark.extended
 def test_early_odometry_is_taken_over_and_no_message_is_lost() -> None:
     config = NodeConfig(wait_s=0.0)
     run = LiveRun(ROBOT, lambda has_lidar: Trial(make_model("skid_steer", ROBOT), "ekf"), node=config)

@@ -105,7 +105,7 @@ def test_state_on_disk_is_never_older_than_a_second(tmp_path, monkeypatch):
     session.close()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_online_killed_twice_and_resumed_writes_the_same_bytes(replayed, killed, tmp_path, capsys):
     shutil.copytree(killed, tmp_path, dirs_exist_ok=True)
     kill_after(tmp_path, read_head(tmp_path / "state")["events"] + 50)  # written by this process, not left by the one before
@@ -131,7 +131,7 @@ def test_output_that_a_killed_run_left_is_replaced(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["fused.mcap"]
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_online_stopped_by_sigterm_leaves_its_last_state(replayed, tmp_path, capsys):
     process = start(tmp_path, "1")
     wait_for_state(tmp_path, process, 100)
@@ -148,7 +148,7 @@ def test_online_stopped_by_sigterm_leaves_its_last_state(replayed, tmp_path, cap
     assert (tmp_path / "fused.mcap").read_bytes() == (replayed / "fused.mcap").read_bytes()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_online_stopped_without_a_state_writes_its_estimates(replayed, tmp_path):
     out, estimate_log = tmp_path / "a.tum", tmp_path / ".a.tum.part"
     options = ("--robot", "vaultbot", "--rate", "2", "--out", out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from unittest import mock
 
 import numpy as np
+import pytest
 
 from localization.pipeline import Trial
 from localization.ros import node as node_module
@@ -27,6 +28,7 @@ class LateTransport(LogTransport):
         return found
 
 
+@pytest.mark.extended
 def test_node_that_compiles_reckons_by_wheels_and_then_loses_no_scan():
     first = LateTransport(drive_log())
     run_node(first)

@@ -37,6 +37,7 @@ def status(transport: LogTransport, name: str):
     return found
 
 
+@pytest.mark.extended
 def test_lidar_of_another_name_is_used_as_in_a_log():
     transport = with_types(LogTransport(drive_log(scans_hz=6.25), renamed), OTHER)
     node, reports = run_node(transport)
@@ -77,6 +78,7 @@ def test_lidar_left_out_by_an_option_is_no_error():
     assert status(transport, "lidar").level == OK
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("topic", ["/scan", pytest.param("/imu/data", marks=pytest.mark.extended)])
 def test_topic_that_is_published_late_is_used_from_there_on(topic):
     """Without a jump, as far as its map goes back."""
@@ -104,6 +106,7 @@ def test_topic_that_is_published_late_is_used_from_there_on(topic):
     assert len(published(transport, PREDICTED_ODOMETRY)) > 900
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("is_beside_arms", [False, True])
 def test_wheels_of_a_drivers_own_message_are_used_live(is_beside_arms):
     """The same poses as by joint states; also where these have the arms alone."""

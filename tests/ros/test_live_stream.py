@@ -71,6 +71,7 @@ def _wrapped(difference):
     return np.array([difference[0], difference[1], math.remainder(difference[2], math.tau)])
 
 
+@pytest.mark.extended
 def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
     robot = dataclasses.replace(ROBOT, clock=dataclasses.replace(ROBOT.clock, gyro_rate_error=0.01))
     assert not notes_on_clocks(ROBOT.clock)
@@ -79,6 +80,7 @@ def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
     assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it; synchronize the clocks."]
 
 
+@pytest.mark.extended
 def test_live_node_names_a_topic_whose_stamps_are_off_the_times_of_receiving():
     """By more than turns are searched for."""
 
@@ -112,6 +114,7 @@ def test_live_node_gives_the_numbers_of_a_replay(calm):
     assert node.warnings() == []
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     "topic", ["/scan", pytest.param("/joint_states", marks=pytest.mark.extended), pytest.param("/imu/data", marks=pytest.mark.extended)]
 )
@@ -215,6 +218,7 @@ def restamped(message, shift_ns, kinds={"/scan": "LaserScan", "/joint_states": "
     return message._replace(data=encode(content))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("jump_s", [500.0, -0.9, pytest.param(3.0, marks=pytest.mark.extended)])
 def test_clock_jump_of_all_sensors_moves_the_pose_within_sigma(jump_s, calm):
     """Set forward and back: the pose hardly notices, and what is published bears the sender's new stamps.
@@ -237,6 +241,7 @@ def test_clock_jump_of_all_sensors_moves_the_pose_within_sigma(jump_s, calm):
     assert np.all(np.abs(_wrapped(found[0] - truth[0])) < most)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", ["ekf", pytest.param("graph", marks=pytest.mark.extended)])
 def test_burst_after_a_silent_network_leaves_the_clocks(estimator):
     """For six seconds nothing comes, then all that its queues could keep: of wheels and IMU the newer half."""
@@ -283,6 +288,7 @@ def test_sensor_that_vanishes_and_returns_is_used_again(topic, calm):
     assert node.session.pipeline.estimator.counts()["matched"] > 75
 
 
+@pytest.mark.extended
 def test_batch_s_ends_shortly_before_the_next_scan(calm):
     """They are looked at once before it is due; at once when it is late, or if there is no LiDAR."""
     stream = calm[1].inputs.stream
@@ -300,6 +306,7 @@ def test_batch_s_ends_shortly_before_the_next_scan(calm):
     assert node.inputs.stream.batch_s(node.inputs.stream.topic_rates["/joint_states"].last_ns) == 0.0
 
 
+@pytest.mark.extended
 def test_batch_s_is_zero_while_a_scan_waits_for_the_wheels():
     """A scan that is ahead of the wheels is used with the very next message that they send."""
     node, _ = run_node(LogTransport(drive_log(scans_hz=6.25)))
@@ -358,6 +365,7 @@ def lidar_statuses(transport):
     return [s for m in published(transport, DIAGNOSTICS) for s in m.status if s.name == "skidloc: lidar"]
 
 
+@pytest.mark.extended
 def test_lidar_without_a_mount_is_an_error_until_its_place_is_found():
     lost = LogTransport(drive_log(scans_hz=6.25), silenced("/tf_static", 0.0, 99.0))
     node, reports = run_node(lost)
@@ -371,6 +379,7 @@ def test_lidar_without_a_mount_is_an_error_until_its_place_is_found():
     assert place in node.warnings()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("estimator", cases(["ekf", "graph"], ("ekf",)))
 def test_late_transforms_are_used_from_then_on(estimator, tmp_path):
     calm, late = undisturbed(estimator)[0], LogTransport(drive_log(scans_hz=6.25), late_transforms)
@@ -507,6 +516,7 @@ def test_node_killed_and_resumed_continues_its_pose(tmp_path, calm):
     assert 20 < node.finish() < 0.4 * len(a)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("left", ["nothing", "half", "hidden files"])
 def test_files_of_a_killed_run_do_not_stop_a_live_node(tmp_path, left):
     """State and estimates that do not fit each other, as after a power cut, and hidden files of any kind."""
@@ -586,6 +596,7 @@ def with_transform(parent, child):
     return spoil
 
 
+@pytest.mark.extended
 def test_second_publisher_of_the_transform_is_reported():
     transport = LogTransport(drive_log(scans_hz=6.25), with_transform("odom", "base_link"), {"/tf": "tf2_msgs/msg/TFMessage"})
     node, reports = run_node(transport)
@@ -629,6 +640,7 @@ def test_estimate_of_a_graph_is_published_as_odometry_and_correction(frames):
     np.testing.assert_allclose(se2.compose(planar(tf[2]), planar(tf[1])), pose, atol=1e-12)
 
 
+@pytest.mark.extended
 def test_odometry_of_a_graph_is_published_without_its_corrections():
     """Live: the published chain map -> odom -> base_link ends where the graph's estimates are."""
     transport, log = undisturbed("graph")[0], open_log(drive_log(scans_hz=6.25), ROBOT)
@@ -646,6 +658,7 @@ def planar(stamped):
     return np.array([place.x, place.y, 2.0 * math.atan2(turn.z, turn.w)])
 
 
+@pytest.mark.extended
 def test_names_and_frames_apply_to_all_publications():
     """In a namespace, with a remapped scan: other topics and frames, the same estimates."""
     names = Names("rover", "/team", ("scan:=/front/scan", "~/odometry:=odom"))

@@ -48,6 +48,7 @@ def calm():
     return track(transport)
 
 
+@pytest.mark.extended
 def test_set_pose_in_odom_continues_from_that_pose_and_covariance(calm):
     cov = np.diag([0.04, 0.01, 0.0025])
     transport, _, reports = commanded("ekf", "/set_pose", pose_message([5.0, -3.0, 1.0], "odom", cov))
@@ -73,6 +74,7 @@ def test_initialpose_moves_the_map_and_leaves_odom_without_a_jump():
     assert node.session.state.start.map_T_start == pytest.approx([5.0, -3.0, 1.0])
 
 
+@pytest.mark.extended
 def test_set_pose_with_wrong_content_is_ignored_with_a_reason(calm):
     wrong = {
         pose_message([0.0, 0.0, 0.0], "map"): "its frame is 'map', and this estimator has odom",
@@ -127,6 +129,7 @@ def test_reset_of_a_graph_sets_the_map_frame_to_the_robot():
     np.testing.assert_allclose(se2.compose(estimate.map_T_odom, estimate.odometry[0]), estimate.pose, atol=1e-9)
 
 
+@pytest.mark.extended
 def test_tare_payload_discards_corrections_and_keeps_the_pose(calm):
     transport, node, replies, _ = serviced("/skidloc/tare_payload", True)
     assert replies[0].is_success
@@ -138,6 +141,7 @@ def test_tare_payload_discards_corrections_and_keeps_the_pose(calm):
     assert node.session.count > 2000
 
 
+@pytest.mark.extended
 def test_pause_publishes_nothing_until_it_is_continued():
     transport, node, replies, _ = serviced("/skidloc/pause", True, False)
     assert [reply.message for reply in replies] == ["paused", "continued"]
@@ -162,6 +166,7 @@ def payload_message(frame, mass, position=(0.0, 0.0, 0.0)):
     return encode(make("geometry_msgs/msg/InertiaStamped", header=header, inertia=inertia))
 
 
+@pytest.mark.extended
 def test_payload_on_its_topic_moves_the_cg_until_it_is_tared(tmp_path):
     """By the topic; the state on disk holds it too."""
     files = Files(state=tmp_path / "state")

@@ -232,6 +232,7 @@ def test_predictions_that_nobody_receives_are_not_written():
     assert len(transforms) == len([m for m in published(transport, ODOMETRY) if stamp_of(m) > late]) > 100
 
 
+@pytest.mark.extended
 def test_predicted_odometry_without_readers_is_left_out_beside_transforms(driven):
     transport = LogTransport(drive_log())
     transport.has_readers = lambda topic: topic == TF

@@ -110,6 +110,7 @@ def outdoor_log(tmp_path_factory):
     return path
 
 
+@pytest.mark.extended
 def test_live_fixes_give_the_map_its_heading_and_place_in_utm(outdoor_log, monkeypatch):
     """The map begins at the start of the drive: its pose east and north of the datum is that of the start, about the antenna's arm."""
     datum = np.array([GpsConfig().latitude_deg, GpsConfig().longitude_deg])
@@ -150,6 +151,7 @@ def test_filtered_fixes_and_services_place_the_map_on_the_earth(outdoor_log):
     assert [back["latitude"], back["longitude"]] == pytest.approx([last.latitude, last.longitude], abs=1e-9)
 
 
+@pytest.mark.extended
 def test_place_on_the_earth_is_no_number_without_positions():
     transport = LogTransport(drive_log())
     _, reports = run_node(transport)

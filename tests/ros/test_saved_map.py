@@ -93,6 +93,7 @@ def test_node_relocalize_searches_again_and_offers_amcls_service(places: PlaceMa
     assert not transport.services["/skidloc/save_map"]("of_a_map").is_success
 
 
+@pytest.mark.extended
 def test_node_save_map_writes_the_graphs_map_and_nothing_over_a_file(tmp_path) -> None:
     name = str(tmp_path / "live.2026-11-26")
     transport = send("/skidloc/save_map", encode(make("std_msgs/msg/String", data=name)), 12.0)

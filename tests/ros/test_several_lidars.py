@@ -75,6 +75,7 @@ def test_node_has_a_status_for_each_scanner_and_estimates_by_one():
     ]
 
 
+@pytest.mark.extended
 def test_silent_scanner_leaves_the_estimate_to_the_other():
     """Within a centimetre of the drive by the front scanner alone."""
 
@@ -138,6 +139,7 @@ def test_lidar_alone_is_always_used():
     assert not choice.lidars
 
 
+@pytest.mark.extended
 def test_newest_scan_wins_where_the_processor_is_too_slow():
     transport = LogTransport(drive_log(scans_hz=6.25))
     transport.types = {topic: kind for topic, kind in transport.types.items() if kind != SCAN or topic == "/scan"}
@@ -222,7 +224,7 @@ def test_points_of_a_known_mount_are_part_of_the_sweep_at_their_own_times():
     assert correction.pose[2] == pytest.approx(math.radians(1.0), rel=0.3)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_rear_scanner_that_is_turned_by_a_degree_is_measured(tmp_path):
     """A narrow view in four rooms: the mount is measured within 3 sigma, and the position errs no more than by the front scanner alone."""
     scanner = ScannerConfig(field_of_view_deg=100.0, beams=201, max_range_m=8.0)

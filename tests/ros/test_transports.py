@@ -33,6 +33,7 @@ def played_at(rate):
     return LogTransport(drive_log(), spoil, {CLOCK: CLOCK_TYPE})
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("rate", [pytest.param(0.1, marks=pytest.mark.extended), 10.0])
 def test_estimates_by_sim_time_are_the_same_at_any_rate(rate):
     calm, transport = LogTransport(drive_log()), played_at(rate)

@@ -50,6 +50,7 @@ def test_place_of_the_time_of_the_fault_shows_nothing() -> None:
     assert faults.inflation.total[0, 0] == 25.0
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("begin", "end"), [(0.3, 0.6), pytest.param(0.0, 2.0, marks=pytest.mark.extended)], ids=["for a while", "always"])
 def test_wheels_in_rpm_leave_pose_and_covariance_of_a_lidar(begin: float, end: float) -> None:
     """Angles 9.55 times too large for some 12 s: the pose is known again at the end, and the covariance is that of the scans."""

@@ -87,6 +87,7 @@ def test_pose_that_people_at_rest_have_moved_is_in_the_covariance() -> None:
     assert not outcome.is_wrong, outcome.least_consistent
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("has_gyro", cases([True, False], usual=["False"]))
 def test_distance_from_the_wheels_stays_in_the_covariance_in_turns(has_gyro: bool) -> None:
     """A LiDAR with a wrong yaw agrees with wheels that turn in place; it is found later, on a straight way."""

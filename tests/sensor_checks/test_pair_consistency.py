@@ -47,6 +47,7 @@ def test_healthy_drive_is_not_reported(robot: str, model: str) -> None:
     assert run(without_lidar(robot), None, model).warnings == []
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", cases(faults_of_turns(), usual=["gyro saturated at 20 deg/s"]))
 def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> None:
     drive = without_lidar("husky_a200")
@@ -60,6 +61,7 @@ def test_fault_without_a_lidar_is_reported_and_in_the_covariance(name: str) -> N
     assert error < max(3.0 * sigma, 0.1)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", cases(faults_of_stamps(), usual=["wrong sign of time_increment"]))
 def test_wrong_stamps_of_scans_are_reported_and_in_the_covariance(name: str) -> None:
     outcome = run(in_room(), faults_of_stamps()[name])

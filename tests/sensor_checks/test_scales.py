@@ -76,6 +76,7 @@ def test_scale_that_a_named_fault_explains_is_reported_no_more(faults: FaultLog)
     assert faults.path.scale == 0.0
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("factor", cases([1.1, 0.9], usual=["1.1"]))
 def test_ranges_of_another_scale_are_in_the_covariance(factor: float) -> None:
     outcome = run(in_room(), scale_ranges(factor))
@@ -85,6 +86,7 @@ def test_ranges_of_another_scale_are_in_the_covariance(factor: float) -> None:
     assert SCALES_APART in outcome.pipeline.checks.found
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("factor", cases([1.03, 0.97], usual=["1.03"]))
 def test_ranges_that_are_off_by_less_than_is_named_are_in_the_covariance(factor: float) -> None:
     outcome = run(in_room(seed=2), scale_ranges(factor))
@@ -104,6 +106,7 @@ def test_wheels_of_another_radius_leave_the_pose_of_a_lidar() -> None:
     assert SCALES_APART not in outcome.pipeline.checks.found
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
 def test_wheels_of_another_radius_are_in_the_covariance_without_a_lidar(factor: float) -> None:
     """Nothing measures ways there."""

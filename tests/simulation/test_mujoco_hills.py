@@ -31,6 +31,7 @@ def test_hills_robot_that_speeds_up_does_not_lead_its_wheels() -> None:
     assert 0.0 < behind / _SPEED < 0.002
 
 
+@pytest.mark.extended
 def test_hills_wheels_measure_the_rates_by_which_their_angles_change() -> None:
     """Over hills, where the wheels' loads change: angles and the integral of the rates are within a step of the simulator, 1 ms. By set
     points that changed at the samples alone they were 9 ms apart."""

@@ -64,6 +64,7 @@ def test_mujoco_healthy_robot_turns_as_the_friction_model(name: str) -> None:
     assert abs(turned) < 1e-3
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["husky_a200", "jackal"])
 def test_mujoco_robot_that_speeds_up_does_not_lead_its_wheels(name: str) -> None:
     """It stays behind them by the slip that pushes it. By an integrator that is implicit in the servos' damping MuJoCo's contacts expected
@@ -95,6 +96,7 @@ def test_mujoco_smaller_left_wheels_turn_left() -> None:
     assert turned == pytest.approx(predicted[2], rel=0.1)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("drift", [0.03, -0.03])
 def test_mujoco_wheels_that_grow_roll_farther(drift: float) -> None:
     """By the last phase they have grown by all of it."""

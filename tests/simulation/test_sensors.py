@@ -211,6 +211,7 @@ def encoders(counts=4096, late=0.0, lost=0.0, rate=50.0):
     return EncoderSensor(EncoderConfig(rate, counts), ROBOT, MassDistribution(ROBOT), late, lost, 10**9, np.random.default_rng(3))
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("rate", "counts"), [(50.0, 64), (100.0, 4096), (200.0, 64)])
 def test_encoders_any_rate_count_the_wheel_angle(rate, counts):
     track = moving_track(seconds=10.0)

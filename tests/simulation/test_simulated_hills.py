@@ -56,7 +56,7 @@ def test_motion_over_ground_is_the_twist_in_the_bodys_plane(heading):
     assert se3.rotation_vector(R.T @ S)[2] / h == pytest.approx(0.9, abs=1e-4)
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_planar_scanner_on_hills_leaves_the_ground_out(tmp_path, monkeypatch):
     """Most beams hit the ground: with them the estimate goes where the ground seems to go, and healthy sensors are accused."""
     config = SimulationConfig(experiment=ExperimentConfig(laps=1))

@@ -21,7 +21,7 @@ import numpy as np
 from localization.estimators import PriorMap
 from localization.events import Event, Scan
 from localization.log_replay import replay
-from localization.maps import SpaceMap
+from localization.maps import KeyframeMap
 from localization.maps.space_localizer import SpaceLocalizer, SpaceMotion
 from localization.maps.space_places import SpacePlaces
 from localization.pipeline import Pipeline, Trial
@@ -72,15 +72,15 @@ def halves(made: HillDrive, clouds: list[Scan]) -> tuple[list[Event], list[Event
     return [e for e in events if e.stamp_ns < middle], [e for e in events if e.stamp_ns >= middle]
 
 
-def map_of(made: HillDrive, events: list[Event]) -> SpaceMap:
+def map_of(made: HillDrive, events: list[Event]) -> KeyframeMap:
     """The map of the graph."""
     trial = Trial(make_model("skid_steer", made.robot), "graph")
     (run,) = replay(events, [trial], made.robot, {**made.mounts, "lidar_link": MOUNT}, True, IN_SPACE)
-    assert isinstance(run.keyframes, SpaceMap)
+    assert run.keyframes is not None
     return run.keyframes
 
 
-def localize(made: HillDrive, mapped: SpaceMap, events: list[Event], rng: np.random.Generator) -> Localized:
+def localize(made: HillDrive, mapped: KeyframeMap, events: list[Event], rng: np.random.Generator) -> Localized:
     """The drive of ``events`` in ``mapped``, from a pose that is off by `_SIGMAS`."""
     places = SpacePlaces(mapped, IN_SPACE.estimator.lidar.range_noise_m)
     map_T_world = _upright(mapped.poses[0]) @ se3.inverse(_upright(true_poses(made, mapped.stamps_ns[:1])[0]))
@@ -138,7 +138,7 @@ def print_starts(name: str, places: SpacePlaces, found: Localized, n: int, is_fo
         )
 
 
-def mirrored(mapped: SpaceMap) -> SpaceMap:
+def mirrored(mapped: KeyframeMap) -> KeyframeMap:
     """``mapped`` as in a mirror, y to the right: a place that no robot stands in."""
     flip = np.diag([1.0, -1.0, 1.0, 1.0])
     return replace(mapped, poses=flip @ mapped.poses @ flip, points=mapped.points * np.array([1, -1, 1], dtype=np.int16))
@@ -165,7 +165,7 @@ def main() -> None:
     given = parser.parse_args()
     print("drives: | seed, scene | first after [s] | localized since [%] | error, median / p95 / largest [m] | NEES (6 expected) |")
     print("starts: | seed, scene | map | pose | starts | localized | wrong | highest probability | s of CPU |")
-    before: SpaceMap | None = None
+    before: KeyframeMap | None = None
     for scene, seeds in (("trees and walls", given.trees), ("open grass", given.grass)):
         for seed in range(*map(int, seeds.split(":"))):
             made = with_accelerometer_bias(drive(Wander(seed), given.seconds, seed=seed), seed)

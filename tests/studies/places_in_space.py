@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from localization.maps import SpaceMap
+from localization.maps import KeyframeMap
 from localization.maps.place_probability import sigmoid
 from localization.maps.space_localizer import WEIGHTS, SpaceLocalizer, SpaceMotion
 from localization.maps.space_places import SpacePlace, SpacePlaces
@@ -48,7 +48,7 @@ class Found(NamedTuple):
 class Recorded(SpacePlaces):
     """A map that keeps the best place of each search."""
 
-    def __init__(self, mapped: SpaceMap) -> None:
+    def __init__(self, mapped: KeyframeMap) -> None:
         super().__init__(mapped, _RANGE_NOISE_M)
         self.best: list[SpacePlace] = []
 
@@ -73,7 +73,7 @@ def changed(scene: Scene, other: Scene, share: float) -> Scene:
     return replace(scene, trees=np.vstack([scene.trees[n:], other.trees[:n]]))
 
 
-def mirrored(mapped: SpaceMap) -> SpaceMap:
+def mirrored(mapped: KeyframeMap) -> KeyframeMap:
     """A place that no robot stands in."""
     flip = np.diag([1.0, -1.0, 1.0, 1.0])
     return replace(mapped, poses=flip @ mapped.poses @ flip, points=mapped.points * np.array([1, -1, 1], dtype=np.int16))

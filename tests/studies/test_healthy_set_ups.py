@@ -13,7 +13,7 @@ from tests.studies.healthy_set_ups import KINDS, check, check_window, seed_of
 if importlib.util.find_spec("localization.evidence") is None:
     pytest.skip("the inference of set-ups is not there", allow_module_level=True)
 
-USUAL = ["encoder of 90 to 200 counts", "circles one way", "turns less at speed", "short range", "load that moves"]
+USUAL = ["encoder of 90 to 200 counts", "turns less at speed", "load that moves"]
 SOURCES = {
     "short range": ("wheels", "gyro", "lidar"),
     "load that moves": ("wheels", "gyro", "lidar"),

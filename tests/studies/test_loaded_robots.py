@@ -15,7 +15,7 @@ from tests.studies.loaded_robots import MINUTE
 from tests.studies.weigh import simulation_of
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_load_beside_the_middle_changes_no_unit_of_the_wheels(tmp_path: Path) -> None:
     """Its centre of rotation is 0.2 m to the side: in arcs to the left the robot goes farther than its wheels roll, and "the wheels' rates
     are 1.25 times too small since t = 14 s" had 0.995."""

@@ -14,6 +14,7 @@ _drawn = cache(lambda source: drawn(1, source))
 _healthy = cache(lambda source: read(_drawn(source)[1], _drawn(source)[0], None, is_judged=False)[0])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("form", cases(FORMS, usual=USUAL, ids=[form.id for form in FORMS]))
 def test_form_of_messages_is_read_as_before(form: Form) -> None:
     robot, records = _drawn(form.source)

@@ -32,7 +32,7 @@ def test_rotations_by_scan_matching_reproduce_the_regressions(measured):
     assert np.abs(z).max() < 3.0
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.xdist_group("simulated_grid")
 def test_rotations_by_scan_matching_are_within_their_sigmas(measured):
     """Against the vehicle at constant rates: what is left is measurement. 68 values of each: the RMS of z is 1 to within 0.3 or smaller."""

@@ -8,7 +8,7 @@ from tests.studies.buildings import BUILDINGS, track_errors
 from tests.studies.thinned import thinned
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_sparse_scans_of_a_building_accuse_no_part_of_the_robot() -> None:
     """One scan a second: walls that had the same range in four scans were taken for the robot itself, and the error was 3.9 m."""
     drive = thinned(BUILDINGS["csail"].open(), 1.0)

@@ -132,7 +132,7 @@ def test_contact_law_slides_downhill_as_the_friction_model_on_a_slope(heading: f
     assert along @ pose[:2] > 0.03
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_slope_of_a_ramp_is_found_at_the_start_of_each_window(tmp_path: Path) -> None:
     path = tmp_path / "ramp.mcap"
     assert main(["simulate", "ramp", "--robot", "husky_a200", "--seed", "5", "--out", str(path)]) == 0

@@ -50,11 +50,13 @@ def test_spoiled_number_is_named_alone_with_its_true_value(field: str) -> None:
     assert result.mended.is_better
 
 
+@pytest.mark.extended
 def test_numbers_of_an_untouched_file_are_not_named() -> None:
     """Odds of 20 to 1 twice: of 12 drives less than one would name any."""
     assert [seed for seed in range(12) if searched(seed).findings] == []
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", range(40, 44))
 def test_two_spoiled_numbers_are_both_named_and_no_third(seed: int) -> None:
     numbers = drawn_numbers(TRUE, np.random.default_rng(seed), 2, ["radius_scale", "cg_x_m", "cg_y_m", "mu_ratio", "servo_gain"])
@@ -62,6 +64,7 @@ def test_two_spoiled_numbers_are_both_named_and_no_third(seed: int) -> None:
     assert {f.best.field for f in findings} == set(numbers)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("number", [300, 311, 356, 365, 370])
 def test_chaos_of_an_engine_names_no_number_beside_the_wrong_ones(number: int) -> None:
     """Of plays of hopping wheels the best is better by chance: by it these draws had another number named."""

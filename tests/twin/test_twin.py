@@ -42,6 +42,7 @@ def test_spoiled_number_is_named_first_or_among_its_rivals(name: str) -> None:
     assert field in [findings[0].best.field, *(rival.field for rival in findings[0].rivals)]
 
 
+@pytest.mark.extended
 def test_command_writes_files_that_are_better_and_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "twin"
     assert main(["twin", str(GRID), "--robot", "vaultbot", *SMALL, "--out", str(out)]) == 0
