@@ -84,6 +84,7 @@ def test_slope_effect_of_twisted_ground_slides_more():
     assert slide(2.0, 0.8) == pytest.approx(slide(-2.0, -0.8), rel=1e-6)  # mirrored, front and rear exchanged
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("mean", [0.0, 0.5])
 def test_slope_effect_covariance_holds_uncertain_loads(mean):
     """Monte Carlo: loads on the diagonals drawn from their distribution, against the motion at their mean."""

@@ -109,6 +109,7 @@ def test_pose_in_space_moved_in_its_plane_has_the_covariance_of_samples():
     np.testing.assert_allclose(found, made.covariance, atol=0.05 * np.abs(made.covariance).max())
 
 
+@pytest.mark.extended
 def test_pose_in_space_after_a_start_has_the_covariance_of_samples():
     """The frame in which it is given is at an uncertain planar pose."""
     rng, start, cov = np.random.default_rng(2), np.array([3.0, -2.0, 0.8]), np.diag([0.02, 0.01, 0.005]) ** 2

@@ -218,9 +218,7 @@ def spoiled(kind):
 
 @pytest.mark.parametrize(
     "kind",
-    cases(
-        ["nan", "all nan", "empty", "backwards", "jump", "repeated", "vanishes", "frame"], ("nan", "all nan", "empty", "jump", "vanishes")
-    ),
+    cases(["nan", "all nan", "empty", "backwards", "jump", "repeated", "vanishes", "frame"], ("all nan", "vanishes")),
 )
 def test_replay_bad_scans_are_skipped(kind, tmp_path, capsys):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(5.0, multiplier=1.875, spoil=spoiled(kind)))

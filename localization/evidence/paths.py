@@ -39,6 +39,8 @@ _LEVER_SIGMA_M = 0.5
 _YAW_SIGMA_RAD, _WINDOW_YAW_RAD = math.radians(5.0), math.radians(5.0)
 """Standard deviation of the heading of a tracked body, which is defined by hand, and of its measurement in a window, where wheels slide."""
 _ITERATIONS = 4
+_LAGS_AT_ONCE = 20_000
+"""Samples at all delays that are computed together: they stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,26 +261,33 @@ def _aligned(
 def lags(track: Track, path: Path, candidates: FloatArray) -> FloatArray:
     """(k,) tempered log likelihood of a track by its path and turns at each of the delays ``candidates`` (k,), up to a constant: one noise
     level, no lever arm."""
-    found = np.empty(len(candidates))
+    parts = np.array_split(candidates, math.ceil(len(candidates) * len(track.t) / _LAGS_AT_ONCE))
+    return np.concatenate([_lags(track, path, part) for part in parts])
+
+
+def _lags(track: Track, path: Path, candidates: FloatArray) -> FloatArray:
     starts = np.flatnonzero(np.diff(track.window, prepend=-1))
-    size = np.diff(np.r_[starts, len(track.t)])
-    for k, delay in enumerate(candidates):
-        p, theta, known = path.at(track.t - delay)
-        weight = known.astype(float)
-        count = np.maximum(np.add.reduceat(weight, starts), 1.0)
-        of_path = (p - np.repeat(np.add.reduceat(weight * p, starts) / count, size)) * weight
-        of_track = (track.positions - np.repeat(np.add.reduceat(weight * track.positions, starts) / count, size)) * weight
-        cross = np.abs(np.add.reduceat(of_path.conj() * of_track, starts)).sum()
-        explained = cross**2 / max(float((np.abs(of_path) ** 2).sum()), 1e-9)
-        rest = float((np.abs(of_track) ** 2).sum()) - explained + 2.0 * track.wide**2 * float((~known).sum())
-        found[k] = -TEMPER * len(track.t) * math.log(rest / len(track.t) + 2.0 * (track.noise**2 + (_RELATIVE * 0.3 * track.wide) ** 2))
-        if track.yaws is not None:
-            difference = np.where(known, track.yaws - theta, 0.0)
-            mean = np.abs(np.add.reduceat(weight * np.exp(1j * difference), starts))
-            off = 2.0 * float((np.add.reduceat(weight, starts) - mean).sum()) + track.wide_yaw**2 * float((~known).sum())
-            least = track.yaw_noise**2 + (_RELATIVE_TURN * 0.3 * track.wide_yaw) ** 2 + _FLOOR_RAD**2
-            found[k] -= 0.5 * TEMPER * len(track.t) * math.log(off / len(track.t) + least)
-    return found
+    size, n = np.diff(np.r_[starts, len(track.t)]), len(track.t)
+
+    def sums(values: np.ndarray) -> np.ndarray:  # (k, W) by window, of (k, n)
+        return np.add.reduceat(values, starts, axis=1)
+
+    p, theta, known = path.at(track.t - candidates[:, None])
+    weight = known.astype(float)
+    count = np.maximum(sums(weight), 1.0)
+    of_path = (p - np.repeat(sums(weight * p) / count, size, axis=1)) * weight
+    of_track = (track.positions - np.repeat(sums(weight * track.positions) / count, size, axis=1)) * weight
+    cross = np.abs(sums(of_path.conj() * of_track)).sum(axis=1)
+    explained = cross**2 / np.maximum((np.abs(of_path) ** 2).sum(axis=1), 1e-9)
+    unknown = (~known).sum(axis=1)
+    rest = (np.abs(of_track) ** 2).sum(axis=1) - explained + 2.0 * track.wide**2 * unknown
+    found = -TEMPER * n * np.log(rest / n + 2.0 * (track.noise**2 + (_RELATIVE * 0.3 * track.wide) ** 2))
+    if track.yaws is None:
+        return np.asarray(found)
+    mean = np.abs(sums(weight * np.exp(1j * np.where(known, track.yaws - theta, 0.0))))
+    off = 2.0 * (sums(weight) - mean).sum(axis=1) + track.wide_yaw**2 * unknown
+    least = track.yaw_noise**2 + (_RELATIVE_TURN * 0.3 * track.wide_yaw) ** 2 + _FLOOR_RAD**2
+    return np.asarray(found - 0.5 * TEMPER * n * np.log(off / n + least))
 
 
 def _wide_evidence(track: Track, which: BoolArray) -> float:

@@ -252,6 +252,7 @@ def test_center_from_end_poses_covariance_covers(turn):
     assert 0.93 < inside / 2000 < 0.97  # five binomial sigmas are 0.024
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("turn", cases([0.05, 0.3, 1.5, 7.0], ("0.3",)))
 def test_center_of_arc_covariance_and_chi_square_cover(turn):
     rng = np.random.default_rng(4)

@@ -101,6 +101,7 @@ SOURCES = {
 }
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("source", cases(SOURCES, usual=("contacts", "centres", "all")))
 def test_cg_covariance_of_a_weighed_robot_is_that_of_samples(source):
     """The whole way: scales err, wheels stand elsewhere, the arms' masses are wrong in what is taken away and in what is added."""

@@ -115,7 +115,7 @@ def test_full_disk_is_a_message_and_leaves_no_file(
         assert [path.name for path in tmp_path.rglob("*") if path.stat().st_size and path.is_file()] == []
 
 
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("writer", cases(WRITERS, ("info", "replay", "check")))
 def test_folder_that_cannot_be_written_is_a_message(writer: str, inputs: Inputs, capsys: pytest.CaptureFixture[str]) -> None:
     """/proc refuses new files to every user, root included."""
     check(main(inputs.arguments(writer, Path("/proc/out"))), capsys, 2)
@@ -144,7 +144,7 @@ def test_closed_output_ends_no_command(writer: str, inputs: Inputs, tmp_path: Pa
     assert main(inputs.arguments(writer, tmp_path / "out")) in (0, 2)
 
 
-@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("writer", cases(WRITERS, ("info", "replay", "check")))
 @pytest.mark.parametrize("operation", [0, 1, 4])
 def test_interrupt_at_a_file_operation_leaves_no_partial_file(
     writer: str, operation: int, inputs: Inputs, tmp_path: Path, capsys: pytest.CaptureFixture[str]

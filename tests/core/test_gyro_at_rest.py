@@ -76,6 +76,7 @@ def test_two_seconds_of_rest_know_a_mems_bias_to_the_noise_of_the_gyro():
     assert math.degrees(float(np.sqrt(np.mean(np.square(yaw_errors))))) < 3.0
 
 
+@pytest.mark.extended
 def test_bias_by_a_rest_that_leaves_its_prior_open_is_consistent():
     """Half a second of a noisy gyro does not show whether the driver has zeroed it: NEES over biases drawn from all priors."""
     nees = []
@@ -146,6 +147,7 @@ def consistency_after(kind: str, draws: int) -> tuple[float, float, float]:
     return float(np.mean(yaw)), float(np.mean(pose)), float(np.linalg.norm(errors) / np.linalg.norm(changes))
 
 
+@pytest.mark.extended
 def test_bias_that_rises_between_two_rests_is_corrected():
     yaw, pose, share = consistency_after("ramp", 4)
     assert yaw < 1.0
@@ -153,6 +155,7 @@ def test_bias_that_rises_between_two_rests_is_corrected():
     assert share < 0.1
 
 
+@pytest.mark.extended
 def test_bias_of_the_cheapest_gyros_is_known_after_two_seconds_of_rest():
     """Drawn as their data sheet has it: 9 of 10 rests are found, and the others leave the filter as it was."""
     rng, found = np.random.default_rng(5), []

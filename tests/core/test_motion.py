@@ -585,12 +585,14 @@ def scale_and_nis(slip_variance):
     return np.mean([world.wheel_noise_scale for world in found]), np.mean([values[len(values) // 2 :] for values in nis])
 
 
+@pytest.mark.extended
 def test_wheel_noise_scale_with_slip_of_six_times_variance_is_estimated():
     scale, nis = scale_and_nis(6.0)
     assert scale == pytest.approx(6.0, rel=0.2)
     assert 2.5 < nis < 3.5
 
 
+@pytest.mark.extended
 def test_wheel_noise_scale_with_less_slip_than_assumed_stays_one():
     """Slip that lasts is small in one step and large over many: the robot file's variance is the least."""
     scale, nis = scale_and_nis(0.2)

@@ -162,6 +162,7 @@ def test_attribute_rows_unequal_noise_is_weighed_alike_in_all_columns(rotations:
     assert yaw.rms > 3.0 * yaw.expected_rms
 
 
+@pytest.mark.extended
 def test_attribute_rows_p_values_of_noise_are_uniform(rotations: Linearization) -> None:
     rng, sigmas, p = np.random.default_rng(1), np.full(rotations.rows.shape, 0.01), []
     for _ in range(300):

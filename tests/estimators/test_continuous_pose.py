@@ -63,6 +63,7 @@ def test_covariances_of_both_frames_equal_monte_carlo_scatter() -> None:
     assert low < np.mean(continuous) < high
 
 
+@pytest.mark.extended
 def test_odometry_at_rest_moves_by_less_than_the_pose() -> None:
     """The gyro's bias, which is found there, corrects the pose by centimetres."""
     jumps = []

@@ -186,6 +186,7 @@ def test_graph_with_wrong_wheels_estimates_radius_scale() -> None:
     assert abs(mean - nominal * TURN_ERROR) < abs(mean - nominal)
 
 
+@pytest.mark.extended
 def test_graph_corrections_hold_for_next_prediction() -> None:
     _, pipeline = estimated()
     names = pipeline.estimator.odometry.noise.corrections.names

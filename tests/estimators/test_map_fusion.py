@@ -98,6 +98,7 @@ def test_map_fusion_with_positions_in_a_map_without_says_so():
     assert any("the map was built without such" in text for text in pipeline.warnings())
 
 
+@pytest.mark.extended
 def test_map_fusion_state_written_and_read_gives_the_same_estimates():
     """The map itself is not in the state."""
     pipeline = start(np.array([0.2, -0.2, 0.1]))

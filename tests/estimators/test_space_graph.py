@@ -79,6 +79,7 @@ def test_smoothed_poses_in_space_err_as_their_covariances_have_it(has_positions)
     assert (np.mean(sigmas) < 0.05) == has_positions  # of the height: 0.04 for 0.06 m
 
 
+@pytest.mark.extended
 def test_loop_in_space_takes_off_drift_as_its_covariance_has_it():
     """Mean NEES of 15 drives as above; a keyframe that drift has moved by 2 m is back within millimetres."""
     rng, sigmas, nees = np.random.default_rng(7), np.array([2e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4]), []

@@ -239,6 +239,7 @@ def test_pose_nees_of_half_the_variance_fails_over_runs():
     assert np.all(means > mean_band(100, 3)[1])
 
 
+@pytest.mark.extended
 def test_nees_of_one_dead_reckoning_counts_as_two_samples_and_by_stretches():
     """A random walk's normalised errors have the correlation sqrt(s / t): in the mean of their squares that is two samples, which show half
     the sigma in some drives; sixteen stretches show it in all. Of right covariances 95 % are called consistent."""
@@ -275,6 +276,7 @@ def correlated(rng, n, d, samples):
     return z
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(("samples", "n_expected"), cases([(1e-3, 400.0), (8.0, 50.0), (40.0, 10.0), (math.inf, 1.0)], ("8.0",)))
 def test_p_value_of_correlated_errors_is_uniform(samples, n_expected):
     """Of consistent errors 95 % are called so, whatever their correlation; of half the sigma nearly all are called overconfident."""

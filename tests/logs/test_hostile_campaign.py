@@ -41,6 +41,7 @@ DECIDED_IN_LOGS = (
 )
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("fault", extended.cases(DECIDED_IN_LOGS, ("transform twice",)))
 def test_sensor_fault_decided_in_logs_is_never_silently_wrong(tmp_path: Path, truths: Path, fault: str) -> None:
     source = SOURCES[0]

@@ -7,6 +7,7 @@ import pytest
 
 from localization.logs.event_decoder import PublisherSeparator
 from motion_models.se2 import FloatArray
+from tests.helpers.extended import cases
 
 DURATION_S = 60
 SEEDS = range(12)
@@ -48,12 +49,17 @@ def topic(seed: int, kind: str) -> tuple[FloatArray, float]:
 
 
 @pytest.mark.parametrize(
-    "kind", ["noisy turn rates", "noisy wheels", "coarse encoders", "few counts from rest on", "outliers", "places alone"]
+    "kind",
+    cases(
+        ["noisy turn rates", "noisy wheels", "coarse encoders", "few counts from rest on", "outliers", "places alone"],
+        usual=["noisy wheels", "few counts from rest on"],
+    ),
 )
 def test_single_publisher_loses_no_reading(kind: str) -> None:
     assert [left_out(*topic(seed, kind)) for seed in SEEDS] == [0.0] * len(SEEDS)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("kind", ["noisy turn rates", "coarse encoders"])
 def test_publisher_of_zeros_between_is_left_out(kind: str) -> None:
     for seed in SEEDS:

@@ -68,6 +68,7 @@ def test_page_without_scripts_keeps_tables_and_static_figures():
     assert made.count("<table>") == 2
 
 
+@pytest.mark.extended
 def test_charts_and_tables_in_a_browser_sort_filter_and_choose(tmp_path: Path):
     shown = render(dataclasses.replace(PAGE, sections=[*PAGE.sections[:2], Section("Still", [STILL], is_static=True)]))
     seen = run_in_page(shown, PROBE, tmp_path, "--window-size=390,900")

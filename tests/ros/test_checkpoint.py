@@ -39,7 +39,9 @@ KINDS = [(name, "skid_steer", "cg_field" if name in ESTIMATORS_WITH_CORRECTIONS 
 AHEAD = 300  # events after a cut that are compared: some 30 scans
 
 
-@pytest.mark.parametrize("kind", KINDS, ids="-".join)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, id="-".join(kind), marks=[] if kind[0] == "graph" else [pytest.mark.extended]) for kind in KINDS]
+)
 def test_pipeline_cut_and_resumed_gives_the_same_bits(kind):
     events, _ = drive_events()
     cuts = {0, 1, 2, 60, *np.random.default_rng(3).integers(3, len(events), 9).tolist(), len(events)}

@@ -48,6 +48,7 @@ def test_lidar_of_another_name_is_used_as_in_a_log():
     assert OTHER in node.topics
 
 
+@pytest.mark.extended
 def test_two_lidars_none_named_are_an_error_in_diagnostics():
     both = ("/front/scan", "/rear/scan")
 

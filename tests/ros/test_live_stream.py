@@ -272,7 +272,7 @@ def silenced(topic, begin_s, end_s):
     return spoil
 
 
-@pytest.mark.parametrize("topic", ["/scan", "/imu/data", "/joint_states"])
+@pytest.mark.parametrize("topic", cases(["/scan", "/imu/data", "/joint_states"], usual=["/scan"]))
 def test_sensor_that_vanishes_and_returns_is_used_again(topic, calm):
     transport = LogTransport(drive_log(scans_hz=6.25), silenced(topic, 6.0, 10.0))
     node, _ = run_node(transport)
@@ -433,6 +433,7 @@ def test_discovery_of_silent_topics_reports_once_and_continues():
     assert reports[0] == "waiting for /scan (no publisher)."
 
 
+@pytest.mark.extended
 def test_discovery_is_silent_while_topics_that_have_come_settle(monkeypatch):
     """The first messages come in the last tenth of a second before the node would report that none do."""
     robot = LogTransport(drive_log(scans_hz=6.25))
@@ -465,6 +466,7 @@ def test_joint_states_without_wheel_joints_are_refused():
         Node.start(LogTransport(drive_log(scans_hz=6.25)), LiveRun(robot, lambda has_lidar: pair, node=NodeConfig(wait_s=0.0)), print)
 
 
+@pytest.mark.extended
 def test_undecodable_messages_are_dropped_and_counted():
     """Halves of messages and random bytes, on every topic that the node subscribes to."""
     rng, others = np.random.default_rng(0), ("/tf", "/tf_static", "/set_pose", "/initialpose", "/skidloc/payload", "/skidloc/pause")

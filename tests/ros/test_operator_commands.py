@@ -108,6 +108,7 @@ def serviced(name, *requests, estimator="ekf"):
     return transport, node, replies, reports
 
 
+@pytest.mark.extended
 def test_reset_begins_anew_and_odom_goes_on_without_a_jump(calm):
     """REP-105; with nothing learned and a new map."""
     transport, node, replies, reports = serviced("/skidloc/reset", True)
@@ -212,6 +213,7 @@ def test_payload_with_wrong_content_is_ignored_with_a_reason():
     assert node.payloads.loads == {}
 
 
+@pytest.mark.extended
 def test_commands_by_topics_do_what_the_services_do():
     """Reset, pause and its end."""
     empty, (off, on) = (

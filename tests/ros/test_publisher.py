@@ -221,6 +221,7 @@ def test_predict_long_after_the_last_estimate_goes_on_at_the_rate_of_the_wheels(
     assert way == pytest.approx(1499 / 50 * 5.0 * ROBOT.geometry.wheel_radius_m, rel=0.01)
 
 
+@pytest.mark.extended
 def test_predictions_that_nobody_receives_are_not_written():
     """By a transport that knows: neither predicted odometry nor more transforms than estimates; estimates are as with readers."""
     transport = LogTransport(drive_log())

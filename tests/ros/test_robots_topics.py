@@ -133,6 +133,7 @@ def test_live_fixes_give_the_map_its_heading_and_place_in_utm(outdoor_log, monke
     assert np.hypot(in_utm[-1].transform.translation.x - expected[0], in_utm[-1].transform.translation.y - expected[1]) < 1e-6
 
 
+@pytest.mark.extended
 def test_filtered_fixes_and_services_place_the_map_on_the_earth(outdoor_log):
     """The last fix is the true place within its own covariance; what is asked by fromLL is answered back by toLL."""
     transport = LogTransport(outdoor_log)

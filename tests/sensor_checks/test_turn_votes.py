@@ -16,6 +16,7 @@ from localization.sensor_checks.turn_votes import GYRO_OPPOSITE, GYRO_UNIT, LIDA
 from localization.sensor_checks.window import Bins, Window
 from motion_models.robot import DIFF_DRIVE, Robot
 from motion_models.robot_file import load_robot
+from tests.helpers.extended import cases
 
 _WHEELS, _GYRO, _LIDAR = 3, 4, 7
 _BIN_S = 0.25
@@ -79,7 +80,9 @@ def _without(rows: np.ndarray, column: int | None) -> np.ndarray:
 
 @pytest.mark.parametrize("missing", [None, _WHEELS, _GYRO, _LIDAR], ids=["all sensors", "no wheels", "no gyro", "no LiDAR"])
 @pytest.mark.parametrize("kind", _KINDS)
-@pytest.mark.parametrize(("robot", "slip_changes"), [(_JACKAL, False), (_JACKAL, True), (_NARROW, True)], ids=["jackal", "slips", "narrow"])
+@pytest.mark.parametrize(
+    ("robot", "slip_changes"), cases([(_JACKAL, False), (_JACKAL, True), (_NARROW, True)], ["slips"], ["jackal", "slips", "narrow"])
+)
 def test_healthy_robots_are_accused_of_nothing(kind: str, missing: int | None, robot: Robot, slip_changes: bool) -> None:
     rng = np.random.default_rng([5, _KINDS.index(kind)])
     found = [_compare(_without(_rows(rng, kind, slip_changes, robot), missing), robot)[2].declared for _ in range(500)]

@@ -26,6 +26,7 @@ def test_healthy_drive_of_a_kind_is_accused_of_nothing(kind: str) -> None:
     assert check(kind, 20, SOURCES.get(kind, ("wheels", "gyro"))).accusations == ()
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("seed", [1301, 1905])
 def test_side_of_a_circle_shows_no_unit(seed: int) -> None:
     """On a circle to the left the left wheels hardly roll, and the sides' slip is more than the sensors' noise: another unit of a side was

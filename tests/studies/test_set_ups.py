@@ -11,6 +11,7 @@ import pytest
 
 from motion_models import se2
 from tests.helpers.bags import START, Record, S, laser_scan
+from tests.helpers.extended import cases
 from tests.helpers.set_up_drives import STEP_S, TOPICS, Drawn, draw_base, drawn_log
 from tests.studies.set_ups import answers
 from tests.studies.set_ups.answers import Body, Truth, is_same, is_twin
@@ -22,6 +23,7 @@ BY_SCANS = ("lidar.yaw", "lidar.upside_down", "lidar.unit", "lidar.place", "cloc
 """Scans have no motion of their own: `test_scan_of_a_turned_lidar_upside_down_has_the_points_of_its_mount`."""
 NOT_LINEAR = ("reference.place", "reference.inverse", "driver.pose_against_twist")
 LINEAR = [s for s in TABLE if s.id not in (*BY_SCANS, *NOT_LINEAR) and s.draw.__name__ != "_factor_since"]
+BY_GROUP = {group: [s for s in LINEAR if s.group == group] for group in dict.fromkeys(s.group for s in LINEAR)}
 SOURCES = ("wheels", "driver", "gyro", "reference")
 BIN_S = 0.5
 
@@ -86,7 +88,7 @@ def assert_maps(drawn: Drawn, setting: Setting, body: Body, records: list[Record
         assert error < 0.08, (source, truth, found, wanted[source].matrix)
 
 
-@pytest.mark.parametrize("symptom", LINEAR, ids=[s.id for s in LINEAR])
+@pytest.mark.parametrize("symptom", cases(LINEAR, [of[0].id for of in BY_GROUP.values()], [s.id for s in LINEAR]))
 def test_symptom_changes_messages_by_the_map_of_its_row(symptom: Any) -> None:
     drawn, setting, body = healthy(1)
     fault = symptom.draw(np.random.default_rng(5), setting)

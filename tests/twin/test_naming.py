@@ -14,6 +14,7 @@ from localization.twin.parameters import hypotheses_of
 from localization.twin.twin import TwinConfig, TwinResult, examine
 from localization.twin.windows import halves, motion_of_point, windows_of
 from motion_models.robot_file import load_robot
+from tests.helpers.extended import cases
 from tests.helpers.quasi_static_simulator import HOPPING, drawn_numbers, named_of_draw, spoiled_quasi_static, true_quasi_static
 from tests.helpers.twin_drives import drive
 
@@ -37,7 +38,7 @@ def searched(seed: int, **numbers: float) -> TwinResult:
     return examine(drive(TRUE, ROBOT, seed, COUNT), ROBOT, spoiled_quasi_static(TRUE, **numbers))
 
 
-@pytest.mark.parametrize("field", SPOILED)
+@pytest.mark.parametrize("field", cases(SPOILED, usual=[*SPOILED][:2]))
 def test_spoiled_number_is_named_alone_with_its_true_value(field: str) -> None:
     result = searched(7, **{field: SPOILED[field]})
     (finding,) = result.findings
@@ -73,6 +74,7 @@ def test_chaos_of_an_engine_names_no_number_beside_the_wrong_ones(number: int) -
     assert (len(named) > 0) == (len(wrong) > 0)
 
 
+@pytest.mark.extended
 def test_no_number_is_named_that_the_windows_held_out_contradict() -> None:
     """Half of the drive is that of a robot with smaller wheels, the other half, on which the file is judged, that of the file's."""
     maneuvers = drive(TRUE, ROBOT, 7, COUNT)
