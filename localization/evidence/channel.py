@@ -59,12 +59,12 @@ def channel_evidence(
         noise = floor[i], relative[i]
         b[:] = 0.0
         _first(z[i], floor[i], tau[i], x, c[i])
-        if k > 1:
-            _scales(z[i], noise, (tau[i], bias_sigma), x, c[i], b, information[i])
-        for _ in range(_ITERATIONS):
-            _motion(z[i], noise, np.exp(c[i]), b, size, x)
+        for step in range(_ITERATIONS + 1 if k > 1 else _ITERATIONS):
+            if step or k < 2:
+                _motion(z[i], noise, np.exp(c[i]), b, size, x)
             if k > 1:
-                _scales(z[i], noise, (tau[i], bias_sigma), x, c[i], b, information[i])
+                _scales(z[i], noise, tau[i], x, c[i], b, information[i])
+                _biases(z[i], noise, np.exp(c[i]), b, bias_sigma, size, x)
         scale = np.exp(c[i])
         own, moving = _size_of_motion(z[i], noise, scale, b, size, x, least[i])
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
@@ -127,42 +127,60 @@ def _motion(z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, size: floa
 @subroutine
 def _mean(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, size: float, near: float) -> float:
     """Posterior mean of the motion in bin ``m``, the noise as at a motion ``near``."""
-    product, information = 0.0, size**-2.0
-    for j in range(len(z)):
-        if math.isfinite(z[j, m]):
-            weight = a[j] / _variance(noise, j, m, a[j], near)
-            product += weight * (z[j, m] - b[j])
-            information += weight * a[j]
-    return float(product / information)
+    return float(_by_others(z, noise, -1, m, a, b, size, near)[0])
 
 
 @subroutine
-def _scales(z: FloatArray, noise: Pair, prior: Pair, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray) -> None:
-    """Scales, biases and the information on the scales (k,) by the motion ``x``, with sigmas of their ``prior``."""
-    tau, bias_sigma = prior
+def _scales(z: FloatArray, noise: Pair, tau: FloatArray, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray) -> None:
+    """Scales and the information on them (k,) by the motion ``x`` and the biases ``b``, with sigmas ``tau`` of their prior."""
     for j in range(len(c)):
-        wxx, wxz, wx, wz, w = _weighted_sums(z[j], x, noise[0][j], noise[1][j], math.exp(c[j]), b[j])
+        wxx, wxz = _weighted_sums(z[j], x, noise[0][j], noise[1][j], math.exp(c[j]), b[j])
         ratio = min(max(wxz / wxx, 1e-4), 1e4)
         information[j] = TEMPER * wxx * ratio**2
         c[j] = math.log(ratio) * information[j] / (information[j] + tau[j] ** -2.0)
-        if bias_sigma[j] > 0.0:
-            b[j] = TEMPER * (wz - math.exp(c[j]) * wx) / (TEMPER * w + bias_sigma[j] ** -2.0)
 
 
 @subroutine
-def _weighted_sums(z: FloatArray, x: FloatArray, floor: FloatArray, relative: float, a: float, b: float) -> tuple[float, ...]:
-    """Sums over the bins of x^2, (z - b) x, x, z and 1, weighted by the noise; a residual beyond three sigma counts less (Cauchy)."""
-    wxx, wxz, wx, wz, w_all = 1e-12, 0.0, 0.0, 0.0, 0.0
+def _weighted_sums(z: FloatArray, x: FloatArray, floor: FloatArray, relative: float, a: float, b: float) -> tuple[float, float]:
+    """Sums over the bins of x^2 and (z - b) x, weighted by the noise; a residual beyond three sigma counts less (Cauchy)."""
+    wxx, wxz = 1e-12, 0.0
     for m in range(len(z)):
         if math.isfinite(z[m]):
             V = floor[m] ** 2 + (relative * a * x[m]) ** 2
             w = 1.0 / (V + (z[m] - b - a * x[m]) ** 2 / 9.0)
             wxx += w * x[m] * x[m]
             wxz += w * (z[m] - b) * x[m]
-            wx += w * x[m]
-            wz += w * z[m]
-            w_all += w
-    return wxx, wxz, wx, wz, w_all
+    return wxx, wxz
+
+
+@subroutine
+def _biases(z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, bias_sigma: FloatArray, size: float, x: FloatArray) -> None:
+    """Biases (k,) by generalized least squares against the motion that the other sources measure, the noise as at ``x``: a motion that has
+    the source itself takes most of its bias for motion. A residual beyond three sigma counts less (Cauchy)."""
+    for j in range(len(b)):
+        if bias_sigma[j] <= 0.0:
+            continue
+        weighted, weights = 0.0, bias_sigma[j] ** -2.0 / TEMPER
+        for m in range(z.shape[1]):
+            if math.isfinite(z[j, m]):
+                others, information = _by_others(z, noise, j, m, a, b, size, x[m])
+                off = z[j, m] - a[j] * others
+                V = _variance(noise, j, m, a[j], x[m]) + a[j] ** 2 / information
+                w = 1.0 / (V + (off - b[j]) ** 2 / 9.0)
+                weighted, weights = weighted + w * off, weights + w
+        b[j] = weighted / weights
+
+
+@subroutine
+def _by_others(z: FloatArray, noise: Pair, j: int, m: int, a: FloatArray, b: FloatArray, size: float, near: float) -> tuple[float, float]:
+    """Posterior mean of the motion in bin ``m`` by all sources but ``j``, and the information on it, the noise as at a motion ``near``."""
+    product, information = 0.0, size**-2.0
+    for i in range(len(z)):
+        if i != j and math.isfinite(z[i, m]):
+            weight = a[i] / _variance(noise, i, m, a[i], near)
+            product += weight * (z[i, m] - b[i])
+            information += weight * a[i]
+    return float(product / information), float(information)
 
 
 @subroutine
