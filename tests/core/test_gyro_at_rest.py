@@ -168,6 +168,15 @@ def test_bias_of_the_cheapest_gyros_is_known_after_two_seconds_of_rest():
     assert np.mean(found) >= 0.9
 
 
+def test_robot_that_sets_off_before_its_wheels_count_keeps_its_bias():
+    """Encoders of few counts begin late: in the last 0.15 s of each rest the gyro turns already."""
+    every_s, rest_s, bias = 5.5, 1.5, 4e-3
+    phase = np.arange(round(3.0 * every_s * RATE_HZ)) / RATE_HZ % every_s
+    ekf, _ = drive(bias - 0.2 * ((phase > rest_s - 0.15) & (phase <= rest_s)), rest_s=rest_s, every_s=every_s)
+    assert abs(ekf.state.number("gyro_bias") - bias) < 4.0 * math.sqrt(ekf.state.variance("gyro_bias")) < 3e-3
+    assert ekf.bias_change is None
+
+
 @pytest.mark.parametrize("rates", [[0.11, 0.11, 0.11], [0.11, 0.002, 0.002], [0.002, 0.11, 0.002]], ids=["bias", "turntable", "turned"])
 def test_rate_that_comes_back_in_the_next_standstill_is_the_bias(rates):
     """One standstill at 6 deg/s may be a turntable; two are the gyro's own."""

@@ -32,7 +32,8 @@ _MAX_RATE_RAD_S, _CONSTANT = 1.0, 0.1
 share of them; those of one that rolls or is carried vary."""
 _MAX_EXPONENT, _MIN_DENSITY = 300.0, 1e-300
 _SETTLING_S = 0.2
-"""Time in which a robot whose wheels read zero stops [s]: their clock may be ahead of the gyro's by a driver's latency (`clock_offset`)."""
+"""Time in which a robot whose wheels read zero stops, or sets off [s]: their clock may be ahead of the gyro's by a driver's latency
+(`clock_offset`), and encoders of few counts begin late."""
 _MIN_SPELL_S, _MIN_STEPS = 0.5, 5
 """Shortest standstill after that which is judged: the scatter of the gyro's rates is that of 25 samples."""
 
@@ -58,7 +59,7 @@ class BiasChange(NamedTuple):
     rate: float
     """By how much [rad/s]."""
     log_evidence: float
-    """Logarithm of the likelihood of a change over that of none."""
+    """Logarithm of the likelihood of a change over that of none: neither since the last rest, nor of what the filter has meanwhile."""
 
 
 class _Bias(NamedTuple):
@@ -95,16 +96,18 @@ class StandstillTest:
         self._turns: list[tuple[float, float, float]] = []  # angle, time, variance of each step of the standstill
         self._bias = 0.0, 0.0  # mean and variance at its begin
         self._unsure: _Bias | None = None  # of the last standstill, where that may have been a rest
+        self._rested: tuple[float, float] | None = None  # mean and variance of the rate in the last one that was
         self._stood_s = 0.0
         self._is_prior_tested = False
         self._rest = 0.0  # probability
+        self._fits_rest = True  # the turn of this step is one at rest
         self._angle = 0.0  # of the gyro, in all of the standstill
         self._is_moved = False
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the robot is at rest, by the standstill up to now."""
-        return self._rest > _AT_REST
+        """Whether the robot is at rest, by the standstill up to now and in this step: one that sets off turns before its wheels count."""
+        return self._rest > _AT_REST and self._fits_rest
 
     @property
     def is_bias_open(self) -> bool:
@@ -135,8 +138,8 @@ class StandstillTest:
             return step, None
         if not self._turns:
             self._bias = state.number("gyro_bias"), state.variance("gyro_bias")
-        found = self._judge(step.start_ns)
-        turn = step.turn
+        found, turn = self._judge(step.start_ns), step.turn
+        self._fits_rest = self._rest <= _AT_REST or self._is_of_rest(turn.angle / turn.duration, turn.duration)
         self._turns.append((turn.angle, turn.duration, turn.scatter_variance or turn.variance))
         return (replace(step, turn=replace(turn, variance=self._density() * turn.duration)) if self.is_at_rest else step), found
 
@@ -155,9 +158,9 @@ class StandstillTest:
         likelihoods = [b.share * density for b, density in zip(biases, densities, strict=True)]
         at_rest = _AT_REST * sum(likelihoods)
         moved = (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S * (_CONSTANT + (1.0 - _CONSTANT) * math.exp(self._variation(rate)))
-        was_at_rest, self._rest = self.is_at_rest, at_rest / (at_rest + moved)
+        was_resting, self._rest = self._rest > _AT_REST, at_rest / (at_rest + moved)
         best = int(np.argmax(likelihoods))
-        if not self.is_at_rest or (was_at_rest and best == 0):
+        if self._rest <= _AT_REST or (was_resting and best == 0):
             return None
         self.bias_sigma = 0.0
         if not best:
@@ -166,8 +169,10 @@ class StandstillTest:
         self._is_prior_tested, self._bias = True, (rate, noise)
         if is_first:
             return BiasAtRest(max(biases[best].variance, change**2), 0.0, rate, noise)
-        if abs(change) > _MIN_REPORTED * self._bias_sigma:
-            self.change = BiasChange(now_ns, change, math.log(densities[best] / max(densities[0], _MIN_DENSITY)))
+        if self._rested is not None and abs(rate - self._rested[0]) > _MIN_REPORTED * self._bias_sigma:
+            mean, variance = self._rested
+            unchanged = max(densities[0], _normal(rate - mean, variance + biases[0].variance + noise), _MIN_DENSITY)
+            self.change = BiasChange(now_ns, rate - mean, math.log(densities[best] / unchanged))
         return BiasAtRest(0.0, change**2, rate, noise)
 
     def _biases(self) -> list[_Bias]:
@@ -184,10 +189,25 @@ class StandstillTest:
     def _end_standstill(self) -> None:
         """Keep the bias by a standstill that may have been a rest."""
         if self._is_long:
-            self._is_prior_tested |= self.is_at_rest
+            self._is_prior_tested |= self._rest > _AT_REST
+            self._rested = self._settled_rate() if self._rest > _AT_REST else self._rested
             is_unsure = 1.0 - _AT_REST < self._rest <= _AT_REST
             self._unsure = _Bias(self._rest, *self._rate()) if is_unsure else None
         self._turns.clear()
+
+    def _is_of_rest(self, rate: float, seconds: float) -> bool:
+        """Whether a ``rate`` [rad/s] over ``seconds`` is that of a robot which still rests, as certainly as that is to be."""
+        mean, noise = self._rate()
+        at_rest = _AT_REST * _normal(rate - mean, noise + self._density() / seconds)
+        return at_rest > _AT_REST * (at_rest + (1.0 - _AT_REST) * 0.5 / _MAX_RATE_RAD_S)
+
+    def _settled_rate(self) -> tuple[float, float]:
+        """`_rate` without the end of the standstill, at which the robot may set off before its wheels count."""
+        seconds = np.array([duration for _, duration, _ in self._turns])
+        until_end = seconds.sum() - np.cumsum(seconds) + seconds
+        kept = [turn for turn, left in zip(self._turns, until_end.tolist(), strict=True) if left > _SETTLING_S]
+        turned, time, _ = np.array(kept or self._turns).sum(axis=0).tolist()
+        return turned / time, self._density() / time
 
     def _rate(self) -> tuple[float, float]:
         """Mean of the gyro's rate in this standstill [rad/s], and its variance [rad^2/s^2]."""
