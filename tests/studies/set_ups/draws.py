@@ -75,8 +75,8 @@ def simulated(seed: int, count: int, sources: Sequence[str], allowed: Callable[[
         base.radius,
         base.track / base.k,
         base.track * base.driver_k,
-        base.fields != "rates",
-        base.fields != "angles",
+        has_angles=base.fields != "rates",
+        has_rates=base.fields != "angles",
     )
     faults = tuple(draw_faults(rng, setting, count, allowed))
     body = Body(base.left, base.right, base.radius, setting.effective_track, setting.driver_track, tuple(sources))
