@@ -343,6 +343,7 @@ def test_replay_bad_input_is_refused_and_no_file_written(case, tmp_path, capsys)
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.extended
 def test_replay_of_pairs_runs_these_alone_as_in_the_whole_table(tmp_path):
     log = bags.write_mcap(tmp_path / "log.mcap", rooms.drive(4.0))
     of_pairs = ("--pairs", "skid_steer/lidar,diff_drive/odometry,skid_steer/ekf")

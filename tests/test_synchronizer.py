@@ -685,6 +685,7 @@ def test_scans_without_times_are_reported_where_robot_turns():
     assert cut(in_order(wheels(2.0, turned=lambda t: (3.0, 3.0)), [scan(0.1 * i) for i in range(1, 15)]))[1].warnings() == []
 
 
+@pytest.mark.extended
 def test_synchronizer_of_long_stream_is_bounded():
     """Ten minutes: what is remembered is seconds, however long it runs."""
     cutter, most = stepper(), 0

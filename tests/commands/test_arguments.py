@@ -142,6 +142,7 @@ def test_folder_in_which_no_file_can_be_made_is_refused_before_the_run() -> None
         check_outputs(Path("/proc/out"))
 
 
+@pytest.mark.extended
 def test_noise_of_a_reference_that_is_not_there_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = Path(__file__).parents[1] / "data" / "aces" / "aces.mcap"
     assert run("replay", log, "--robot", "aces", "--out", tmp_path / "o", "--reference-sigma", 0.02, 0.5) == 2

@@ -91,6 +91,7 @@ def test_check_of_two_sensors_that_contradict_corrects_none(tmp_path: Path) -> N
     assert (robot.joints, robot.wheel_noise) == (load_robot(ROBOT_TOML).joints, load_robot(ROBOT_TOML).wheel_noise)
 
 
+@pytest.mark.extended
 def test_check_with_urdf_names_what_the_log_contradicts(tmp_path: Path) -> None:
     case = CASES / "H02-urdf-plugin-contradicts-joints"
     found = check(tmp_path, case / "log.mcap", "--urdf", str(case / "robot.urdf"))

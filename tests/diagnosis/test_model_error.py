@@ -30,6 +30,7 @@ def diagnosed(hypothesis: Hypothesis, seed: int) -> Diagnosis:
     return diagnose(measured_under(drive, model, hypothesis, np.random.default_rng(seed), has_inertia=True), model)
 
 
+@pytest.mark.extended
 def test_diagnose_contacts_that_creep_by_rate_are_no_cause() -> None:
     found = diagnosed(_CREEPING, 3)
     assert not found.findings

@@ -179,6 +179,7 @@ def test_pose_graph_on_turns_estimates_corrections() -> None:
     assert graph.corrections()[0] == pytest.approx(mean, abs=0.2 * sigma.min())
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("is_smoothed", [False, True])
 def test_pose_graph_over_fifty_drives_has_consistent_nees(is_smoothed: bool) -> None:
     """Of one pose of each drive, after loops: independent, so that their sum has 3 x 50 degrees of freedom. Cauchy's loss counts right

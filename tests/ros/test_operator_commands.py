@@ -65,6 +65,7 @@ def test_set_pose_in_odom_continues_from_that_pose_and_covariance(calm):
     assert np.abs(se2.between(a, b)).max() < 0.05
 
 
+@pytest.mark.extended
 def test_initialpose_moves_the_map_and_leaves_odom_without_a_jump():
     transport, node, reports = commanded("graph", "/initialpose", pose_message([5.0, -3.0, 1.0], "map"))
     assert any("in 'map'" in text for text in reports)

@@ -148,6 +148,7 @@ def test_published_twist_is_that_of_its_stamp_with_its_covariance(estimator, top
     assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 0.02
 
 
+@pytest.mark.extended
 def test_prediction_with_the_gyro_turns_as_the_robot_does(driven):
     """Against the same node without it: the turn rates between scans."""
     without = LogTransport(drive_log(), lambda messages: [m for m in messages if m.topic != "/imu/data"])

@@ -38,6 +38,7 @@ def places() -> PlaceMap:
     return PlaceMap(keyframes, 0.02)
 
 
+@pytest.mark.extended
 def test_node_in_a_saved_map_is_localized_after_initialpose(places: PlaceMap) -> None:
 
     def spoil(messages):

@@ -50,6 +50,7 @@ def _motion(run: RunRecord) -> tuple[np.ndarray, np.ndarray]:
     return angles[-1] - angles[0], np.array([c * x + s * y, -s * x + c * y, turned])
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("name", ["husky_a200", "jackal"])
 def test_mujoco_healthy_robot_turns_as_the_friction_model(name: str) -> None:
     robot = load_robot(name)
