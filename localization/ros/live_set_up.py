@@ -183,6 +183,8 @@ class EntranceChecks:
         self.running: LiveSetUp | None = None
         self.notes: list[str] = []
         """Sentences on what was found."""
+        self.corrected: set[str] = set()
+        """Keys of the robot file that were corrected: each once, else what a correction does not change begins the drive for ever."""
 
     def begin(self, sensors: LiveSensors) -> LiveSetUp | None:
         """Compare the ``sensors`` from here on; None where one alone measures the motion."""

@@ -189,7 +189,7 @@ def test_attribute_rows_noise_of_headings_that_the_gyro_does_not_have_is_no_erro
     assert row.status == status
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_find_trends_in_noise_are_as_rare_as_their_p_value() -> None:
     """At most 11 of 300 drives have one at a significance of 1 % (binomial, 99.99 %), and each drive has one that is there."""
     drive = law_drive("turtlebot3_burger")

@@ -51,7 +51,7 @@ def normalised(pose: FloatArray, cov: FloatArray, truth: FloatArray) -> float:
     return float(error @ np.linalg.solve(cov, error))
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_covariances_of_both_frames_equal_monte_carlo_scatter() -> None:
     corrected, continuous = [], []
     for seed in range(DRIVES):

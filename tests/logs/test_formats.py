@@ -108,7 +108,7 @@ def _peak(path: Path) -> tuple[int, int]:
         tracemalloc.stop()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "write",
     [

@@ -569,7 +569,7 @@ def test_overview_has_no_date_and_the_same_bytes(tmp_path):
     assert {(0, 114, 178), (213, 94, 0), (204, 121, 167)} <= colours  # a bar of each estimator
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 def test_overview_of_another_process_and_style_has_the_same_bytes(tmp_path):
     """A matplotlibrc of the user's must not reach the report."""
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: red\nxtick.major.size: 30\naxes.labelpad: 40\nsvg.fonttype: path\n")

@@ -45,7 +45,7 @@ def test_rotations_by_scan_matching_are_within_their_sigmas(measured):
     assert (simulated_grid.sigmas(measured).mean(axis=0) < [0.001, 0.004, 0.004]).all()
 
 
-@pytest.mark.extended
+@pytest.mark.slow
 @pytest.mark.xdist_group("simulated_grid")
 def test_closed_model_differs_from_vehicle_by_less_than_a_percent(measured):
     """The closed model knows no inertia: at 0.3 rad/s that is worth some thousandths of k."""
