@@ -91,6 +91,11 @@ class ClockPlan:
     period_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Median time from message to message of a topic's first frame [s], where its first messages show it."""
 
+    def corrected(self, late_ns: Mapping[str, int]) -> ClockPlan:
+        """The plan of stamps that the robot file's clocks correct before they come, by ``late_ns`` of their topic [ns]."""
+        latency_ns = {topic: latency - late_ns.get(topic, 0) for topic, latency in self.latency_ns.items()}
+        return dataclasses.replace(self, latency_ns=latency_ns)
+
     def first_stamps(self, first: Mapping[str, Sequence[FirstMessage]]) -> Iterator[int]:
         """Shifted header stamps of those of the ``first`` messages, from which the plan was made, that are not old."""
         for topic, pairs in first.items():

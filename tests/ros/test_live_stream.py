@@ -80,21 +80,32 @@ def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
     assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it; synchronize the clocks."]
 
 
-@pytest.mark.extended
-def test_live_node_names_a_topic_whose_stamps_are_off_the_times_of_receiving():
-    """By more than turns are searched for."""
+def with_scans_ahead(seconds: int, until_s: float = math.inf):
+    """Warnings of a node whose scans are stamped ``seconds`` ahead, by the messages of the first ``until_s``."""
 
     def shift(messages):
         found = []
-        for message in messages:
+        for message in (m for m in messages if m.received_ns - messages[0].received_ns < until_s * S):
             data = bytearray(message.data)
             if message.topic == "/scan":  # seconds of the stamp, behind the encapsulation
-                data[4:8] = (int.from_bytes(data[4:8], "little") + 2).to_bytes(4, "little")
+                data[4:8] = (int.from_bytes(data[4:8], "little") + seconds).to_bytes(4, "little")
             found.append(message._replace(data=bytes(data)))
         return found
 
-    node, _ = run_node(LogTransport(drive_log(scans_hz=6.25), shift))
-    (named,) = (text for text in node.warnings() if "times of receiving" in text)
+    return run_node(LogTransport(drive_log(scans_hz=6.25), shift))[0].warnings()
+
+
+@pytest.mark.extended
+def test_live_node_corrects_the_clock_of_a_lidar_once():
+    found = with_scans_ahead(2)
+    assert [text for text in found if text.startswith("/scan: its stamps are 2.0") and "Corrected" in text]
+    assert not [text for text in found if "times of receiving" in text]  # they are right from there on
+
+
+@pytest.mark.extended
+def test_live_node_names_a_topic_whose_stamps_are_off_the_times_of_receiving():
+    """Before the drive has shown whose clock is off."""
+    (named,) = (text for text in with_scans_ahead(2, until_s=9.0) if "times of receiving" in text)
     assert named.startswith("/scan: its stamps are 1.9")
     assert "s ahead of" in named
 
