@@ -276,7 +276,7 @@ class PoseGraph:
         return factors, values
 
     def _add_keyframe(self, pose: FloatArray, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        key, bias = gtsam.symbol("x", self.count), self.keyframes.bias_prior()
+        key = gtsam.symbol("x", self.count)
         values.insert(key, self.keyframes.value(pose))
         if self.count:
             return
@@ -285,7 +285,7 @@ class PoseGraph:
             prior = np.zeros(len(self.prior_cov))
             factors.add(gtsam.PriorFactorVector(gtsam.symbol("c", 0), prior, gtsam.noiseModel.Gaussian.Covariance(self.prior_cov)))
             values.insert(gtsam.symbol("c", 0), prior)
-        if bias is not None:
+        if (bias := self.keyframes.bias_prior()) is not None:
             factors.add(bias[1])
             values.insert(bias[0], np.zeros(3))
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from localization.trajectory import IntArray
-from motion_models.groups import Group
+from motion_models.groups import Group, between
 from motion_models.se2 import FloatArray
 
 
@@ -76,8 +77,7 @@ def through_nodes(
     travelled = np.append(0.0, np.cumsum(np.linalg.norm(each(group.local, odometry[:-1], odometry[1:]), axis=1) + 1e-9))
     length = np.where(b > a, travelled[nodes[b]] - travelled[nodes[a]], math.inf)
     part = np.clip((travelled - travelled[nodes[a]]) / length, 0.0, 1.0)
-    back = each(group.compose, each(group.inverse, odometry), odometry[nodes[a]])
-    until = each(group.compose, each(group.inverse, odometry), odometry[nodes[b]])
+    back, until = (each(partial(between, group), odometry, odometry[nodes[end]]) for end in (a, b))
     forward, backward = each(group.compose, poses[a], each(group.inverse, back)), each(group.compose, poses[b], each(group.inverse, until))
     A, B, w = each(group.adjoint, back), each(group.adjoint, until), part[:, None, None]
     mixed = (1.0 - w) * (A @ covs[a] @ A.swapaxes(-1, -2)) + w * (B @ covs[b] @ B.swapaxes(-1, -2))

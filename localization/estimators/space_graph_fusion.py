@@ -97,7 +97,7 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         if not self.graph.count or way > c.keyframe_distance_m or turn > c.keyframe_angle_rad:
             self._add_keyframe(delta, cov)
             delta, cov = np.eye(4), np.zeros((6, 6))
-        if step.gravity is not None:
+        if step.gravity is not None and self._smoothing is not None:
             k, force, variance = self.graph.count - 1, step.gravity.force, step.gravity.variance
             self.graph.apply(GraphUpdate(gravities=(GravityMeasurement(k, force, delta[:3, :3], variance),)))
         self._place_positions(step, delta, cov)

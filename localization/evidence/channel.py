@@ -60,12 +60,12 @@ def channel_evidence(
         noise = floor[i], relative[i]
         b[:] = 0.0
         _first(z[i], floor[i], tau[i], x, c[i])
-        for step in range(_ITERATIONS + 1 if k > 1 else _ITERATIONS):
-            if step or k < 2:
-                _motion(z[i], noise, np.exp(c[i]), b, size, x)
+        if k > 1:
+            _maps(z[i], noise, (tau[i], bias_sigma), size, x, c[i], b, information[i])
+        for _ in range(_ITERATIONS):
+            _motion(z[i], noise, np.exp(c[i]), b, size, x)
             if k > 1:
-                _scales(z[i], noise, tau[i], x, c[i], b, information[i])
-                _biases(z[i], noise, np.exp(c[i]), b, bias_sigma, size, x)
+                _maps(z[i], noise, (tau[i], bias_sigma), size, x, c[i], b, information[i])
         scale = np.exp(c[i])
         own, moving = _size_of_motion(z[i], noise, scale, b, size, x, least[i])
         price[i] = -0.5 * (math.log(own / size) / _SIZE_SIGMA) ** 2 + _price(c[i], b, information[i], tau[i], bias_sigma)
@@ -129,6 +129,16 @@ def _motion(z: FloatArray, noise: Pair, a: FloatArray, b: FloatArray, size: floa
 def _mean(z: FloatArray, noise: Pair, m: int, a: FloatArray, b: FloatArray, size: float, near: float) -> float:
     """Posterior mean of the motion in bin ``m``, the noise as at a motion ``near``."""
     return float(_by_others(z, noise, -1, m, a, b, size, near)[0])
+
+
+@subroutine
+def _maps(
+    z: FloatArray, noise: Pair, prior: Pair, size: float, x: FloatArray, c: FloatArray, b: FloatArray, information: FloatArray
+) -> None:
+    """Scales, the information on them, and biases (k,) by the motion ``x`` (n,), with sigmas of their ``prior``."""
+    tau, bias_sigma = prior
+    _scales(z, noise, tau, x, c, b, information)
+    _biases(z, noise, np.exp(c), b, bias_sigma, size, x)
 
 
 @subroutine

@@ -183,8 +183,7 @@ class EntranceChecks:
         self.running: LiveSetUp | None = None
         self.notes: list[str] = []
         """Sentences on what was found."""
-        self.corrected: set[str] = set()
-        """Keys of the robot file that were corrected: each once, else what a correction does not change begins the drive for ever."""
+        self._corrected: set[str] = set()  # keys of the robot file
 
     def begin(self, sensors: LiveSensors) -> LiveSetUp | None:
         """Compare the ``sensors`` from here on; None where one alone measures the motion."""
@@ -193,12 +192,22 @@ class EntranceChecks:
         self.running = LiveSetUp(sensors, self._executor) if sources.wheels is not None and others else None
         return self.running
 
-    def end(self, report: Callable[[str], None]) -> None:
-        """The question is answered: what was found is noted and reported."""
-        for text in () if self.running is None else self.running.texts:
+    def end(self, report: Callable[[str], None]) -> SetUp | None:
+        """The question is answered: what was found is noted and reported. The set-up to go on with, where that is another one.
+
+        A key of the robot file is corrected once: what a correction does not change would begin the drive anew for ever.
+        """
+        running, self.running = self.running, None
+        if running is None:
+            return None
+        for text in running.texts:
             self.notes.append(text)
             report(text)
-        self.running = None
+        found = running.found
+        if found is None or found.is_as_declared or (found.keys and self._corrected >= found.keys.keys()):
+            return None
+        self._corrected |= found.keys.keys()
+        return found
 
 
 class KeptMessages:

@@ -15,7 +15,7 @@ from localization.errors import CheckpointError
 from localization.events import CgSample, Event
 from localization.logs.clock_sync import Merger
 from localization.logs.decode import ArmReading, MessageStats, Oddity
-from localization.logs.event_decoder import CLOCKS, EventDecoder, JointsToWheels, OdometryToWheels, decode_item, late_ns
+from localization.logs.event_decoder import CLOCKS, EventDecoder, JointsToWheels, OdometryToWheels, decode_item
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
 from localization.ros.discovery import DiscoveredTopics
@@ -48,7 +48,7 @@ class LiveStream:
         parts, self._stats, self._epoch_ns = discovered.parts, stats, epoch_ns
         self.sources: Sources = parts.sources
         self._event_decoder = EventDecoder(parts.sources, parts.joints, parts.arms, robot, stats, discovered.plan.period_s)
-        late = {source.topic: late_ns(source.kind, robot.clock) for source in parts.sources.used()}
+        late = {topic: decoder.late_ns for topic, decoder in self._event_decoder.decoders.items()}
         self._merger = Merger(discovered.plan.corrected(late), stats, is_live=True)
         self._decoders = {source.topic: decoder(source.type or TYPES[source.kind], is_ros1=is_ros1) for source in parts.sources.used()}
         self.topic_rates = {source.topic: TopicRate() for source in parts.sources.used()}

@@ -444,15 +444,13 @@ class Node:
 
     def _pass_entrance(self, entrance: LiveSetUp) -> None:
         """Go on as robot file and transforms have it, or, from the start of the drive on, with what was found."""
-        self._checks.end(self._report)
+        found = self._checks.end(self._report)
         reading = self.inputs.open_stream(MessageStats())
         reading.restore(self.inputs.stream.wheel_angles)
-        self.inputs.stream.on_reading, found = None, entrance.found
-        is_corrected = found is not None and bool(found.keys) and self._checks.corrected >= found.keys.keys()
-        if found is None or found.is_as_declared or is_corrected:  # what is corrected once is as good as it gets
+        self.inputs.stream.on_reading = None
+        if found is None:
             self.session.start_error_m = 0.0
             return
-        self._checks.corrected |= found.keys.keys()
         self.session.state.wiring = LiveRobot(found.robot, found.is_gyro_used)  # checkpoints hold it from now on
         self.inputs.rewire(self.session.state.wiring, self.session.pipeline.mounts)
         self._begin_anew(found.robot.with_mounts(self.session.pipeline.mounts))

@@ -203,15 +203,12 @@ class StandstillTest:
 
     def _settled_rate(self) -> tuple[float, float]:
         """`_rate` without the end of the standstill, at which the robot may set off before its wheels count."""
-        seconds = np.array([duration for _, duration, _ in self._turns])
-        until_end = seconds.sum() - np.cumsum(seconds) + seconds
-        kept = [turn for turn, left in zip(self._turns, until_end.tolist(), strict=True) if left > _SETTLING_S]
-        turned, time, _ = np.array(kept or self._turns).sum(axis=0).tolist()
-        return turned / time, self._density() / time
+        until_end = np.cumsum([seconds for _, seconds, _ in reversed(self._turns)])[::-1].tolist()
+        return self._rate([turn for turn, left in zip(self._turns, until_end, strict=True) if left > _SETTLING_S])
 
-    def _rate(self) -> tuple[float, float]:
-        """Mean of the gyro's rate in this standstill [rad/s], and its variance [rad^2/s^2]."""
-        angle, seconds, _ = np.array(self._turns).sum(axis=0).tolist()
+    def _rate(self, turns: Sequence[tuple[float, float, float]] = ()) -> tuple[float, float]:
+        """Mean of the gyro's rate in this standstill [rad/s], or in those of its ``turns``, and its variance [rad^2/s^2]."""
+        angle, seconds, _ = np.array(turns or self._turns).sum(axis=0).tolist()
         return angle / seconds, self._density() / seconds
 
     def _density(self) -> float:
