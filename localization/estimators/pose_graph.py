@@ -140,7 +140,7 @@ class SmoothedKeyframes:
     """(K, dim, dim) of their right perturbations."""
     group: PoseGroup
     rows: Sequence[int]
-    marginals: gtsam.Marginals
+    marginals: gtsam.ISAM2
 
     def relative_cov(self, a: int, b: int) -> FloatArray:
         """(dim, dim) covariance of the right perturbation of the motion from keyframe ``a`` to ``b``."""
@@ -226,8 +226,8 @@ class PoseGraph:
             for loop in self.loops:
                 graph.add(self._motion(loop))
             values = levenberg_marquardt(graph, values)
-            linear = graph.linearize(values)
-            marginals, rows = gtsam.Marginals(linear, linear.optimize()), self.keyframes.rows
+            marginals, rows = make_isam(), self.keyframes.rows
+            marginals.update(graph, values)
             covs = np.array([marginals.marginalCovariance(gtsam.symbol("x", k))[np.ix_(rows, rows)] for k in range(self.count)])
         self._values = values
         poses = self.poses()
@@ -301,11 +301,7 @@ class LivePoseGraph(PoseGraph):
     """A `PoseGraph` that is solved at each update: `poses`, `corrections` and `marginal` are the estimates by all that was added."""
 
     def __post_init__(self) -> None:
-        params = gtsam.ISAM2Params()
-        params.relinearizeSkip = 1
-        params.setRelinearizeThreshold(_RELINEARIZE)
-        params.setFactorization("QR")  # CHOLESKY ended in IndeterminateLinearSystem after thousands of ordinary steps
-        self._isam = gtsam.ISAM2(params)
+        self._isam = make_isam()
         super().__post_init__()
 
     def apply(self, update: GraphUpdate) -> None:
@@ -360,6 +356,16 @@ def robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., Flo
     return gtsam.CustomFactor(gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov)), list(keys), error)
 
 
+def make_isam() -> gtsam.ISAM2:
+    """By QR, whose error grows with the condition number of the factors, and by Cholesky with its square: 1.8e7 where a LiDAR is lost for a
+    fifth of the drive, of which the square is beyond double precision."""
+    params = gtsam.ISAM2Params()
+    params.relinearizeSkip = 1
+    params.setRelinearizeThreshold(_RELINEARIZE)
+    params.setFactorization("QR")
+    return gtsam.ISAM2(params)
+
+
 def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
     """GTSAM's own loop copies all values at every Python callback; this one does the same without: damped steps until the cost stays."""
     cost, damping = graph.error(values), 0.0
@@ -367,7 +373,7 @@ def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values)
         linear = graph.linearize(values)
         for key, n in values.dims().items() if damping else ():
             linear.push_back(gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
-        moved = values.retract(linear.optimize())
+        moved = values.retract(linear.optimize(gtsam.EliminateQR))  # as in `make_isam`
         new_cost = graph.error(moved)
         if new_cost > cost * (1.0 + 1e-12) + 1e-12:
             damping = max(10.0 * damping, 1e-3)
