@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from localization.bounded_settings import Allowed, Below, Count, Positive, Settings, Share
 from localization.lidar import registration
 from localization.lidar.correlative_search import OUTLIER_COST, find_place, prior_outlier_cov
 from localization.lidar.key_scans import KeyScanError, KeyScans, key_scan_noise
 from localization.lidar.registration import Alignment, align_points, is_narrow, linearize, mahalanobis
-from localization.lidar.submap import voxel_means
+from localization.lidar.submap import MAX_RINGS, voxel_means
 from localization.small_filters import FORGETTING
 from motion_models import se2
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2, Tangent2, triple
@@ -22,6 +23,9 @@ MIN_POINTS = 10
 _CELL_OF_RANGE = 0.02
 """Voxel of a submap, as a share of the first scan's median range: in five buildings and six rooms 3 % is as robust and less precise."""
 _NO_OFFSET = np.zeros(3)
+_WITH_SURFACE = 0.8
+"""Least share of the first scan's points that have a surface in a submap of this scan alone: more than `LidarConfig.search_below`, below
+which each scan of a place that is mapped would be searched. A scanner with 80 beams has 0.4 at 2 % of its range, ACES's with 180 0.7."""
 MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
@@ -39,7 +43,8 @@ class LidarConfig(Settings):
     matcher: Literal["submap", "kiss"] = "submap"
     """What aligns scans first: Gauss-Newton on the `submap` from the prediction, or KISS-ICP from it (`kiss`), which the submap refines."""
     voxel_size_m: Annotated[float, Allowed("0, or from 0.01 to 10", lambda value: value == 0.0 or 0.01 <= value <= 10.0)] = 0.0
-    """Edge of the voxels [m]; 0 takes 2 % of the first scan's median range (KISS-ICP: 5 %), at least 2 sigma of a range."""
+    """Edge of the voxels [m]; 0 takes 2 % of the first scan's median range (KISS-ICP: 5 %), at least 2 sigma of a range, and more where the
+    scanner has few beams."""
     min_range_m: Annotated[float, Below("max_range_m")] = 0.1
     """Nearer points are the robot itself [m]."""
     max_range_m: Positive = 50.0
@@ -181,8 +186,11 @@ class ScanMatcher:
 
 
 def choose_cell(config: LidarConfig, points: Points2) -> float:
-    """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame: at least two sigma of a range."""
-    return config.voxel_size_m or max(_CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1]))), 2.0 * config.range_noise_m)
+    """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame: at least two sigma of a range, and as large
+    as it has to be for surfaces, which take the points of three voxels within `MAX_RINGS` (`submap.fill_surface`)."""
+    to_third = cKDTree(points).query(points, k=3)[0][:, 2] / MAX_RINGS
+    of_range = _CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1])))
+    return config.voxel_size_m or max(of_range, 2.0 * config.range_noise_m, float(np.quantile(to_third, _WITH_SURFACE)))
 
 
 def _is_better(found: Alignment, fit: Alignment, prior: Pose2, cov: Cov3) -> bool:
