@@ -212,7 +212,8 @@ class MovingObjects:
         self._compared = _Comparison(view.poses, self._suspicion is not None or distance > MIN_OFF_M)
         self._window.is_scene_moving = now_s - self._shown_s < CALM_S or lidar.is_active
         if lidar.is_active:
-            self.report.add(moved_share)
+            if self._is_by_scans:
+                self.report.add(moved_share)
             if self._departure is None:
                 self._departure = Departure(view.poses if self._suspicion is None else self._suspicion.begin, self._is_by_scans)
         elif self._departure is not None and not self._views.is_active:

@@ -80,6 +80,13 @@ def test_scene_that_moves_is_in_the_covariance(name: str) -> None:
 
 
 @pytest.mark.extended
+def test_no_objects_are_reported_of_an_estimate_that_is_by_no_scans() -> None:
+    """By wheels that nobody has calibrated, all of a still world moves."""
+    outcome = run(in_room(2), without_gyro(multiply_wheels(0.5, 0.3, 0.6)), estimator="odometry")
+    assert MOVING_OBJECTS not in outcome.pipeline.checks.found
+
+
+@pytest.mark.extended
 def test_pose_that_people_at_rest_have_moved_is_in_the_covariance() -> None:
     """The first scan after a rest fits .1 m elsewhere, before the wheels have moved by a centimetre: that is no slip."""
     outcome = run(SCENES["20 people edge away"](2))
