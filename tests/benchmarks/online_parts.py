@@ -15,6 +15,7 @@ from typing import Any
 
 from localization.pipeline import Pipeline, Trial
 from localization.ros.jit_warm_up import WarmUp
+from localization.ros.live_outputs import LiveOutputs
 from localization.ros.live_set_up import LiveSetUp
 from localization.ros.live_stream import LiveStream
 from localization.ros.node import Node
@@ -36,7 +37,7 @@ _PARTS: tuple[tuple[str, type[Any], str], ...] = (
     ("pipeline: steps of the estimator, buffers", Pipeline, "process"),
     ("work after an estimate", Pipeline, "run_deferred"),
     ("prediction", Predictor, "predict"),
-    ("encoding of predictions", EstimatePublisher, "publish_prediction"),
+    ("encoding of predictions", LiveOutputs, "publish_prediction"),
     ("encoding of estimates", EstimatePublisher, "publish_estimate"),
     ("state to disk", Session, "save_state"),
     ("comparison of sensors on the first metres", LiveSetUp, "add_event"),
