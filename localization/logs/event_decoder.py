@@ -371,8 +371,12 @@ class PublisherSeparator:
 
 
 def _changes(values: Sequence[complex], before: Sequence[complex]) -> list[float]:
-    """Sizes of the changes of ``values`` from those ``before``; NaN where they are not known."""
-    changes = [abs(a - b) for a, b in zip(values, before, strict=True)]
+    """Sizes of the changes of ``values`` from those ``before``; NaN where they are not known.
+
+    Not by abs(): that of a complex NaN raises OverflowError where an earlier call of C has left errno at ERANGE (CPython 3.11).
+    """
+    differences = [a - b for a, b in zip(values, before, strict=True)]
+    changes = [math.hypot(difference.real, difference.imag) for difference in differences]
     return [change if change < math.inf else math.nan for change in changes]
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import math
+
 import numpy as np
 import pytest
 
@@ -74,3 +77,11 @@ def test_outlier_among_constant_speeds_makes_no_second_publisher() -> None:
     values[[50, 120]] = 1e5, -1e300
     values[160] = np.inf, np.nan
     assert left_out(values, 20.0) == 0.0
+
+
+def test_unknown_places_are_admitted_after_a_number_beyond_the_range_of_c() -> None:
+    """Twists have no place. CPython 3.11's abs() of a complex NaN raises OverflowError while errno is ERANGE, as JIT compilers leave it."""
+    separator, unknown, strtod = PublisherSeparator(), complex(math.nan, math.nan), ctypes.CDLL(None).strtod
+    assert separator.admit(0, [0.4, unknown], 0.4)
+    strtod(b"1e999", None)
+    assert separator.admit(20_000_000, [0.4, unknown], 0.4)

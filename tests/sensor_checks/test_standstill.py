@@ -29,7 +29,8 @@ def test_wheels_that_read_zero_while_the_lidar_moves_are_unknown() -> None:
 def test_lidar_alone_is_outvoted_by_wheels_and_another_sensor(rate_noise: float | None, shake_m_s2: float | None) -> None:
     """People walk around a standing robot: its scans look like motion. Wheels, gyro and IMU together show that the scene moves."""
     rng = np.random.default_rng(1)
-    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=None if rate_noise is None else lambda w: 0.01 + rate_noise * rng.normal())
+    gyro = None if rate_noise is None else lambda w: 0.01 + rate_noise * rng.normal()
+    robot = CheckedDrive(wheels=lambda v, w: (0.0, 0.0), gyro=gyro, nis=3.0)
     for k in range(0 if shake_m_s2 is None else 400):
         robot.checks.insert_imu(ImuSample(k * S // 50, np.zeros(3), np.array([0.0, 0.0, 9.8]) + shake_m_s2 * rng.normal(size=3)))
     are_all_at_rest = rate_noise is not None and shake_m_s2 is not None
