@@ -9,11 +9,11 @@ import pytest
 
 from motion_models import se2
 from tests.league import joined, page, tables, tuning
-from tests.league.__main__ import main
+from tests.league.__main__ import main, run_system
 from tests.league.evalio_pipelines import PIPELINES
 from tests.league.logs import find_logs, peer_arrays
 from tests.league.peers.exchange import Drive, matrix, peak_memory_mb, planar
-from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE
+from tests.league.systems import PEERS, SYSTEMS, SYSTEMS_IN_SPACE, System
 from tests.studies.hills import FRONT_ENDS
 
 
@@ -149,3 +149,14 @@ def test_settings_of_a_large_grid_are_drawn_within_the_budget():
     assert len(tuning.draw(grid, 40)) == 6
     assert tuning.draw(grid, 4) == tuning.draw(grid, 4)
     assert len({tuning.name_with("x", settings) for settings in tuning.draw(grid, 4)}) == 4
+
+
+def test_result_of_defaults_is_none_of_other_settings(tmp_path):
+    """A peer that ran with its defaults still has to run with the settings that were tuned."""
+    folder = tmp_path / "of_the_peer"
+    folder.mkdir()
+    system = System("mine", "", folders=(folder,), tuned={"voxel": (0.1, 0.2)})
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "mine.json").write_text("{}")
+    assert not run_system(system, "a", tmp_path, None)
+    assert "mine: no run_mine.cpp" in run_system(system, "a", tmp_path, None, {"voxel": 0.1})

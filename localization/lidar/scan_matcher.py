@@ -26,6 +26,9 @@ _NO_OFFSET = np.zeros(3)
 _WITH_SURFACE = 0.8
 """Least share of the first scan's points that have a surface in a submap of this scan alone: more than `LidarConfig.search_below`, below
 which each scan of a place that is mapped would be searched. A scanner with 80 beams has 0.4 at 2 % of its range, ACES's with 180 0.7."""
+_WRONG_WHEELS = 2.0 / 3.0
+"""Sigma of the factor by which wheels that are outliers are wrong: within 3 sigma they count any motion from three times to the opposite of
+what they do. Between scans a second apart that is metres."""
 MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
@@ -94,13 +97,20 @@ class ScanMatcher:
         self._residuals = np.full(3, 1e-3)  # sums over the last scans: squares, squares of blocks, inliers
 
     def match(
-        self, points: Points2, prior: Pose2, cov: Cov3, guess: Pose2 | None = None, offset: Tangent2 = _NO_OFFSET
+        self,
+        points: Points2,
+        prior: Pose2,
+        cov: Cov3,
+        guess: Pose2 | None = None,
+        offset: Tangent2 = _NO_OFFSET,
+        moved: Pose2 = _NO_OFFSET,
     ) -> ScanMatch | None:
         """The pose of ``points`` near ``prior`` (3,), whose error against the submap has covariance ``cov`` (3, 3); None where it is lost.
 
         Gauss-Newton starts from ``guess`` (3,), or from the prior. A pose is searched where what the scan takes off the prior is wider than
         the basin of convergence, or where the result does not fit; one that fits far from the prior is aligned again with the prior as an
         outlier. ``offset`` (3,), from the prior to where the twist of the last step would lead, widens the search, and is tried beside it.
+        ``moved`` (3,), by the wheels since the last scan, widens it by what these may be wrong by (`_WRONG_WHEELS`).
         """
         fit = align_points(self.submap.grid, points, prior, cov, prior if guess is None else guess)
         self.mapped_share = fit.n_associated / len(points)
@@ -109,7 +119,7 @@ class ScanMatcher:
         converges, agrees = is_narrow(taken_off), mahalanobis(prior, fit.pose, cov) < 2.0 * OUTLIER_COST
         fits = converges and fit.overlap >= self._config.search_below
         if not (fits and agrees):
-            added = prior_outlier_cov(cov) + np.outer(offset, offset)
+            added = prior_outlier_cov(cov) + np.outer(offset, offset) + _WRONG_WHEELS**2 * np.outer(moved, moved)
             start: Pose2 | None = fit.pose
             if not fits:
                 start = find_place(self.submap.image, voxel_means(points, self.submap.cell), prior, cov + added, cov)

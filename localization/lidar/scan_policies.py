@@ -9,7 +9,7 @@ import numpy as np
 from localization.events import Scan, Step
 from localization.lidar.scan_matcher import LidarConfig
 from motion_models import se2
-from motion_models.se2 import FloatArray
+from motion_models.se2 import FloatArray, Pose2
 
 MOVED_COV = np.diag([3.0, 3.0, 1.5]) ** 2
 """Covariance of the pose of a robot that was moved by other than its wheels: carried across a room, and turned to any side [m^2, m^2,
@@ -45,23 +45,25 @@ class MovedRobot:
     def __init__(self, config: LidarConfig) -> None:
         self._config = config
         self._mapped_shares: dict[str, float] = {}  # of the last scan in each frame
-        self._since = np.zeros(3)  # motion by the wheels since the last scan
+        self.since: Pose2 = np.zeros(3)
+        """(3,) motion by the wheels from the last scan to the begin of the step."""
         self._at_ns: int | None = None
 
     def add_no_scan(self, step: Step) -> None:
         """A step that ends without a scan."""
-        self._since = se2.compose(self._since, step.predicted.delta)
+        self.since = se2.compose(self.since, step.predicted.delta)
 
     def begin(self, scan: Scan) -> None:
         """``scan`` begins a submap: all of it is mapped."""
-        self._since = np.zeros(3)
+        self.since = np.zeros(3)
         self._mapped_shares = {scan.frame_id: 1.0}
 
-    def is_moved(self, step: Step, scan: Scan, mapped_share: float, *, is_matched: bool) -> bool:
-        """Whether the robot was moved since the last scan, by the ``mapped_share`` of the points of ``scan`` of ``step`` and before."""
+    def is_moved(self, step: Step, scan: Scan, motion: Pose2, mapped_share: float, *, is_matched: bool) -> bool:
+        """Whether the robot was moved by other than its wheels since the last scan, which have the ``motion`` (3,): by the ``mapped_share``
+        of the points of ``scan`` of ``step`` and before."""
         before, c = self._mapped_shares.get(scan.frame_id, 0.0), self._config
         self._mapped_shares[scan.frame_id] = mapped_share
-        (x, y, yaw), self._since = se2.compose(self._since, step.predicted.delta), np.zeros(3)
+        (x, y, yaw), self.since = motion, np.zeros(3)
         if is_matched or step.is_scan_partial or before <= c.search_below or mapped_share >= c.lost_below:
             return False
         if math.hypot(x, y) >= c.key_distance_m or abs(yaw) >= c.key_angle_rad:

@@ -97,8 +97,9 @@ class ScanMatchingSensor:
         guess = None
         if self._kiss is not None:
             guess = self._kiss.align(deskewed.points, prior, registration.prior_error_at_points(deskewed.planar, cov))
-        found = self._matcher.match(deskewed.planar, prior, cov, guess, offset)
-        if self.moved.is_moved(step, scan, self._matcher.mapped_share, is_matched=found is not None):
+        moved = se2.compose(self.moved.since, step.predicted.delta)
+        found = self._matcher.match(deskewed.planar, prior, cov, guess, offset, moved)
+        if self.moved.is_moved(step, scan, moved, self._matcher.mapped_share, is_matched=found is not None):
             self._scan, self._matcher.is_new_place = None, False
             return None, "moved"
         return found, "lost" if found is None else ""

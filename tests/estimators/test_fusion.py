@@ -200,6 +200,20 @@ def test_ekf_with_encoders_at_zero_follows_lidar() -> None:
     assert np.hypot(*(poses - drive.poses)[:, :2].T).max() < 0.1
 
 
+@pytest.mark.parametrize("walls", [LAB, pytest.param(HALL, marks=pytest.mark.extended)])
+def test_ekf_with_sparse_scans_and_encoders_without_sign_follows_lidar(walls: FloatArray) -> None:
+    """Between two scans wheels that count backwards ahead are off by twice the way, which is metres."""
+
+    def unsigned(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
+        return np.abs(twists) * [1.0, 1.0, 0.0] + twists * [0.0, 0.0, 1.0]
+
+    way = rooms.path((2, 0, 0), (5, 0.5, 0.3), (4, -0.5, 0.0), (5, 0.5, 0.3), (4, -0.5, -0.1), (4, 0.5, 0.3), (2, 0, 0))
+    scanner = rooms.Beams(beams=361, view=math.pi, rate_hz=0.5, fill=0.0)
+    drive = rooms.drive_through(walls, way, 0, scanner=scanner, wheels=unsigned)
+    poses, _ = rooms.at_scans(drive, ekf(drive))
+    assert np.hypot(*(poses - drive.poses)[:, :2].T).max() < 0.03
+
+
 def test_ekf_with_wheels_that_stall_and_catch_up_loses_no_scan() -> None:
     """A driver that repeats its odometry for 0.6 s, and then publishes all of the motion at once, while the robot drives and turns fast."""
 

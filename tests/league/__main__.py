@@ -69,7 +69,7 @@ def run_system(system: System, log: str, out: Path, folder: Path | None, setting
     """Run ``system`` on ``log`` unless its result is there. Returns why it failed, or an empty string. ``settings`` that are not its
     defaults are part of the result's name."""
     target = out / log / tuning.name_with(system.name, settings)
-    if target.with_name(f"{system.name}.json").exists():
+    if target.with_name(f"{target.name}.json").exists():
         return ""
     pairs = [f"{name}={value:g}" for name, value in settings.items()]
     if system.folders and not system.tuned:
