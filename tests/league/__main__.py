@@ -147,6 +147,8 @@ def rows_of(
     rows: list[dict[str, Any]] = []
     floor = {} if isinstance(reference, Relations) else {"floor_m": math.hypot(*REFERENCE_SIGMA[:2])}
     for system, tuned in systems:
+        if tuned is not None and tuned.log == log:  # which judges no settings that it has chosen
+            continue
         settings = NO_SETTINGS if tuned is None else tuned.settings
         name, file = system.name + ("" if tuned is None else f", tuned on {tuned.log}"), tuning.name_with(system.name, settings)
         reason = run_system(system, log, out, folder, settings)
