@@ -172,7 +172,7 @@ class Pipeline:
     def warnings(self) -> list[str]:
         """Problems of the sensors so far."""
         losses = self.lidar
-        description = "" if losses is None else losses.describe()
+        description = losses.describe() if losses is not None and losses.is_event else ""
         found = [*self.estimator.warnings(), *([description] if description else [])]
         return [*self.synchronizer.warnings(), *self.checks.warnings(), *(f"{self._name}: {problem}" for problem in found)]
 

@@ -39,6 +39,8 @@ _CAUSES: Mapping[str, tuple[str, str]] = {
     ),
 }
 """What happened and what to do, by cause."""
+_BRIDGED = {"lost", "sparse", "excluded"}
+"""Causes that single scans of a healthy LiDAR have."""
 _SILENCE_ADVICE = "Check the LiDAR's driver, cable and topic."
 
 
@@ -73,6 +75,12 @@ class LidarLosses:
     def is_long(self) -> bool:
         """Whether so much is missing that the run is not to be recommended without a measured error."""
         return is_long(self.share, self.longest_s)
+
+    @property
+    def is_event(self) -> bool:
+        """Whether something happened to LiDAR or robot, or much is missing. Single scans that fit nowhere, have few points, or
+        were left out by a check, which has a sentence of its own, are bridged by the other sensors."""
+        return self.is_long or bool(self.silences) or not set(self.causes) <= _BRIDGED
 
     @property
     def summary(self) -> str:

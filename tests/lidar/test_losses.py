@@ -83,6 +83,19 @@ def test_describe_without_lost_scans_is_empty() -> None:
     assert not losses.is_long
 
 
+@pytest.mark.parametrize(
+    ("matched", "is_event"),
+    [
+        ("m" * 100 + "l" + "m" * 100, False),
+        ("m" * 100 + "x" * 4 + "m" * 100, False),
+        ("m" * 100 + "x" * 20 + "m" * 100, True),
+        ("m" * 100 + "s" + "m" * 100, True),
+    ],
+)
+def test_single_scans_that_are_bridged_are_no_event(matched: str, is_event: bool) -> None:
+    assert LidarLosses.of(counted(matched)).is_event == is_event
+
+
 def test_isolated_lost_scans_are_not_long() -> None:
     """One of 36 is empty."""
     losses = LidarLosses.of(counted((35 * "m" + "l") * 36 + "m"))
