@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from localization.evaluation.reference_files import read_reference_file
     from localization.evaluation.references import reference_track
     from localization.evaluation.scores import Result, score
+    from localization.inputs.step_config import StepConfig
     from localization.log_replay import Run, replay
     from localization.logs import Log, TopicOverrides, open_log
     from localization.pipeline import ReplayConfig, Trial
-    from localization.step_config import StepConfig
     from localization.trajectory import Trajectory, read_tum, write_tum
 
 __all__ = [
@@ -47,7 +47,7 @@ _MODULES = {
     "localization.logs": "Log TopicOverrides open_log",
     "localization.pipeline": "ReplayConfig Trial",
     "localization.log_replay": "Run replay",
-    "localization.step_config": "StepConfig",
+    "localization.inputs.step_config": "StepConfig",
     "localization.trajectory": "Trajectory read_tum write_tum",
 }
 __getattr__ = exports(__name__, {name: module for module, names in _MODULES.items() for name in names.split()})

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from localization.attitude import AttitudeFilter
+from localization.inputs.attitude import AttitudeFilter
 from localization.output import whole_file
 from localization.space_pose import Pose3, aligning, quaternion, yaw_rotation
 from localization.trajectory import IntArray, Trajectory

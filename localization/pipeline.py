@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from localization.attitude import AttitudeFilter
 from localization.estimators import (
     ESTIMATORS_IN_SPACE,
     ESTIMATORS_WITH_CORRECTIONS,
@@ -25,10 +24,11 @@ from localization.estimators import (
     make_localizing,
 )
 from localization.events import Event, ImuSample, PositionSample, Scan
+from localization.inputs.attitude import AttitudeFilter
+from localization.inputs.step_config import StepConfig
+from localization.inputs.synchronizer import Synchronizer
 from localization.lidar.losses import LidarLosses
 from localization.sensor_checks import SensorChecks
-from localization.step_config import StepConfig
-from localization.synchronizer import Synchronizer
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, add_correction_parameters, make_corrections
 from motion_models.robot import Mount, Robot

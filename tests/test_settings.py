@@ -12,6 +12,7 @@ from localization.core.motion import FilterConfig
 from localization.diagnosis.diagnose import DiagnosisConfig
 from localization.errors import SettingError
 from localization.evaluation.metrics import EvaluateConfig
+from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
 from localization.pipeline import ReplayConfig
 from localization.simulation.experiments import ExperimentConfig
@@ -19,7 +20,6 @@ from localization.simulation.scanners import ScannerConfig, SpinningConfig
 from localization.simulation.sensors import EncoderConfig, GpsConfig, SensorConfig
 from localization.simulation.simulator import SimulationConfig
 from localization.simulation.vehicle import VehicleConfig
-from localization.step_config import StepConfig
 
 ROOTS = (ReplayConfig, SimulationConfig, DiagnosisConfig, WindowConfig, EvaluateConfig)
 

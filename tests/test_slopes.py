@@ -9,13 +9,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from localization.inputs.step_config import StepConfig
 from localization.log_replay import replay
 from localization.logs import open_log
 from localization.pipeline import ReplayConfig, Trial
 from localization.simulation.experiments import Experiment, ExperimentConfig, OpenLoop, Phase, Rest, constant
 from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, simulate, write_simulation
-from localization.step_config import StepConfig
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.registry import make_model
 from motion_models.robot import Robot

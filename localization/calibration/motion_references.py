@@ -12,10 +12,10 @@ import numpy as np
 from localization.evaluation.consistency import covariances_in_body
 from localization.evaluation.references import ReferenceTrack, with_noise
 from localization.events import Event, ImuSample, Scan, Turn
-from localization.gyro import GyroBuffer
+from localization.inputs.gyro import GyroBuffer
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.lidar import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, Sweep, choose_cell
 from localization.trajectory import BoolArray, Trajectory
-from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.motion import Motion

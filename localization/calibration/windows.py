@@ -13,7 +13,7 @@ import numpy as np
 from localization.bounded_settings import Count, Positive, Settings
 from localization.calibration.motion_references import HOLD_S, MotionReference, Span, Wheels
 from localization.events import CgSample, Event, WheelSample
-from localization.wheel_buffer import WheelBuffer
+from localization.inputs.wheel_buffer import WheelBuffer
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.robot import Robot

@@ -21,7 +21,7 @@ from localization.calibration.motion_references import GyroMotionReference, Lida
 from localization.calibration.position_reference import PositionMotionReference
 from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
-from localization.gyro import GyroRecord, is_gravity
+from localization.inputs.gyro import GyroRecord, is_gravity
 from localization.logs.reader import Log
 from localization.simulation.experiments import CONFIGURATION_CGS, CONTROLLERS, TRAJECTORIES
 from motion_models import se2

@@ -37,7 +37,7 @@ from localization.diagnosis.missing_terms import SEARCHED, Search, extended_mode
 from localization.diagnosis.model_extension import Extension, FoundTerm
 from localization.diagnosis.result import DiagnosisResult
 from localization.events import Turn
-from localization.gyro import GyroRecord
+from localization.inputs.gyro import GyroRecord
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import IntArray

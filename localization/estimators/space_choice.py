@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.attitude import AttitudeFilter
 from localization.core.space import SpaceConfig
 from localization.estimate import Estimate
 from localization.estimators.estimator import Estimator
 from localization.estimators.space_fusion import SpaceFusion
 from localization.estimators.space_graph_fusion import SpaceGraphFusion, SpaceGraphSettings
+from localization.inputs.attitude import AttitudeFilter
 from localization.lidar import LidarConfig
 from localization.lifting import Lifting
 from localization.space_pose import Pose3

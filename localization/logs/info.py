@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from localization.accelerometer import scale_of_force
-from localization.gyro import GRAVITY_SAMPLES
+from localization.inputs.accelerometer import scale_of_force
+from localization.inputs.gyro import GRAVITY_SAMPLES
 from localization.logs.decode import imu_decoder
 from localization.logs.event_decoder import TopicDecoder
 from localization.logs.reader import Log

@@ -7,6 +7,8 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+from localization.inputs.step_config import StepConfig
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.logs.decode import MessageStats
 from localization.logs.topic_roles import TopicOverrides
 from localization.ros.continuous_odometry import ContinuousOdometry
@@ -17,8 +19,6 @@ from localization.ros.node_config import NodeConfig
 from localization.ros.predictor import Predictor
 from localization.ros.publisher import EstimatePublisher
 from localization.ros.transports.transport import Received, Transport
-from localization.step_config import StepConfig
-from localization.wheel_buffer import WheelBuffer
 from motion_models.compiled import interpreted
 from motion_models.registry import make_model
 from motion_models.robot import Robot

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 from localization.estimate import Estimate
 from localization.events import CgSample, Event, WheelSample
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.ros.continuous_odometry import ContinuousOdometry
 from localization.ros.discovery import MAX_BACKLOG
 from localization.ros.live_stream import LiveStream
 from localization.ros.predictor import Predictor
 from localization.ros.publisher import EstimatePublisher
 from localization.ros.transports.transport import Received
-from localization.wheel_buffer import WheelBuffer
 from motion_models.compiled import interpreted
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from localization.estimate import Estimate
 from localization.estimators import GraphFusion
 from localization.events import Event, Scan, WheelSample
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.pipeline import Pipeline, Trial
 from localization.ros.continuous_odometry import ContinuousOdometry
 from localization.ros.gnss import GeodeticMap, utm_pose
@@ -19,7 +20,6 @@ from localization.ros.publisher import EstimatePublisher
 from localization.ros.session import Session
 from localization.ros.settings import LiveRun
 from localization.ros.start_pose import StartPose
-from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.se2 import Cov3, Pose2
 

@@ -24,6 +24,7 @@ from localization.errors import CheckpointError
 from localization.estimate import Estimate
 from localization.estimators import PriorMap, SavedMapFusion
 from localization.events import Event, Scan
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.logs.decode import MessageStats
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import read_head
@@ -44,7 +45,6 @@ from localization.ros.session import LiveRobot, Session, SessionState, View, mad
 from localization.ros.settings import LiveRun
 from localization.ros.start_pose import StartPose
 from localization.ros.transports.transport import Received, Transport
-from localization.wheel_buffer import WheelBuffer
 from motion_models.errors import RobotError
 from motion_models.prior import prior_notes
 from motion_models.robot import Clock, Mount

@@ -11,9 +11,9 @@ import numpy as np
 from localization.core.twist import CHANGE_SHARE, SLIP_LASTS_S, TWIST_FLOOR
 from localization.estimate import Estimate, GyroCalibration
 from localization.events import Turn
-from localization.step_config import StepConfig
-from localization.wheel_buffer import WheelBuffer
-from localization.wheel_gaps import UnknownVelocity
+from localization.inputs.step_config import StepConfig
+from localization.inputs.wheel_buffer import WheelBuffer
+from localization.inputs.wheel_gaps import UnknownVelocity
 from motion_models.base import MotionModel
 from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import assign

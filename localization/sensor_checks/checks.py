@@ -11,6 +11,7 @@ import numpy as np
 
 from localization.estimators import Estimate, Estimator, Residuals
 from localization.events import ImuSample, Scan, Step
+from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
 from localization.sensor_checks.bias_changes import BiasChangeCheck
 from localization.sensor_checks.clocks import ClockCheck
@@ -23,7 +24,6 @@ from localization.sensor_checks.pairs import GYRO_WHEELS, usual_errors
 from localization.sensor_checks.path_uncertainty import PathUncertainty, lever_of_unknown_front
 from localization.sensor_checks.sensor_consistency import SensorConsistency
 from localization.sensor_checks.step_checks import StepChecks
-from localization.step_config import StepConfig
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.robot import Mount, Robot

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from localization.events import ImuSample, Step
+from localization.inputs.step_config import StepConfig
+from localization.inputs.wheel_gaps import UnknownVelocity
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.window import Bins, Window
-from localization.step_config import StepConfig
-from localization.wheel_gaps import UnknownVelocity
 from motion_models.se2 import FloatArray
 
 WHEELS_STANDING = SensorFault(

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from localization.events import Step
+from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
 from localization.sensor_checks.contradictions import Contradictions
 from localization.sensor_checks.faults import FaultLog
@@ -16,7 +17,6 @@ from localization.sensor_checks.own_body import OwnBody
 from localization.sensor_checks.standstill import Standstill
 from localization.sensor_checks.sweep_times import SweepTimes
 from localization.sensor_checks.window import Window
-from localization.step_config import StepConfig
 from motion_models.robot import Mount
 
 

@@ -61,8 +61,8 @@ class SlopeEffect:
         return cls(FrictionModel.from_robot(robot), robot.geometry.cg_height_m, robot.geometry.wheel_deflection)
 
     def warp_of(self, twist: float) -> float:
-        """Load that ground with the ``twist`` [1/m] (`localization.ground_curvature`) moves onto the front left and rear right wheels, over
-        m g / 4: their feet are higher than the others by twist * wheelbase * track / 2, which four tyres share."""
+        """Load that ground with the ``twist`` [1/m] (`localization.inputs.ground_curvature`) moves onto the front left and rear right
+        wheels, over m g / 4: their feet are higher than the others by twist * wheelbase * track / 2, which four tyres share."""
         track, wheelbase, radius = self.friction.nominal[1], self.friction.nominal[2], self.friction.nominal[0]
         return float(twist * wheelbase * track / (4.0 * self.deflection * radius))
 

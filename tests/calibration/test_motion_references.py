@@ -9,8 +9,8 @@ from localization.calibration.motion_references import GyroMotionReference, Lida
 from localization.calibration.windows import WindowConfig, cut
 from localization.evaluation.references import ReferenceTrack
 from localization.events import ImuSample, Scan, WheelSample
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.simulation.world import WORLDS
-from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.registry import make_model
 from motion_models.robot import GyroNoise

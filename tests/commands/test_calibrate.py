@@ -17,8 +17,8 @@ from ruamel.yaml import YAML
 from localization.cli import main
 from localization.evaluation.references import read_relations
 from localization.events import ImuSample, WheelSample
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.logs import TopicOverrides, open_log
-from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver, read_windows, windows_text
 from motion_models.preintegration import preintegrate

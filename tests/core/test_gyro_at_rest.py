@@ -11,7 +11,7 @@ from localization.core.motion import FilterConfig
 from localization.core.policies.standstill import _BIAS_PRIORS
 from localization.estimators.fusion import EkfFusion
 from localization.events import Step
-from localization.rate_series import RateSeries
+from localization.inputs.rate_series import RateSeries
 from motion_models import se2
 from motion_models.motion import Motion
 from motion_models.online_calibration import make_corrections

@@ -24,8 +24,8 @@ from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.errors import EstimatorError
 from localization.evaluation.consistency import mean_band
 from localization.events import Scan, Step, Turn, WheelSample
+from localization.inputs.synchronizer import Synchronizer
 from localization.lidar import KeyScanError
-from localization.synchronizer import Synchronizer
 from motion_models import se2
 from motion_models.motion import Motion
 from motion_models.online_calibration import make_corrections

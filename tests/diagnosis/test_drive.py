@@ -10,8 +10,8 @@ from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, ImuRecord, MessageLoss, StandstillTurn, find_message_loss, find_standstill_turn
 from localization.evaluation.references import ReferenceTrack
 from localization.events import ImuSample, WheelSample
-from localization.gyro import GyroRecord
-from localization.wheel_buffer import WheelBuffer
+from localization.inputs.gyro import GyroRecord
+from localization.inputs.wheel_buffer import WheelBuffer
 from motion_models.calibration.maneuvers import Maneuver
 from motion_models.registry import make_model
 from motion_models.robot import GyroNoise, Mount

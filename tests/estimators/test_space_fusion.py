@@ -10,11 +10,11 @@ import pytest
 
 from localization.core.measurements.position import predict_position_in_space
 from localization.events import PositionSample, WheelSample
+from localization.inputs.step_config import StepConfig
 from localization.log_replay import replay
 from localization.logs.reference_topics import merge_positions
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.state_serialization import deserialize, serialize
-from localization.step_config import StepConfig
 from motion_models.registry import make_model
 from tests.helpers.hill_scans import MOUNT, make_scene, scans
 from tests.helpers.hills import rolling_drive, with_accelerometer_bias, with_gyro_bias

@@ -9,9 +9,9 @@ import numpy as np
 from localization.estimators import Estimate
 from localization.estimators.baselines import DeadReckoning
 from localization.events import Scan, Step, Turn
+from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
-from localization.step_config import StepConfig
 from motion_models import se2
 from motion_models.motion import Motion
 from motion_models.robot_file import load_robot

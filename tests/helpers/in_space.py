@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from localization.events import Event, Scan
+from localization.inputs.step_config import StepConfig
 from localization.pipeline import Pipeline, ReplayConfig, Trial
-from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.registry import make_model
 from motion_models.se2 import FloatArray

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from localization.events import Event, Step
-from localization.synchronizer import Synchronizer
+from localization.inputs.synchronizer import Synchronizer
 
 
 def steps(events: Iterable[Event], synchronizer: Synchronizer) -> Iterator[Step]:

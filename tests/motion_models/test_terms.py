@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from localization.events import WheelSample
-from localization.wheel_motion import WheelMotion
+from localization.inputs.wheel_motion import WheelMotion
 from motion_models import se2
 from motion_models.calibration.fit import FitConfig, fit
 from motion_models.calibration.maneuvers import Maneuver

@@ -22,14 +22,14 @@ from hypothesis import strategies as st
 from localization.errors import CheckpointError
 from localization.estimators import ESTIMATORS, ESTIMATORS_WITH_CORRECTIONS
 from localization.events import StepInterval, WheelSample
+from localization.inputs.step_config import StepConfig
+from localization.inputs.wheel_buffer import WheelInterval
 from localization.lidar import LidarConfig
 from localization.lidar.scan_matcher import ScanMatcher
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.checkpoint import CheckpointWriter, fingerprints, read_checkpoint, read_head, write_checkpoint
 from localization.ros.state_serialization import deserialize, serialize, serialize_parts
 from localization.sensor_checks.innovations import Bin
-from localization.step_config import StepConfig
-from localization.wheel_buffer import WheelInterval
 from motion_models.registry import make_model
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot

@@ -11,15 +11,15 @@ from rosbags.typesys import Stores, get_typestore
 from localization.core.twist import fuse_turn, mean_twist, twist_at_end
 from localization.estimators import Estimate
 from localization.events import WheelSample
+from localization.inputs.step_config import StepConfig
+from localization.inputs.wheel_buffer import WheelBuffer
 from localization.logs.reader import open_source
 from localization.ros.discovery import TF
 from localization.ros.node_config import NodeConfig
 from localization.ros.predictor import Predictor, predicted_motion
 from localization.ros.publisher import ODOMETRY, POSE, PREDICTED_ODOMETRY
 from localization.ros.session import Files
-from localization.step_config import StepConfig
 from localization.trajectory import read_tum
-from localization.wheel_buffer import WheelBuffer
 from motion_models import se2
 from motion_models.preintegration import integrate_twists, noise_vector
 from motion_models.registry import make_model

@@ -12,9 +12,9 @@ from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import reference_track
 from localization.events import Scan
 from localization.evidence.entrance import infer_set_up
+from localization.inputs.lidar_choice import LidarChoice
 from localization.lidar import LidarConfig
 from localization.lidar.merged_sweep import MOUNT_COV, MergedSweeps, MountCorrection
-from localization.lidar_choice import LidarChoice
 from localization.log_replay import replay
 from localization.logs import TopicOverrides, open_log
 from localization.logs.decode import Oddity

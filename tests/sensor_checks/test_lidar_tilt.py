@@ -9,11 +9,11 @@ import pytest
 
 from localization.estimators.baselines import DeadReckoning
 from localization.events import Scan, Step
+from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
 from localization.sensor_checks import SensorChecks
 from localization.sensor_checks.lidar_tilt import LidarTilt, fit_ground
 from localization.simulation import world
-from localization.step_config import StepConfig
 from motion_models.motion import Motion
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot

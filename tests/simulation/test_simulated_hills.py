@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import skidloc
+from localization.inputs.step_config import StepConfig
 from localization.lidar.ground_hits import GroundHits
 from localization.log_replay import replay
 from localization.logs import open_log
@@ -20,7 +21,6 @@ from localization.simulation.sensors import SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from localization.simulation.terrain import make_waves, over_ground, poses_on
 from localization.simulation.vehicle import COLUMNS, POSE
-from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot

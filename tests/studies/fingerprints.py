@@ -24,13 +24,13 @@ import numpy as np
 
 from localization.estimators import PriorMap
 from localization.evaluation.references import reference_track
+from localization.inputs.step_config import StepConfig
 from localization.log_replay import Run, replay
 from localization.logs import open_log
 from localization.logs.reference_topics import merge_positions, read_positions
 from localization.maps.place_search import PlaceMap
 from localization.pipeline import ReplayConfig, Trial
 from localization.simulation.sensors import SensorConfig
-from localization.step_config import StepConfig
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from tests.helpers.hill_scans import MOUNT, make_scene, scans

@@ -31,13 +31,13 @@ from localization.estimators.graph_fusion import GraphConfig, GraphFusion
 from localization.evaluation.metrics import evaluate
 from localization.evaluation.references import ReferenceTrack, reference_track
 from localization.events import Event
+from localization.inputs.synchronizer import Synchronizer
 from localization.lidar import LidarConfig
 from localization.logs import open_log
 from localization.pipeline import Pipeline, Trial
 from localization.simulation.experiments import ExperimentConfig
 from localization.simulation.sensors import START_NS
 from localization.simulation.simulator import SimulationConfig, simulate, write_simulation
-from localization.synchronizer import Synchronizer
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.online_calibration import Form, add_correction_parameters, make_corrections

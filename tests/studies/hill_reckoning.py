@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from localization.inputs.step_config import StepConfig
 from localization.log_replay import Run, replay
 from localization.pipeline import ReplayConfig, Trial
-from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.registry import make_model
 from motion_models.se2 import FloatArray

@@ -25,10 +25,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from localization.events import ImuSample, Scan
+from localization.inputs.step_config import StepConfig
 from localization.lidar import Sweep
 from localization.log_replay import replay
 from localization.pipeline import ReplayConfig, Trial
-from localization.step_config import StepConfig
 from motion_models import se3
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model

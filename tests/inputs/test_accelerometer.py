@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from localization.accelerometer import Accelerometer, scale_of_force
 from localization.events import ImuSample
+from localization.inputs.accelerometer import Accelerometer, scale_of_force
 from motion_models.robot import Mount
 from motion_models.slope import GRAVITY
 

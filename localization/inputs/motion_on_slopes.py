@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from localization.attitude import Tilt
-from localization.tyre_friction import TyreFriction
+from localization.inputs.attitude import Tilt
+from localization.inputs.tyre_friction import TyreFriction
 from motion_models.base import MotionModel
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.motion import Motion, Twist

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from localization.errors import EventError
 from localization.events import CgSample, ImuSample, Scan, WheelSample
-from localization.step_config import StepConfig
-from localization.synchronizer import Synchronizer
-from localization.wheel_buffer import WheelBuffer, WheelWindow
-from localization.wheel_gaps import UnknownVelocity, VelocityWithinIntervals
+from localization.inputs.step_config import StepConfig
+from localization.inputs.synchronizer import Synchronizer
+from localization.inputs.wheel_buffer import WheelBuffer, WheelWindow
+from localization.inputs.wheel_gaps import UnknownVelocity, VelocityWithinIntervals
 from motion_models import se2
 from motion_models.preintegration import preintegrate
 from motion_models.registry import make_model

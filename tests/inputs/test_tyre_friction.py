@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from localization.attitude import Tilt
 from localization.events import Turn
-from localization.motion_on_slopes import MotionOnSlopes
+from localization.inputs.attitude import Tilt
+from localization.inputs.motion_on_slopes import MotionOnSlopes
 from motion_models.friction import FrictionModel
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.preintegration import noise_vector

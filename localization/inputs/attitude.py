@@ -3,7 +3,7 @@
 Gravity is a measurement of the vertical once the robot's own acceleration is taken off, which wheels and turning give; what they do not
 explain (bumps, slip, vibration) is the measurement's noise, estimated on the way. The state is the vertical with the gyro's biases; its
 error is a small rotation (Sola 2017, "Quaternion kinematics for the error-state Kalman filter"). What of it is the mount's error, and what
-the ground's tilt, is separated by `localization.ground_tilt`.
+the ground's tilt, is separated by `localization.inputs.ground_tilt`.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from localization.accelerometer import Accelerometer, PlacedImu
 from localization.events import Gravity, ImuSample, Turn
-from localization.ground_curvature import GroundCurvature
-from localization.ground_tilt import GroundTilt
+from localization.inputs.accelerometer import Accelerometer, PlacedImu
+from localization.inputs.ground_curvature import GroundCurvature
+from localization.inputs.ground_tilt import GroundTilt
 from localization.small_filters import propagate_in_place, update_in_place
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
@@ -38,7 +38,7 @@ _ACCELEROMETER_RAD = math.radians(0.3)
 """Error of the vertical by an accelerometer's bias of 0.05 m/s^2 [rad]."""
 _SLOPE_EFFECT = 0.1
 """Relative uncertainty of a slope's effect by the height of the CG and the law, whose slides are within 3 to 13 % of MuJoCo's; mu and the
-tyres' stiffness are estimated (`localization.tyre_friction`)."""
+tyres' stiffness are estimated (`localization.inputs.tyre_friction`)."""
 _MIN_UP = 0.2
 """Least z of the vertical: beyond 78 deg nothing drives."""
 _WINDOW_S, _FIRST_WINDOW_S = 1.0, 0.5

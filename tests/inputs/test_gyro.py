@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from localization.events import ImuSample
-from localization.gyro import GyroBuffer
+from localization.inputs.gyro import GyroBuffer
 from motion_models.robot import GyroNoise, Mount
 from tests.helpers import bags
 

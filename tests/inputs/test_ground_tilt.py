@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.ground_tilt import GroundTilt
+from localization.inputs.ground_tilt import GroundTilt
 from localization.small_filters import propagate_in_place, update_in_place
 
 COV = np.radians(0.5) ** 2 * np.eye(2)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from localization.attitude import AttitudeFilter
-from localization.body_rates import BodyRates
 from localization.events import BodyTurn, Gravity, ImuSample, Scan, Turn
-from localization.gyro import GyroBuffer
+from localization.inputs.attitude import AttitudeFilter
+from localization.inputs.body_rates import BodyRates
+from localization.inputs.gyro import GyroBuffer
 from motion_models.robot import Mount, Robot
 
 

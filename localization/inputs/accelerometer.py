@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import ImuSample
-from localization.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
+from localization.inputs.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY

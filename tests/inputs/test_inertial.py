@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from localization.events import ImuSample, Scan
-from localization.inertial import InertialMotion, InertialSensors
+from localization.inputs.inertial import InertialMotion, InertialSensors
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot
 

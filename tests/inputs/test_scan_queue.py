@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from localization.events import Scan
-from localization.scan_queue import ScanQueue
+from localization.inputs.scan_queue import ScanQueue
 from motion_models.robot import Mount
 
 MS = 1_000_000

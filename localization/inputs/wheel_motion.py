@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from localization.attitude import Tilt
-from localization.motion_on_slopes import MotionOnSlopes
-from localization.wheel_buffer import WheelBuffer, WheelWindow
-from localization.wheel_gaps import VelocityWithinIntervals
+from localization.inputs.attitude import Tilt
+from localization.inputs.motion_on_slopes import MotionOnSlopes
+from localization.inputs.wheel_buffer import WheelBuffer, WheelWindow
+from localization.inputs.wheel_gaps import VelocityWithinIntervals
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.extended_model import horizon_s, in_series, needs_series

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from localization.ground_curvature import GroundCurvature
+from localization.inputs.ground_curvature import GroundCurvature
 from motion_models.friction.slope_effect import SlopeEffect
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot

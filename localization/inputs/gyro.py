@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import ImuSample, Turn
-from localization.rate_series import MAX_GAP_NS, RateSeries
+from localization.inputs.rate_series import MAX_GAP_NS, RateSeries
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray
 

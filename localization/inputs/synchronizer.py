@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from localization.events import CgSample, Event, ImuSample, Scan, Step, StepInterval, Turn, WheelSample, turn_twist
-from localization.inertial import InertialSensors
-from localization.scan_queue import ScanQueue
-from localization.step_config import StepConfig
-from localization.wheel_gaps import UnknownVelocity
-from localization.wheel_motion import WheelMotion
+from localization.inputs.inertial import InertialSensors
+from localization.inputs.scan_queue import ScanQueue
+from localization.inputs.step_config import StepConfig
+from localization.inputs.wheel_gaps import UnknownVelocity
+from localization.inputs.wheel_motion import WheelMotion
 from motion_models.base import MotionModel
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from localization.events import Scan
+from localization.inputs.lidar_choice import LidarChoice
 from localization.lidar.ground_hits import GroundHits
-from localization.lidar_choice import LidarChoice
 from motion_models.robot import Mount
 
 _UNKNOWN = "no transform or robot file gives the mount of the LiDAR's frame '{}'"

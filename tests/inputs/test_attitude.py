@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from localization.attitude import AttitudeFilter
 from localization.events import ImuSample
+from localization.inputs.attitude import AttitudeFilter
 from motion_models.robot import GyroNoise, Mount
 from motion_models.slope import GRAVITY
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from localization.inputs.wheel_buffer import WheelWindow
 from localization.small_filters import FORGETTING
-from localization.wheel_buffer import WheelWindow
 from motion_models.compiled import kernel
 from motion_models.se2 import Cov3, FloatArray, Twist2
 
