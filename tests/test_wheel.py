@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "tests" / "data" / "vaultbot" / "rotation_grid.csv"
 START = """
 import sys, localization, motion_models, skidloc
