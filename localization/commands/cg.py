@@ -200,9 +200,10 @@ def effect(robot: Robot, estimate: CgEstimate) -> dict[str, dict[str, float]]:
 
 def _by_cg(model: SkidSteer, cg: FloatArray) -> FloatArray:
     """(3, 2) derivative of k, x_CR and y_CR by the CG."""
-    _, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = model.nominal
+    k_0, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = model.nominal
     x, y = cg
-    return np.array([[k_1 + 2 * k_2 * x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
+    k_by_x = k_1 + 2 * k_2 * x if model.rotation(cg, model.nominal)[0] < max(k_0, 1.0) else 0.0
+    return np.array([[k_by_x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
 
 
 def _off_middle(urdf: Path, base_link: str) -> float:

@@ -11,13 +11,14 @@ import pytest
 from motion_models.calibration.fit import FitConfig
 from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
+from motion_models.friction.model import FrictionModel
 from motion_models.online_calibration import make_corrections
 from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
 from motion_models.registry import advice, make_model, recommended_model, usual_models
 from motion_models.robot import Driver, Geometry, Robot
 from motion_models.robot_file import load_robot, parse_robot
 from motion_models.robot_names import robot_names
-from motion_models.skid_steer import thesis_coefficients
+from motion_models.skid_steer import SkidSteer, thesis_coefficients
 
 BARE = """
 name = "bare"
@@ -139,3 +140,30 @@ def test_robot_with_arms_is_advised_to_take_the_friction_model() -> None:
     assert usual_models([burger, husky]) == ("diff_drive", "skid_steer")
     assert usual_models([husky, vaultbot]) == ("diff_drive", "skid_steer", "friction")
     assert advice(vaultbot, ["friction"]) == advice(husky, ["skid_steer"]) == []
+
+
+@pytest.mark.parametrize("name", ["jackal", "husky_a200", "leo", "warthog"])
+def test_scaling_far_from_the_middle_is_that_of_the_friction_model(name: str) -> None:
+    """A third of the wheelbase ahead the parabola alone passes 1, which is without slip, by up to a half."""
+    robot = load_robot(name)
+    g, friction, prior = robot.geometry, FrictionModel.from_robot(robot), skid_prior(robot).coefficients
+    model = SkidSteer(g.wheel_radius_m, g.track_width_m, prior)
+    for share, off in ((0.0, 1e-6), (0.15, 0.02), (0.25, 0.1), (0.33, 0.06), (0.4, 0.03)):
+        cg = robot.center_of_gravity + np.array([share * g.wheelbase_m, 0.0])
+        turned = friction.interpret_twist(np.array([-1.0, 1.0]), cg[None], friction.nominal).value[0, 2]
+        expected = turned * g.track_width_m / (2.0 * friction.nominal[0])
+        assert float(model.rotation(cg, prior)[0]) == pytest.approx(float(expected), abs=off), share
+    assert prior[0] + (prior[1] + prior[2] * cg[0]) * cg[0] > 1.5  # by the parabola alone
+
+
+def test_scaling_at_its_limit_has_numeric_derivatives() -> None:
+    model = SkidSteer.from_robot(load_robot("jackal"))
+    wheels, cg = np.array([[-2.0, 3.0]]), np.array([[0.12, 0.02]])
+    assert model.rotation(cg[0], model.nominal)[0] == 1.0
+    found = model.twist(wheels, cg, model.nominal)
+    for j, h in enumerate(1e-6 * np.eye(len(model.nominal))):
+        one, other = (model.twist(wheels, cg, model.nominal + sign * h).value for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found.d_params[0, :, j], (one - other)[0] / 2e-6, atol=1e-6)
+    for j, h in enumerate(1e-6 * np.eye(2)):
+        one, other = (model.twist(wheels, cg + sign * h, model.nominal).value for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found.d_cg[0, :, j], (one - other)[0] / 2e-6, atol=1e-6)
