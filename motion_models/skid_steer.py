@@ -44,12 +44,12 @@ def thesis_coefficients(variant: YcrVariant = "symmetric") -> FloatArray:
 class SkidSteer(ModelBase):
     """Ebersole 2016, eqs. 4.6-4.18, with the regressions on the CG as parameters:
 
-    k    = k_0 + k_1 x_G + k_2 x_G^2, at most 1, or k_0 where that is more             (4.21)
+    k    = k_0 + k_1 x_G + k_2 x_G^2, at most 1 where k_0 is less                      (4.21)
     x_CR = x_cr_0 + x_cr_1 x_G                                                         (4.22)
     y_CR = y_cr_0 + y_cr_1 x_G + y_cr_2 x_G^2 + (y_cr_s0 + y_cr_s1 x_G + y_cr_s2 x_G^2) y_G   (4.23-4.25)
 
     Above an axle the wheels of that axle carry all of the robot and do not slide sideways: it turns as without slip, k = 1, which the
-    parabola passes.
+    parabola passes. A robot that does not skid at all (k_0 of 1 and more) has no such limit.
 
     The inverse takes two inputs, vx and wz: vy = -wz x_CR follows and cannot be commanded.
     """
@@ -156,7 +156,7 @@ def _rotation(x: _Number, y: _Number, params: FloatArray) -> tuple[_Number, _Num
     """k [-], x_CR [m] and y_CR [m] for the CG ``x, y``: numbers, or arrays of one shape."""
     k_0, k_1, k_2, x_cr_0, x_cr_1 = params[0], params[1], params[2], params[3], params[4]
     c_0, c_1, c_2, s_0, s_1, s_2 = params[5], params[6], params[7], params[8], params[9], params[10]
-    k = np.minimum(k_0 + (k_1 + k_2 * x) * x, max(k_0, 1.0))  # 4.21
+    k = np.minimum(k_0 + (k_1 + k_2 * x) * x, 1.0 if k_0 < 1.0 else np.inf)  # 4.21
     x_cr = x_cr_0 + x_cr_1 * x  # 4.22
     y_cr = c_0 + (c_1 + c_2 * x) * x + (s_0 + (s_1 + s_2 * x) * x) * y  # 4.23-4.25
     return k, x_cr, y_cr
@@ -193,7 +193,7 @@ def _twist(
             d_wheels[i, 1, j] = -wz_by_wheel * x_cr
             d_wheels[i, 2, j] = wz_by_wheel
 
-        is_below = params[0] + (k_1 + k_2 * x) * x <= max(params[0], 1.0)  # else k is the limit, of which only k_0 is a coefficient
+        is_below = params[0] >= 1.0 or params[0] + (k_1 + k_2 * x) * x <= 1.0  # else k is the limit, which no coefficient moves
         wz_by_x = wz_per_k * (k_1 + 2.0 * k_2 * x) if is_below else 0.0
         d_cg[i, 0, 0] = wz_by_x * y_cr + wz * (c_1 + 2.0 * c_2 * x + (s_1 + 2.0 * s_2 * x) * y)
         d_cg[i, 0, 1] = wz * (s_0 + (s_1 + s_2 * x) * x)
@@ -202,7 +202,7 @@ def _twist(
 
         power = 1.0
         for j in range(3):
-            wz_by_k = wz_per_k * power if is_below or (j == 0 and params[0] >= 1.0) else 0.0
+            wz_by_k = wz_per_k * power if is_below else 0.0
             d_params[i, 0, j] = wz_by_k * y_cr
             d_params[i, 1, j] = -wz_by_k * x_cr
             d_params[i, 2, j] = wz_by_k

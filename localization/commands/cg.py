@@ -202,7 +202,7 @@ def _by_cg(model: SkidSteer, cg: FloatArray) -> FloatArray:
     """(3, 2) derivative of k, x_CR and y_CR by the CG."""
     k_0, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = model.nominal
     x, y = cg
-    k_by_x = k_1 + 2 * k_2 * x if model.rotation(cg, model.nominal)[0] < max(k_0, 1.0) else 0.0
+    k_by_x = k_1 + 2 * k_2 * x if k_0 >= 1.0 or model.rotation(cg, model.nominal)[0] < 1.0 else 0.0
     return np.array([[k_by_x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
 
 
