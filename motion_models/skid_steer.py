@@ -118,6 +118,13 @@ class SkidSteer(ModelBase):
         """k [-], x_CR [m] and y_CR [m], each (...,), for ``cg`` (..., 2)."""
         return _rotation(cg[..., 0], cg[..., 1], params)
 
+    def rotation_by_cg(self, cg: FloatArray, params: FloatArray) -> FloatArray:
+        """(3, 2) derivative of k, x_CR and y_CR by ``cg`` (2,)."""
+        k_0, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = params
+        x, y = cg
+        k_by_x = k_1 + 2 * k_2 * x if self.rotation(cg, params)[0] < 1.0 or k_0 >= 1.0 else 0.0
+        return np.array([[k_by_x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
+
     def twist(self, wheels: FloatArray, cg: FloatArray, params: FloatArray) -> Twist:
         """See `MotionModel.twist`."""
         return Twist.from_kernel(_twist, np.array([self.wheel_radius, self.track_width]), wheels, cg, params)
@@ -193,7 +200,7 @@ def _twist(
             d_wheels[i, 1, j] = -wz_by_wheel * x_cr
             d_wheels[i, 2, j] = wz_by_wheel
 
-        is_below = params[0] >= 1.0 or params[0] + (k_1 + k_2 * x) * x <= 1.0  # else k is the limit, which no coefficient moves
+        is_below = k < 1.0 or params[0] >= 1.0  # else k is the limit, which no coefficient moves
         wz_by_x = wz_per_k * (k_1 + 2.0 * k_2 * x) if is_below else 0.0
         d_cg[i, 0, 0] = wz_by_x * y_cr + wz * (c_1 + 2.0 * c_2 * x + (s_1 + 2.0 * s_2 * x) * y)
         d_cg[i, 0, 1] = wz * (s_0 + (s_1 + s_2 * x) * x)

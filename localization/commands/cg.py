@@ -24,7 +24,6 @@ from motion_models.friction.contact import loads
 from motion_models.input_files import read_text
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot
-from motion_models.se2 import FloatArray
 from motion_models.skid_steer import SkidSteer
 
 
@@ -192,18 +191,10 @@ def effect(robot: Robot, estimate: CgEstimate) -> dict[str, dict[str, float]]:
     model = SkidSteer.from_robot(robot)
     here = np.array(model.rotation(estimate.position, model.nominal))
     nominal = np.array(model.rotation(robot.center_of_gravity, model.nominal))
-    J = _by_cg(model, estimate.position)
+    J = model.rotation_by_cg(estimate.position, model.nominal)
     sigma = np.sqrt(np.diagonal(J @ estimate.covariance @ J.T))
     names = ("k", "x_cr_m", "y_cr_m")
     return {n: {"nominal": float(a), "here": float(b), "sigma": float(s)} for n, a, b, s in zip(names, nominal, here, sigma, strict=True)}
-
-
-def _by_cg(model: SkidSteer, cg: FloatArray) -> FloatArray:
-    """(3, 2) derivative of k, x_CR and y_CR by the CG."""
-    k_0, k_1, k_2, _, x_cr_1, _, c_1, c_2, s_0, s_1, s_2 = model.nominal
-    x, y = cg
-    k_by_x = k_1 + 2 * k_2 * x if k_0 >= 1.0 or model.rotation(cg, model.nominal)[0] < 1.0 else 0.0
-    return np.array([[k_by_x, 0.0], [x_cr_1, 0.0], [c_1 + 2 * c_2 * x + (s_1 + 2 * s_2 * x) * y, s_0 + (s_1 + s_2 * x) * x]])
 
 
 def _off_middle(urdf: Path, base_link: str) -> float:

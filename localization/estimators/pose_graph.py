@@ -357,8 +357,8 @@ def robust_factor(keys: Sequence[int], cov: FloatArray, error: Callable[..., Flo
 
 
 def make_isam() -> gtsam.ISAM2:
-    """By QR, whose error grows with the condition number of the factors, and by Cholesky with its square: 1.8e7 where a LiDAR is lost for a
-    fifth of the drive, of which the square is beyond double precision."""
+    """ISAM2 that factorizes by QR. Its error grows with the condition number of the factors, that of Cholesky with the square: where a
+    LiDAR is lost for a fifth of the drive the number is 1.8e7, and its square beyond double precision."""
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
     params.setRelinearizeThreshold(_RELINEARIZE)

@@ -28,7 +28,7 @@ OUTLIER_COST = 0.5 * OUTLIER_SIGMAS**2
 """-log of the odds that the prior is an outlier."""
 _SEARCH_FACTOR = 9.0
 _SEARCH_FLOOR = np.diag([0.1, 0.1, 0.03]) ** 2
-"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2], and what else `ScanMatcher.match` has of motion that wheels do not show."""
+"""The search covers 3 sigma of 9 P + this [m^2, m^2, rad^2], and what `ScanMatcher.match` adds for wheels that are wrong."""
 _SEARCH_LIMIT, _WIDEST_SEARCH = np.array([3.0, 3.0, 1.0]), np.array([15.0, 15.0, math.pi])
 """Half the window of a search at most, for a prior that may be an outlier, and for one that is wide itself [m, m, rad]."""
 _MAX_RIVAL = 0.9

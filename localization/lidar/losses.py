@@ -80,7 +80,8 @@ class LidarLosses:
     def is_event(self) -> bool:
         """Whether something happened to LiDAR or robot, or much is missing. Single scans that fit nowhere, have few points, or
         were left out by a check, which has a sentence of its own, are bridged by the other sensors."""
-        return self.is_long or self.share > MAX_LOST_SHARE or bool(self.silences) or not set(self.causes) <= _BRIDGED
+        is_much = self.share > MAX_LOST_SHARE or self.longest_s > MAX_LOST_S
+        return is_much or bool(self.silences) or not set(self.causes) <= _BRIDGED
 
     @property
     def summary(self) -> str:

@@ -27,8 +27,8 @@ _WITH_SURFACE = 0.8
 """Least share of the first scan's points that have a surface in a submap of this scan alone: more than `LidarConfig.search_below`, below
 which each scan of a place that is mapped would be searched. A scanner with 80 beams has 0.4 at 2 % of its range, ACES's with 180 0.7."""
 _WRONG_WHEELS = 2.0 / 3.0
-"""Sigma of the factor by which wheels that are outliers are wrong: within 3 sigma they count any motion from three times to the opposite of
-what they do. Between scans a second apart that is metres."""
+"""Sigma of the factor by which wheels that are outliers are wrong: within 3 sigma the robot has moved by anything from
+the opposite of what they count to three times that. Between scans a second apart that is metres."""
 MIN_PLACE_OVERLAP = 0.6
 """Share of points on the submap, below which a place found from a wide prior is not taken: Cartographer's least score of a place without
 a prior (`global_localization_min_score`)."""
@@ -198,9 +198,11 @@ class ScanMatcher:
 def choose_cell(config: LidarConfig, points: Points2) -> float:
     """Edge of the voxels [m] for a submap that begins with ``points`` (N, 2) of the body frame: at least two sigma of a range, and as large
     as it has to be for surfaces, which take the points of three voxels within `MAX_RINGS` (`submap.fill_surface`)."""
+    if config.voxel_size_m:
+        return config.voxel_size_m
     to_third = cKDTree(points).query(points, k=3)[0][:, 2] / MAX_RINGS
     of_range = _CELL_OF_RANGE * float(np.median(np.hypot(points[:, 0], points[:, 1])))
-    return config.voxel_size_m or max(of_range, 2.0 * config.range_noise_m, float(np.quantile(to_third, _WITH_SURFACE)))
+    return max(of_range, 2.0 * config.range_noise_m, float(np.quantile(to_third, _WITH_SURFACE)))
 
 
 def _is_better(found: Alignment, fit: Alignment, prior: Pose2, cov: Cov3) -> bool:

@@ -76,7 +76,7 @@ class MovingObjects:
         """From wheels and estimate that agree, while objects move."""
         self._jump = Jump()
         self._is_by_scans = False
-        """The estimate is by scans, too: one by wheels alone is where they lead."""
+        """The estimate is by scans, too: one by wheels alone is where they lead, and no object that moves has an effect on it."""
         self.report = MovingReport(faults)
 
     @property

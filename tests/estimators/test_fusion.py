@@ -202,7 +202,7 @@ def test_ekf_with_encoders_at_zero_follows_lidar() -> None:
 
 @pytest.mark.parametrize("walls", [LAB, pytest.param(HALL, marks=pytest.mark.extended)])
 def test_ekf_with_sparse_scans_and_encoders_without_sign_follows_lidar(walls: FloatArray) -> None:
-    """Between two scans wheels that count backwards ahead are off by twice the way, which is metres."""
+    """Between two scans wheels that count backward motion as forward are off by twice the way, which is metres."""
 
     def unsigned(t: np.ndarray, twists: np.ndarray) -> np.ndarray:
         return np.abs(twists) * [1.0, 1.0, 0.0] + twists * [0.0, 0.0, 1.0]

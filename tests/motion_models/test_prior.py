@@ -167,3 +167,5 @@ def test_scaling_at_its_limit_has_numeric_derivatives() -> None:
     for j, h in enumerate(1e-6 * np.eye(2)):
         one, other = (model.twist(wheels, cg + sign * h, model.nominal).value for sign in (1.0, -1.0))
         np.testing.assert_allclose(found.d_cg[0, :, j], (one - other)[0] / 2e-6, atol=1e-6)
+    by_cg = [np.subtract(*(model.rotation(cg[0] + sign * h, model.nominal) for sign in (1.0, -1.0))) / 2e-6 for h in 1e-6 * np.eye(2)]
+    np.testing.assert_allclose(model.rotation_by_cg(cg[0], model.nominal), np.transpose(by_cg), atol=1e-6)
