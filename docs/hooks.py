@@ -1,17 +1,15 @@
-"""What the site makes from the code: equations as MathML, lines of code beside them, and the texts of all warnings.
+"""What the site makes from the code: equations as MathML, lines of code beside them, and the page of all warnings.
 
 In a page `{code: PATH :: TEXT}` becomes the number and the text of the line of the file PATH that contains TEXT, which must be one line;
-`<!-- messages: PATH -->` becomes the list of the warnings of that module, `<!-- readme: PATH -->` that file, `<!-- robots -->` the rows of
-the shipped robots.
+`<!-- readme: PATH -->` becomes that file, `<!-- robots -->` the rows of the shipped robots.
+
+`python docs/hooks.py` writes `docs/warnings.md` from the tables of messages.
 """
 
 from __future__ import annotations
 
-import ast
-import functools
 import re
 import tomllib
-from collections.abc import Iterator
 from html import escape, unescape
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,15 +21,18 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("motion_models", "localization")
 CODE = re.compile(r"\{code: (?P<path>\S+) :: (?P<text>[^\n]+?)\}(?=\s|$)")
-MESSAGES = re.compile(r"<!-- messages: (?P<path>\S+) -->")
 README = re.compile(r"<!-- readme: (?P<path>\S+) -->")
 ROBOTS = "<!-- robots -->"
 FIGURES = ROOT / "notebooks" / "figures"
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:|#)[^)]*\)")
 _EQUATION = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
-_BRACES = re.compile(r"\{[^}]*\}")
-_LEAST_LENGTH = 25
-"""Of a text that is a sentence and not a part of one."""
+TABLES = ROOT / "localization" / "messages"
+_FIELD = re.compile(r"\{[^}]*\}")
+_PAGE_HEAD = """# Warnings, causes and cures
+
+Every message states what happened, where, and what to do. Those with **!** ask for something; those without state what was chosen or left
+out, and nothing has to be done. … stands for numbers and names. `metrics.json` has each message by its id, with its numbers, and so have
+the diagnostics of the live node."""
 
 
 class Line(NamedTuple):
@@ -57,56 +58,26 @@ def find_line(path: str, text: str) -> Line:
     return found[0]
 
 
-@functools.cache
-def messages(path: str) -> list[str]:
-    """Texts of the warnings of a module, in the order of its lines; expressions in them are an ellipsis."""
-    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-    found = {text: None for node in _warning_nodes(tree) for text in _texts(node) if " " in text and len(text) >= _LEAST_LENGTH}
-    return list(found)
-
-
-def modules_with_messages() -> list[str]:
-    """Paths of all modules that warn users about their data."""
-    return [str(p.relative_to(ROOT)) for p in sorted((ROOT / "localization").rglob("*.py")) if messages(str(p.relative_to(ROOT)))]
-
-
-def _warning_nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """Expressions that become warnings: of a `SensorFault`, of functions and variables with that word in their name."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef) and any(word in node.name for word in ("warning", "contradiction")):
-            docstring = ast.get_docstring(node) is not None
-            yield from node.body[docstring:]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "SensorFault":
-            yield from node.args[:1]
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ("append", "extend"):
-            if "warning" in ast.unparse(node.func.value):
-                yield from node.args
-        elif isinstance(node, ast.Assign | ast.AugAssign | ast.AnnAssign) and node.value is not None:
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            if any("warnings" in ast.unparse(target) for target in targets):
-                yield node.value
-
-
-def _texts(node: ast.AST) -> Iterator[str]:
-    """Whole texts in an expression."""
-    if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        yield _BRACES.sub("…", node.value)
-    elif isinstance(node, ast.JoinedStr):
-        yield "".join(_BRACES.sub("…", str(part.value)) if isinstance(part, ast.Constant) else "…" for part in node.values)
-    else:
-        for child in ast.iter_child_nodes(node):
-            yield from _texts(child)
+def warnings_page() -> str:
+    """All messages with their causes and cures, from the tables of `localization.messages`."""
+    tables = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in TABLES.glob("*.toml")}
+    lines = [_PAGE_HEAD]
+    for subject, table in sorted(tables.items(), key=lambda item: item[1]["title"].lower()):
+        found = {name: entry for name, entry in table.items() if isinstance(entry, dict) and "text" in entry}
+        lines += ["", f"## {table['title']}", ""]
+        for name, entry in found.items():
+            text = _FIELD.sub("…", f"{entry['text']} {entry.get('remedy', '')}".strip())
+            lines.append(f"- {'**!**' if 'remedy' in entry else '-'} `{subject}.{name}`: {escape(text, quote=False)}")
+        lines += ["", f"**Cause.** {table['cause']}", "", f"**Cure.** {table['cure']}"]
+    return "\n".join(lines) + "\n"
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Lines of code and warnings, before the page is rendered."""
+    """Lines of code, before the page is rendered."""
 
     def show_line(found: re.Match[str]) -> str:
         line = find_line(found["path"], found["text"])
         return f'<small class="code-line">{line.path}:{line.number} <code>{escape(line.text)}</code></small>'
-
-    def show_messages(found: re.Match[str]) -> str:
-        return "\n".join(f"- {escape(text.strip())}" for text in messages(found["path"]))
 
     def show_readme(found: re.Match[str]) -> str:
         """The file without its links to others, which lie outside of the site."""
@@ -114,7 +85,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
     markdown = markdown.replace("](../notebooks/figures/", "](images/")
     markdown = README.sub(show_readme, markdown).replace(ROBOTS, "\n".join(robot_rows()) if ROBOTS in markdown else "")
-    return MESSAGES.sub(show_messages, CODE.sub(show_line, markdown))
+    return CODE.sub(show_line, markdown)
 
 
 def robot_rows() -> list[str]:
@@ -147,3 +118,7 @@ def on_page_content(html: str, **_: object) -> str:
         return str(convert(unescape(found[3]), display="inline" if found[2] == "(" else "block"))
 
     return _EQUATION.sub(typeset, html)
+
+
+if __name__ == "__main__":
+    (ROOT / "docs" / "warnings.md").write_text(warnings_page(), encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ from localization.events import Event
 from localization.lidar.losses import LidarLosses
 from localization.lifting import AttitudeTable, SpaceTable, Trajectory3
 from localization.maps import KeyframeMap
+from localization.messages import Message
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.trajectory import Trajectory
 from motion_models.robot import Mount, Robot
@@ -42,7 +44,7 @@ class Run:
     """Number of occurrences by name: scans, matched, searched, standing..."""
     map_points: FloatArray
     """(M, 2) points of the map, in the world [m]; (0, 2) without a LiDAR."""
-    warnings: Sequence[str]
+    warnings: Sequence[Message]
     """Problems of the sensors."""
     seconds: float
     """Computing time of this trial, without reading the log."""
@@ -90,27 +92,21 @@ _JITTER_M = 0.05
 """Steps of the path below which an estimate's jitter at standstill would count as distance."""
 _PARAMETERS_EVERY_NS = 2_000_000_000
 """Time between two samples of the estimated parameters, in `Run.parameter_history`."""
-_EQUAL_CHARACTERS = 60
-"""Number of first characters that are equal in warnings of one fault: its time and kind, up to the numbers."""
 
 
-def warnings_of(runs: Iterable[Run]) -> list[str]:
+def warnings_of(runs: Iterable[Run]) -> list[Message]:
     """Problems of the sensors in all ``runs``, each once: what several trials report alike is given with the names of all of them.
 
-    The sensor checks' warnings have no name, and their numbers depend on the estimate: of those of several runs that begin alike the first
-    is kept.
+    Numbers of the sensor checks depend on the estimate: of one fault at one time in several runs the first message is kept.
     """
-    names: dict[str, list[str]] = {}
-    beginnings: set[str] = set()
-    for run in runs:
-        name = f"{run.estimator} ({run.model})"
-        for warning in run.warnings:
-            text = warning.removeprefix(f"{name}: ")
-            if text == warning and text not in names and warning[:_EQUAL_CHARACTERS] in beginnings:
-                continue
-            names.setdefault(text, []).extend([name] if text != warning else [])
-        beginnings |= {warning[:_EQUAL_CHARACTERS] for warning in run.warnings}
-    return [f"{', '.join(dict.fromkeys(found))}: {text}" if found else text for text, found in names.items()]
+    found: dict[tuple[str, str], Message] = {}
+    sources: dict[tuple[str, str], list[str]] = {}
+    for message in itertools.chain.from_iterable(run.warnings for run in runs):
+        is_of_check = not message.source and message.at_s is not None
+        key = (message.id, f"{message.at_s:.1f}") if is_of_check else (message.id, message.body)
+        found.setdefault(key, message)
+        sources.setdefault(key, []).append(message.source)
+    return [message.of(", ".join(dict.fromkeys(sources[key]))) if message.source else message for key, message in found.items()]
 
 
 def replay(

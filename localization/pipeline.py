@@ -28,6 +28,7 @@ from localization.inputs.attitude import AttitudeFilter
 from localization.inputs.step_config import StepConfig
 from localization.inputs.synchronizer import Synchronizer
 from localization.lidar.losses import LidarLosses
+from localization.messages import Message
 from localization.sensor_checks import SensorChecks
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, add_correction_parameters, make_corrections
@@ -169,12 +170,11 @@ class Pipeline:
         lost = self.estimator.lost
         return None if lost is None else LidarLosses.of(lost)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the sensors so far."""
         losses = self.lidar
-        description = losses.describe() if losses is not None and losses.is_event else ""
-        found = [*self.estimator.warnings(), *([description] if description else [])]
-        return [*self.synchronizer.warnings(), *self.checks.warnings(), *(f"{self._name}: {problem}" for problem in found)]
+        found = [*self.estimator.warnings(), *(losses.warnings() if losses is not None and losses.is_event else [])]
+        return [*self.synchronizer.warnings(), *self.checks.warnings(), *(problem.of(self._name) for problem in found)]
 
     def add_mounts(self, mounts: Mapping[str, Mount]) -> bool:
         """Add mounts of new frames; those of known frames are not changed. Returns whether there were any."""

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from motion_models.icr import Icr
     from motion_models.motion import Motion, Twist
     from motion_models.preintegration import preintegrate
-    from motion_models.prior import SkidPrior, geometric_scaling, prior_notes, skid_prior
+    from motion_models.prior import SkidPrior, geometric_scaling, skid_prior
     from motion_models.registry import MODELS, make_model
     from motion_models.robot import Robot
     from motion_models.robot_file import load_robot, parse_robot, robot_toml
@@ -96,7 +96,6 @@ __all__ = [
     "parse_robot",
     "posture_for",
     "preintegrate",
-    "prior_notes",
     "read_rotation_table",
     "read_weighings",
     "read_windows",
@@ -138,7 +137,7 @@ _MODULES = {
     "motion_models.icr": "Icr",
     "motion_models.motion": "Motion Twist",
     "motion_models.preintegration": "preintegrate",
-    "motion_models.prior": "SkidPrior geometric_scaling prior_notes skid_prior",
+    "motion_models.prior": "SkidPrior geometric_scaling skid_prior",
     "motion_models.registry": "MODELS make_model",
     "motion_models.robot": "Robot",
     "motion_models.robot_file": "load_robot parse_robot robot_toml",

@@ -35,8 +35,10 @@ _CURVED, _SLOPE_SIGMA = [2, 4, 8, 10], 0.25
 """k_2, x_cr_1, y_cr_s0 and y_cr_s2: their relative standard deviation. VaultBot's are within 25 % of those by geometry (a test)."""
 _DRIVEN_SIGMA = 0.02
 """Relative standard deviation of k of a robot with two driven wheels and a caster: its track. Freiburg's Pioneers, fr079: 1 %."""
-_CALIBRATION_TURN_S, _TURN_RAD_PER_S = 20.0, 0.5
-"""Duration [s] and yaw rate of the turning that a note recommends."""
+CALIBRATION_TURN_S = 20.0
+"""Duration of the turning that a note recommends [s]."""
+_TURN_RAD_PER_S = 0.5
+"""Its yaw rate [rad/s]."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +185,7 @@ class ScalingPrior(NamedTuple):
     sigma: float
     """Its standard deviation."""
     sigma_after_turning: float
-    """Standard deviation of k after `_CALIBRATION_TURN_S` of turning: k sqrt(yaw variance per radian / turned angle)."""
+    """Standard deviation of k after `CALIBRATION_TURN_S` of turning: k sqrt(yaw variance per radian / turned angle)."""
     source: str
     """Source of k."""
 
@@ -194,34 +196,6 @@ def scaling_prior(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> Scal
         return None
     prior = skid_prior(robot)
     k, sigma = float(prior.coefficients[0]), float(prior.sigmas[0])
-    turned = _CALIBRATION_TURN_S * _TURN_RAD_PER_S
+    turned = CALIBRATION_TURN_S * _TURN_RAD_PER_S
     measured = k * math.sqrt(robot.wheel_noise.yaw_rad2_per_rad / turned)
     return ScalingPrior(k, sigma, sigma * measured / math.hypot(sigma, measured), prior.source)
-
-
-def unused_terms_notes(robot: Robot, models: Sequence[str]) -> list[str]:
-    """A sentence where the robot's learned terms belong to none of ``models``; else none."""
-    if not robot.terms or set(robot.terms) & set(models):
-        return []
-    return [f"{robot.name}: the learned terms of its file are of {', '.join(robot.terms)}, and {', '.join(models)} runs without them."]
-
-
-def prior_notes(robot: Robot, models: Sequence[str] = ("skid_steer",)) -> list[str]:
-    """A sentence for the user where `scaling_prior` is not None, and one where the robot's learned terms belong to none of ``models``.
-
-    >>> from motion_models import load_robot
-    >>> prior_notes(load_robot("vaultbot"))
-    []
-    """
-    notes = unused_terms_notes(robot, models)
-    found = scaling_prior(robot, models)
-    if found is None:
-        return notes
-    if robot.drive == DIFF_DRIVE:
-        return [*notes, f"{robot.name} has two driven wheels and a caster: diff_drive is its model, and skid_steer is the same with k = 1."]
-    return [
-        *notes,
-        f"{robot.name}: [models.skid_steer] has no k_0, so k = {found.k:.2f} +- {found.sigma:.2f} from {found.source}; "
-        f"{_CALIBRATION_TURN_S:g} s of turning make it +- {found.sigma_after_turning:.2f} "
-        "(`skidloc calibrate LOG --robot ... --out ROBOT.toml`).",
-    ]

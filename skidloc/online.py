@@ -12,6 +12,7 @@ from localization.errors import CheckpointError, EventError
 from localization.estimate import Estimate
 from localization.estimators import check_estimator
 from localization.events import CgSample, Event, ImuSample, PositionSample, Reference, Scan, WheelSample
+from localization.messages import Message
 from localization.pipeline import Pipeline, ReplayConfig, Trial
 from localization.ros.predictor import Predictor, extrapolate
 from localization.ros.start_pose import StartPose
@@ -157,7 +158,7 @@ class Online:
         return self._publish(self.pipeline.finish())
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the sensors so far, with what to do."""
         return [*self._messages.stats.describe(), *self.pipeline.warnings()]
 

@@ -30,6 +30,7 @@ from localization.events import Event
 from localization.evidence import open_log_with_set_up
 from localization.log_replay import replay
 from localization.logs import Log, TopicOverrides
+from localization.messages import Message
 from localization.pipeline import ReplayConfig
 from localization.trajectory import Trajectory
 from motion_models.registry import make_model, recommended_model
@@ -171,9 +172,9 @@ class ScoredRun:
         return self.result.nees_mean
 
     @property
-    def warnings(self) -> Sequence[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the sensors during the run."""
-        return self.result.run.warnings
+        return list(self.result.run.warnings)
 
     def to_numpy(self) -> FloatArray:
         """(N, 10) array with the columns `COLUMNS`; variances are NaN where the estimator has no covariance."""
@@ -229,7 +230,7 @@ class Runs(Sequence[ScoredRun]):
         return iter(self.runs)
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the sensors in any of the runs, each once."""
         return list(dict.fromkeys(itertools.chain.from_iterable(run.warnings for run in self.runs)))
 

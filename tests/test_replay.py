@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from localization.cli import main
 from localization.log_replay import warnings_of
+from localization.messages import message
 from localization.trajectory import read_tum
 from tests.helpers import bags, rooms
 from tests.helpers.checkout import beginning_of
@@ -114,14 +115,18 @@ def test_warnings_of_runs_name_all_trials_that_have_them():
     def run(estimator, *warnings):
         return SimpleNamespace(estimator=estimator, model="icr", warnings=[*warnings])
 
-    lost, slip = "LiDAR lost for 3 % of the drive.", "at t = 2 s: wheels slip."
-    runs = [run("odometry"), run("ekf", f"ekf (icr): {lost}", slip), run("graph", slip, f"graph (icr): {lost}", "graph (icr): late.")]
-    assert warnings_of(runs) == [f"ekf (icr), graph (icr): {lost}", slip, "graph (icr): late."]
+    lost, slip = message("saved_map.never"), message("stopped_gyro.repeats").at(2.0)
+    late = message("scans.late", scans="2 scans").of("graph (icr)")
+    runs = [run("odometry"), run("ekf", lost.of("ekf (icr)"), slip), run("graph", slip, lost.of("graph (icr)"), late)]
+    assert warnings_of(runs) == [lost.of("ekf (icr), graph (icr)"), slip, late]
 
 
-def test_warnings_of_runs_that_begin_alike_are_given_once():
-    def differ(metres, t=302.2):
-        return f"at t = {t} s: for 10 s the motion by the scans and that by the wheels differ (3.2 sigma in the mean, {metres} m)."
+def test_fault_of_several_runs_whose_numbers_differ_is_given_once():
+    """Numbers of the checks depend on the estimate."""
+
+    def differ(metres, at_s=302.2):
+        numbers = {"sigmas": 3.2, "difference": metres, "window": 10.0, "use": "The scans decide.", "cause": "Wheels spin."}
+        return message("sensor_pairs.ways_of_lidar_and_wheels", **numbers).at(at_s)
 
     runs = [
         SimpleNamespace(estimator=name, model="icr", warnings=[differ(metres), differ(metres, 7.0)])

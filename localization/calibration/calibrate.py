@@ -20,6 +20,7 @@ from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack
 from localization.evidence import open_log_as_declared
 from localization.logs import Log, TopicOverrides
+from localization.messages import Message, message, phrase
 from localization.trajectory import BoolArray
 from motion_models.base import MotionModel, scales
 from motion_models.calibration.cross_validation import HeldOut, LearnedNoise, cross_validate, learn_noise
@@ -51,7 +52,7 @@ class Cut:
     maneuvers: tuple[Maneuver, ...]
     measured_by: str
     """What measured the motion, in words."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     antenna: tuple[float, float] = (0.0, 0.0)
     """Where in the body frame positions without headings were measured [m]."""
     is_antenna_known: bool = True
@@ -146,8 +147,8 @@ def cut_log(
         guess = estimate_antenna(windows.maneuvers, robot)[0]
         motion_reference = motion_reference.with_guess(guess)
         windows = cut(log.events(), motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
-    kept = f"{len(windows.maneuvers)} windows of {config.window_s:g} s"
-    left = f"{kept}; left out: {windows.standing} standing still, {windows.unmeasured} not measured."
+    counts = {"count": len(windows.maneuvers), "standing": windows.standing, "unmeasured": windows.unmeasured}
+    left = message("measured_motion.windows", length_s=config.window_s, **counts)
     found = Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
     if not isinstance(motion_reference, PositionMotionReference):
         return found
@@ -354,16 +355,13 @@ def _without(maneuver: Maneuver, components: Sequence[int]) -> Maneuver:
     return dataclasses.replace(maneuver, cov=cov)
 
 
-def describe_clocks(offset_s: float, sigma_s: float, maneuvers: Sequence[Maneuver], robot: Robot) -> str:
-    """The wheels' clock as found beside those by headings and by positions alone, in a sentence; empty where they agree."""
+def describe_clocks(offset_s: float, sigma_s: float, maneuvers: Sequence[Maneuver], robot: Robot) -> Message | None:
+    """The wheels' clock as found beside those by headings and by positions alone, None where they agree."""
     others = estimate_clocks(maneuvers, robot)
     if all(abs(each.offset_s - offset_s) <= 2.0 * math.hypot(each.sigma_s, sigma_s) for each in others):
-        return ""
-    listed = " and ".join(f"{1e3 * each.offset_s:+.0f} +- {1e3 * each.sigma_s:.0f} ms by {each.by} alone" for each in others)
-    return (
-        f"the wheels' clock is off by {1e3 * offset_s:+.0f} +- {1e3 * sigma_s:.0f} ms by all that was measured, {listed}: one offset does "
-        "not describe this drive, and the EKF's will differ too. Check the stamps of the wheels' driver: jitter, or rates that it smooths."
-    )
+        return None
+    by = [phrase("jittering_clock.by", offset_ms=1e3 * each.offset_s, sigma_ms=1e3 * each.sigma_s, what=each.by) for each in others]
+    return message("jittering_clock.differs", offset_ms=1e3 * offset_s, sigma_ms=1e3 * sigma_s, others=" and ".join(by))
 
 
 def _least_error(residuals: FloatArray) -> float:

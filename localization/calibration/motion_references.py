@@ -15,6 +15,7 @@ from localization.events import Event, ImuSample, Scan, Turn
 from localization.inputs.gyro import GyroBuffer
 from localization.inputs.wheel_buffer import WheelBuffer
 from localization.lidar import MIN_POINTS, LidarConfig, ScanMatch, ScanMatcher, Sweep, choose_cell
+from localization.messages import Message, message
 from localization.trajectory import BoolArray, Trajectory
 from motion_models import se2
 from motion_models.base import MotionModel
@@ -130,7 +131,7 @@ class MotionReference(Protocol):
     def correct(self, spans: Sequence[Span]) -> list[Span]:
         """``spans`` without errors that the whole log shows."""
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Limits of what was measured, in sentences for the user."""
 
 
@@ -193,15 +194,12 @@ class GyroMotionReference:
         self._bias = bias, seconds
         return bias, max(scatter, self._noise.white_rad_per_sqrt_s / math.sqrt(seconds))
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """See `MotionReference.warnings`."""
         if self._bias is None:
-            note = (
-                "the robot never stood still for a second, so the gyro's bias could not be measured and counts as error; "
-                "let it stand for a few seconds."
-            )
+            note = message("motion_reference.no_rest")
         else:
-            note = f"the gyro's bias is {self._bias[0]:+.5f} rad/s, by {self._bias[1]:.0f} s of standing still; it was taken off."
+            note = message("motion_reference.bias", bias=self._bias[0], seconds=self._bias[1])
         return [note, *self._gyro.warnings()]
 
 
@@ -254,14 +252,11 @@ class LidarMotionReference:
         """See `MotionReference.correct`."""
         return list(spans)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """See `MotionReference.warnings`."""
-        notes = []
-        if self._open:
-            notes.append(f"{self._open} windows count by their heading alone: along walls and corridors scans do not fix the position.")
+        notes = [message("motion_reference.open", count=self._open)] if self._open else []
         if self._unmatched:
-            unmatched = f"{self._unmatched} of {self._scans} scans could not be matched with the first of their window"
-            notes.append(f"{unmatched}; windows that end in one were left out.")
+            notes.append(message("motion_reference.unmatched", count=self._unmatched, scans=self._scans))
         return notes
 
     def _adapt_to_rate(self, stamp_ns: int) -> None:
@@ -411,18 +406,15 @@ class TrackMotionReference:
         """See `MotionReference.correct`."""
         return list(spans)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """See `MotionReference.warnings`."""
         return list(self._warnings)
 
 
-def _describe_noise(track: ReferenceTrack, noise: FloatArray) -> str:
-    """Noise (N, 3, 3) of a reference's poses, and where it is from, in one sentence."""
+def _describe_noise(track: ReferenceTrack, noise: FloatArray) -> Message:
+    """Noise (N, 3, 3) of a reference's poses, and where it is from."""
     x, y, yaw = np.sqrt(np.median(np.diagonal(noise, axis1=1, axis2=2), axis=0))
-    size = f"{1e3 * math.hypot(x, y) / math.sqrt(2.0):.2g} mm and {math.degrees(yaw):.2g} deg"
+    sizes = {"sigma_mm": 1e3 * math.hypot(x, y) / math.sqrt(2.0), "sigma_deg": math.degrees(yaw)}
     if track.covariances is None:
-        return f"{track.source} has no covariances: its poses count as good to {size}; give their noise with --reference-sigma."
-    return (
-        f"the covariances of {track.source} make its poses good to {size}, each by itself; where errors last from pose to pose, as an "
-        "estimator's, give the noise without them with --reference-sigma."
-    )
+        return message("motion_reference.no_covariances", source=track.source, **sizes)
+    return message("motion_reference.covariances", source=track.source, **sizes)

@@ -15,6 +15,7 @@ from localization.calibration.motion_references import MAX_GAP_OVER_PERIOD, MAX_
 from localization.errors import EvaluationError
 from localization.evaluation.references import ReferenceTrack
 from localization.events import Event
+from localization.messages import Message, message
 from motion_models.calibration.chords import chord_covariances, chord_poses
 from motion_models.errors import CalibrationError
 from motion_models.se2 import FloatArray
@@ -120,23 +121,21 @@ class PositionMotionReference:
             )
         return list(spans)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """See `MotionReference.warnings`."""
         name = self._track.source
-        source = "as given" if self._is_given else "without covariances of its own; give its noise with --reference-sigma"
-        notes = [
-            *self._track.warnings,
-            f"{name} has positions alone, good to {1e3 * self._sigma_m:.2g} mm ({source}): compared are two chords of"
-            f" {self._window_ns * _NS:g} s in each window, by their lengths and the angle between them.",
-        ]
+        about = {"sigma_mm": 1e3 * self._sigma_m, "chord_s": self._window_ns * _NS}
+        if self._is_given:
+            noise = message("positions_as_reference.given_noise", source=name, **about)
+        else:
+            noise = message("positions_as_reference.assumed_noise", source=name, **about)
+        notes = [*self._track.warnings, noise]
         if not self.is_antenna_known:
-            notes.append(
-                f"where in the body's frame {name} measures is not known, so that it is estimated; one path does not separate it from the"
-                " centre of rotation. Give it by --antenna, or by the frame of its messages in /tf_static."
-            )
-        if self._coarse:
-            windows = "1 window was" if self._coarse == 1 else f"{self._coarse} windows were"
-            notes.append(f"{windows} left out: their chords are short against the noise of {name}.")
+            notes.append(message("positions_as_reference.antenna", source=name))
+        if self._coarse == 1:
+            notes.append(message("positions_as_reference.short_chord", source=name))
+        elif self._coarse:
+            notes.append(message("positions_as_reference.short_chords", source=name, count=self._coarse))
         return notes
 
 

@@ -21,11 +21,12 @@ from localization.evaluation.reference_check import compare_with_log
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import Relations
 from localization.events import Event
-from localization.evidence import CORRECTED, SetUp, SetUpLog, open_log_with_set_up
+from localization.evidence import SetUp, SetUpLog, open_log_with_set_up
 from localization.log_replay import Run, replay, warnings_of
 from localization.logs import Log, inspect_log
 from localization.logs.info import LogInfo
 from localization.logs.topic_roles import CHOSEN_BY
+from localization.messages import Message, phrase
 from localization.pipeline import Trial
 from motion_models.errors import RobotError
 from motion_models.prior import expected_scaling, scaling_sigma
@@ -238,8 +239,8 @@ def _odds(log_factor: float) -> str:
     return "over 1000 to 1" if log_factor > math.log(1000.0) else f"{math.exp(max(log_factor, 0.0)):.0f} to 1"
 
 
-def _refuted(quantity: str, text: str) -> CheckRow:
-    advice = text.replace(CORRECTED, "In the robot file:")
+def _refuted(quantity: str, found: Message) -> CheckRow:
+    advice = found.but(correction=phrase("set_up.in_file"))
     return CheckRow(quantity, "as in the robot file", "all sources beside each other", "contradiction", advice)
 
 

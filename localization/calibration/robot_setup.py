@@ -27,10 +27,11 @@ from localization.calibration.wheel_fit import (
     read_motion,
     wheel_sides,
 )
-from localization.evidence import CORRECTED, infer_set_up
+from localization.evidence import infer_set_up
 from localization.logs import open_log
 from localization.logs.topic_names import is_measured_outside, is_other_estimate, match_joints
 from localization.logs.topic_roles import TYPES, TopicOverrides
+from localization.messages import Message, phrase
 from motion_models.center_of_gravity.drive_controllers import ControllerValues
 from motion_models.center_of_gravity.urdf import first_names, link_poses, parse_urdf
 from motion_models.center_of_gravity.urdf_wheels import FORWARD, WheelGeometry, is_wheel, sides, wheel_geometry
@@ -370,14 +371,14 @@ def _mount(rotation: FloatArray, translation: FloatArray) -> Mount:
     return Mount(x, y, z, roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0]))
 
 
-def finish_checked(draft: Draft, given: Given, path: Path, default_name: str) -> tuple[Robot, tuple[str, ...]]:
+def finish_checked(draft: Draft, given: Given, path: Path, default_name: str) -> tuple[Robot, tuple[Message, ...]]:
     """The robot of a ``draft`` with what the log at ``path`` corrects of its signs, sides, units and clocks, and a sentence for each.
 
     Where nothing in the log decides, the sentence names all causes and the robot stays as drafted. Raises what `open_log` does.
     """
     robot = finish_robot(draft, given, default_name)
     found = infer_set_up(open_log(path, robot))
-    texts = tuple(text.replace(CORRECTED, "Written to the robot file:") for text in found.sentences)
+    texts = tuple(each.but(correction=phrase("set_up.written")) for each in found.sentences)
     return (robot if found.is_ambiguous else found.robot), texts
 
 

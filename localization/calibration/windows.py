@@ -14,8 +14,9 @@ from localization.bounded_settings import Count, Positive, Settings
 from localization.calibration.motion_references import HOLD_S, MotionReference, Span, Wheels
 from localization.events import CgSample, Event, WheelSample
 from localization.inputs.wheel_buffer import WheelBuffer
+from localization.messages import Message, message
 from motion_models.base import MotionModel
-from motion_models.calibration.maneuvers import Maneuver
+from motion_models.calibration.maneuvers import ForeignWindows, Maneuver
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -53,7 +54,7 @@ class Windows:
     """Windows that were left out because the robot stood still in them, or hardly moved."""
     unmeasured: int
     """Windows that were left out because wheels or reference had no data, or no valid measurement."""
-    warnings: tuple[str, ...]
+    warnings: tuple[Message, ...]
     """Limits of the motion reference, in sentences for the user."""
     step_rad: float = 0.0
     """Step of the encoders [rad]; 0 where none was seen."""
@@ -190,3 +191,15 @@ def driven(maneuvers: Sequence[Maneuver], wheel_radius_m: float, track_width_m: 
         metres += float(np.abs(ways.mean(axis=1)).sum())
         radians += float(np.abs(ways[:, 1] - ways[:, 0]).sum()) / track_width_m
     return seconds, metres, radians
+
+
+def describe_foreign(found: Sequence[ForeignWindows]) -> list[Message]:
+    """Windows of a table that were left out as their positions are in another frame."""
+    notes = []
+    for each in found:
+        counts = {"count": each.left_out, "compared": each.compared}
+        if each.kind == "far":
+            notes.append(message("foreign_windows.far", groups=each.groups, largest=each.largest, **counts))
+        else:
+            notes.append(message("foreign_windows.turned", groups=each.groups, largest=math.degrees(each.largest), **counts))
+    return notes

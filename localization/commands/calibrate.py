@@ -23,7 +23,7 @@ from localization.calibration.calibrate import (
     turning,
     with_clock,
 )
-from localization.calibration.windows import WindowConfig
+from localization.calibration.windows import WindowConfig, describe_foreign
 from localization.commands.calibration_tables import (
     calibration_numbers,
     print_better_model,
@@ -164,8 +164,8 @@ class Calibrate:
         if kind == "rotations":
             table = read_rotations(path, robot)
             return Cut(path.name, tuple(rotations_as_maneuvers(table, robot)), f"the table of {len(table.ratio)} rotations")
-        maneuvers, notes = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)
-        return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows", tuple(notes))
+        maneuvers, foreign = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)
+        return Cut(path.name, tuple(maneuvers), f"the table of {len(maneuvers)} windows", tuple(describe_foreign(foreign)))
 
     def _regressions(self, console: Console, robot: Robot) -> tuple[Robot, dict[str, float], dict[str, Any]]:
         """The thesis's regressions; what is written are the coefficients by all rows at once, with their sigmas."""

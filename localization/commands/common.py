@@ -18,6 +18,7 @@ from rich.segment import Segment
 from rich.table import Table
 
 from localization.errors import SettingError
+from localization.messages import Message
 from localization.output import output_errors, refuse_existing, write_text_file
 
 # Control characters but for line ends and tabs, marks that turn the direction of writing, and bytes of file names that are no text.
@@ -39,6 +40,14 @@ class PlainConsole(Console):
 def print_warning(console: Console, text: str) -> None:
     """A line that is not lost among others."""
     console.print(f"[yellow]![/] {escape(text)}", soft_wrap=True)
+
+
+def print_message(console: Console, found: Message) -> None:
+    """A warning, or a note beside it: ``found`` has nothing to be done about it."""
+    if found.is_warning:
+        print_warning(console, found)
+    else:
+        console.print(f"- {found}", markup=False, soft_wrap=True)
 
 
 def names(text: str, option: str) -> list[str]:

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table as Grid
 
+from localization.calibration.robot_notes import robot_notes
 from localization.commands.common import names, print_warning, write_json
 from localization.commands.models import model_names
 from localization.comparison.comparison_page import CompareHead, check_report, write_comparison_report
@@ -30,7 +31,6 @@ from localization.output import check_outputs, versions
 from localization.pipeline import ReplayConfig
 from motion_models.errors import RobotError
 from motion_models.online_calibration import check_forms
-from motion_models.prior import prior_notes
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 
@@ -174,7 +174,7 @@ class Compare:
         """On the robots: where k comes from if its file has none."""
         robots = {job.robot.name: job.robot for job in jobs}
         models = model_names(self.model, list(robots.values()))
-        return list(dict.fromkeys(note for robot in robots.values() for note in prior_notes(robot, models)))
+        return list(dict.fromkeys(note for robot in robots.values() for note in robot_notes(robot, models)))
 
 
 def places(out: Path) -> tuple[Path, Path]:

@@ -13,8 +13,9 @@ from rich.console import Console
 from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
-from localization.calibration.windows import WindowConfig
-from localization.commands.common import in_radians, new_folder, write_json
+from localization.calibration.robot_notes import unused_terms_notes
+from localization.calibration.windows import WindowConfig, describe_foreign
+from localization.commands.common import in_radians, new_folder, print_message, write_json
 from localization.diagnosis.baseline import estimate_baseline
 from localization.diagnosis.corrected_robot import correct_robot, held_shares, is_held
 from localization.diagnosis.diagnose import DiagnosisConfig
@@ -44,7 +45,6 @@ from localization.report.diagnosis_page import write_diagnosis_report
 from motion_models.calibration.maneuvers import read_windows, table_columns, without_foreign_frames
 from motion_models.calibration.regressions import read_rotations, rotations_as_maneuvers
 from motion_models.errors import CalibrationError, SkidlocError
-from motion_models.prior import unused_terms_notes
 from motion_models.registry import make_model
 from motion_models.robot import Robot
 from motion_models.robot_file import load_robot, relocated, robot_toml
@@ -160,9 +160,9 @@ class Diagnose:
         if "rotation_ratio" in columns:
             maneuvers = rotations_as_maneuvers(read_rotations(self.source, robot), robot)
             return drive_of_table(name, robot, maneuvers, "rotations")
-        maneuvers, notes = without_foreign_frames(read_windows(self.source), robot.geometry.wheel_radius_m)
+        maneuvers, foreign = without_foreign_frames(read_windows(self.source), robot.geometry.wheel_radius_m)
         found = drive_of_table(name, robot, maneuvers, "windows")
-        return dataclasses.replace(found, warnings=(*notes, *found.warnings))
+        return dataclasses.replace(found, warnings=(*describe_foreign(foreign), *found.warnings))
 
     def _check_others(self) -> None:
         """Refuse further drives beside a table, and files of one drive's reference."""
@@ -308,4 +308,4 @@ def print_diagnosis(console: Console, d: Diagnosis) -> None:
     if d.next_drive:
         console.print(f"next drive: {d.next_drive}", markup=False, soft_wrap=True)
     for note in (*d.contradictions, *describe_outliers(d), *d.warnings):
-        console.print(f"! {note}", markup=False, soft_wrap=True)
+        print_message(console, note)

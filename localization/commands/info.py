@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from localization.calibration.robot_notes import robot_notes
 from localization.commands.common import print_table, print_warning, write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.logs.topic_roles import CHOSEN_BY
 from localization.output import check_outputs
-from motion_models.prior import prior_notes
 from motion_models.robot_file import load_robot
 
 
@@ -38,7 +38,7 @@ class Info:
         with console.status("reading the log"):
             robot = load_robot(self.robot)
             info = inspect_log(open_log(self.log, robot, self.topic))
-            info.warnings.extend(prior_notes(robot))
+            info.warnings.extend(robot_notes(robot))
         if self.json is not None:
             write_json(self.json, info.to_dict())
         _print(console, info)

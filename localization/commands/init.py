@@ -17,6 +17,7 @@ from rich.prompt import Confirm, Prompt
 from localization.calibration.arms_setup import ArmsDraft, add_arms
 from localization.calibration.log_survey import Survey, survey_log
 from localization.calibration.robot_draft import DRIVE_60_S, Draft, Given
+from localization.calibration.robot_notes import robot_notes
 from localization.calibration.robot_setup import draft_robot, finish_checked
 from localization.commands.calibrate import Calibrate
 from localization.commands.common import add_row, plain_table, print_line, print_table
@@ -26,7 +27,6 @@ from motion_models.center_of_gravity.urdf import body_link, parse_urdf, read_urd
 from motion_models.center_of_gravity.urdf_wheels import with_forward_base
 from motion_models.center_of_gravity.xacro_files import expand_xacro, is_xacro
 from motion_models.errors import RobotError
-from motion_models.prior import prior_notes
 from motion_models.registry import recommended_model
 from motion_models.robot import DRIVES, Robot
 from motion_models.robot_file import load_robot, parse_robot, robot_toml
@@ -122,7 +122,7 @@ class Init:
                 add_row(table, c.quantity, c.source, c.value, c.by_log)
             print_table(console, table)
         robot = self._write(console, survey, draft, given)
-        for note in prior_notes(robot):
+        for note in robot_notes(robot):
             print_line(console, note)
         model = recommended_model(robot)
         if self.calibrate or (is_interactive and _wants_calibration(console, draft)):

@@ -17,7 +17,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from localization.commands.common import print_warning
+from localization.calibration.robot_notes import robot_notes
+from localization.commands.common import print_message, print_warning
 from localization.commands.online_options import CommandOptions, listening
 from localization.errors import CheckpointError, OutputError
 from localization.estimators import check_estimator
@@ -31,7 +32,6 @@ from localization.ros.node import Node, StopSignal
 from localization.ros.session import Session, SessionState, View, made_by, shared_of
 from localization.ros.settings import LiveRun, OnlineSettings
 from localization.ros.transports.transport import Transport
-from motion_models.prior import prior_notes
 from motion_models.registry import advice
 
 _LINE_S = 0.25
@@ -89,8 +89,8 @@ class OnlineCommand(CommandOptions, OnlineSettings):
             is_done = True
         finally:
             session.close(forget=is_done)
-        for note in dict.fromkeys([*prior_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
-            print_warning(console, note)
+        for note in dict.fromkeys([*robot_notes(robot, [trial.model.name]), *log.warnings(), *session.pipeline.warnings()]):
+            print_message(console, note)
         for sentence in advice(robot, [trial.model.name]):
             console.print(sentence, markup=False, soft_wrap=True)
         self._summarize(console, session, seconds, count)
@@ -156,7 +156,7 @@ class OnlineCommand(CommandOptions, OnlineSettings):
         finally:
             answers.shutdown(wait=False, cancel_futures=True)
         for note in node.warnings():
-            report(note)
+            print_message(console, note)
         self._summarize(console, node.session, node.seconds, count)
 
     def _view(self, console: Console) -> View | None:

@@ -18,7 +18,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from localization.commands.common import WIDE, names, new_folder, print_table, print_warning, write_json
+from localization.calibration.robot_notes import robot_notes
+from localization.commands.common import WIDE, names, new_folder, print_message, print_table, write_json
 from localization.commands.models import model_names
 from localization.errors import EstimatorError, EvaluationError, MapError, SettingError
 from localization.estimators import ESTIMATORS_WITH_CORRECTIONS, ESTIMATORS_WITH_MAP, LOCALIZER, PriorMap, check_estimator, merge_maps
@@ -42,6 +43,7 @@ from localization.logs.reference_topics import merge_positions, read_positions
 from localization.logs.writer import write_fused
 from localization.maps import SavedMap, load_map, save_map
 from localization.maps.space_places import make_places
+from localization.messages import Message, message
 from localization.output import as_text, check_outputs, fingerprint, versions
 from localization.pipeline import ReplayConfig, Trial
 from localization.report.cg_figure import turn_blocks
@@ -52,17 +54,13 @@ from localization.report.turn_layer import TurnLayer
 from localization.trajectory import write_tum
 from motion_models.base import MotionModel
 from motion_models.online_calibration import Form, check_forms
-from motion_models.prior import prior_notes, scaling_prior
+from motion_models.prior import scaling_prior
 from motion_models.registry import advice, make_model
 from motion_models.robot import Mount, Robot
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 
 _WHEELLESS = "lidar"
-_HELD_OUT = (
-    "{0} is fused and the reference: every second position is fused, and the others score. As positions by GPS err alike for minutes, the "
-    "score of the graph is still too small. To fuse all of them, name another --reference, or none."
-)
 _PROGRESS_NS = 500_000_000
 _FIRST_LEFT_OUT = ("RPE deg/m", "speed x", "drift %", "ATE deg", "end m", "NEES", "LiDAR lost %")
 """Titles of columns, in the order in which a narrow terminal leaves them out."""
@@ -133,7 +131,7 @@ class Replay:
         if self.extend_map is not None and self.map is None:
             raise EstimatorError("--extend-map adds to a saved map. Name it by --map, or write a new one by --save-map.")
         reference, positions = self._reference(log), self._positions(log)
-        held_out = [_HELD_OUT.format(self.positions)] if self._is_held_out(log) else []
+        held_out = [message("positions.held_out", topic=self.positions or "")] if self._is_held_out(log) else []
         # the LiDAR alone uses no motion model: it runs once, and counts for each
         alone = next((p for p in pairs if p.estimator == _WHEELLESS), None)
         once = [p for p in pairs if p.estimator != _WHEELLESS or p is alone]
@@ -155,18 +153,17 @@ class Replay:
             robot=robot.name,
             start=describe_instant(log.start_ns),
             duration_s=log.duration_s,
-            warnings=[
-                as_text(note)
-                for note in dict.fromkeys(
+            warnings=list(
+                dict.fromkeys(
                     [
-                        *prior_notes(robot, [m.name for m in models]),
+                        *robot_notes(robot, [m.name for m in models]),
                         *held_out,
                         *log.warnings(),
                         *warnings_of(found),
                         *_in_space_notes(found),
                     ]
                 )
-            ],
+            ),
             versions=versions(),
             log_fingerprint=fingerprint(log.path),
             center_of_gravity=_about_center_of_gravity(turns, found, models, robot),
@@ -337,6 +334,7 @@ class Replay:
             "distance_m": _distance(results),
             "results": [result.metrics(head.duration_s, self.timing) for result in results],
             "notes": list(head.warnings),
+            "messages": [note.as_json() for note in head.warnings],
             "k_prior": None if prior is None else prior._asdict(),
             "provenance": {
                 "log_fingerprint": head.log_fingerprint,
@@ -347,8 +345,8 @@ class Replay:
 
     def _print(self, console: Console, head: ReportHead, results: Sequence[Result], reference: ReferenceTrack | Relations | None) -> None:
         of_reference = reference.warnings if isinstance(reference, ReferenceTrack) else ()
-        for note in dict.fromkeys([*head.warnings, *map(as_text, of_reference)]):
-            print_warning(console, note)
+        for note in dict.fromkeys([*head.warnings, *of_reference]):
+            print_message(console, note)
         print_table(console, accuracy_table(results, head.duration_s, console.width if console.is_terminal else WIDE))
         console.print(verdict(results, reference), markup=False, soft_wrap=True)
         robot = load_robot(self.robot)
@@ -451,11 +449,10 @@ def _estimates(run: Run) -> Iterator[FusedEstimate]:
         )
 
 
-def _in_space_notes(runs: Sequence[Run]) -> list[str]:
+def _in_space_notes(runs: Sequence[Run]) -> list[Message]:
     """Which of the ``runs`` have left the plane, when, and why."""
     return [
-        f"{run.estimator} ({run.model}): the IMU shows that the ground tilts, so from {run.in_space_from_s:.1f} s on poses are in space, "
-        "with clouds registered in 3D. --config.step.planar keeps them in the plane."
+        message("tilting_ground.in_space", begin_s=run.in_space_from_s).of(f"{run.estimator} ({run.model})")
         for run in runs
         if run.in_space_from_s is not None
     ]

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from localization.calibration.calibrate import MotionReferenceName
-from localization.commands.common import in_radians, write_json
+from localization.commands.common import in_radians, print_message, write_json
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import DrivenWeighing, weigh
@@ -123,4 +123,4 @@ def print_weighing(console: Console, found: DrivenWeighing, at: tuple[float, flo
     about = f"{found.windows} windows, {found.turned_rad:.0f} rad of turning by the wheels, motion by {found.motion_reference}"
     console.print(about, markup=False, soft_wrap=True)
     for note in found.warnings:
-        console.print(f"! {note}", markup=False, soft_wrap=True)
+        print_message(console, note)

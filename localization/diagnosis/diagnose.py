@@ -81,6 +81,7 @@ from localization.diagnosis.verdict import (
     noise_excess,
     separating_drive,
 )
+from localization.messages import Message, message
 from motion_models.base import MotionModel
 from motion_models.friction import FrictionModel
 from motion_models.se2 import FloatArray
@@ -474,32 +475,23 @@ def _by_contacts(predictor: DrivePredictor, first: Linearization) -> FloatArray:
     return predictor.by_file.discrepancies(Hypothesis()) - first.rows
 
 
-def _contact_notes(predictor: DrivePredictor, error: MissingSlips) -> tuple[str, ...]:
-    """That the contacts are not those of the robot file, or not those of the friction model, in sentences."""
+def _contact_notes(predictor: DrivePredictor, error: MissingSlips) -> tuple[Message, ...]:
+    """That the contacts are not those of the robot file, or not those of the friction model."""
     if predictor.unmodelled.stiffness_exponent:
-        return (
-            "the contacts of this robot creep, by the speed of the slip and not by its share of the way: causes are searched beside such"
-            " contacts.",
-            *error.notes,
-        )
+        return message("contacts.creep"), *error.notes
     if not predictor.unmodelled.log_stiffness:
         return error.notes
-    times = math.exp(predictor.unmodelled.log_stiffness)
-    return (
-        f"the contacts of this robot are {times:.0f} times as stiff as the robot file has them, nearly of Coulomb's friction: causes are"
-        " searched beside such contacts.",
-        *error.notes,
-    )
+    return message("contacts.stiff", times=math.exp(predictor.unmodelled.log_stiffness)), *error.notes
 
 
-def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> tuple[str, ...]:
+def _clock_warnings(predictor: DrivePredictor, findings: Sequence[Finding]) -> tuple[Message, ...]:
     """Where headings or positions alone give the wheels another clock than ``findings`` do."""
     shifts = [(predictor.wheel_shift(with_sizes({f.definition: f.size})), f.sigma) for f in findings if f.definition.is_clock]
     offset, sigma = sum(shift for shift, _ in shifts), math.hypot(*(sigma for shift, sigma in shifts if shift))
     if not offset or predictor.drive.kind != "log":
         return ()
-    text = describe_clocks(offset, sigma, predictor.drive.maneuvers, predictor.drive.robot)
-    return (text,) if text else ()
+    found = describe_clocks(offset, sigma, predictor.drive.maneuvers, predictor.drive.robot)
+    return () if found is None else (found,)
 
 
 def _heldout(linearization: Linearization, chosen: tuple[int, ...], others: tuple[int, ...], config: DiagnosisConfig) -> Gain:

@@ -23,6 +23,7 @@ from localization.calibration.windows import WindowConfig, Windows, cut
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.inputs.gyro import GyroRecord, is_gravity
 from localization.logs.reader import Log
+from localization.messages import Message, message
 from localization.simulation.experiments import CONFIGURATION_CGS, CONTROLLERS, TRAJECTORIES
 from motion_models import se2
 from motion_models.calibration.maneuvers import IntArray, Maneuver, read_rows
@@ -126,7 +127,7 @@ class Drive:
     """x and y in the body frame of the antenna, for positions without headings [m]."""
     encoder_step_rad: float = 0.0
     """Step of the wheels' encoders [rad]; 0 where it is not known."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
 
     @property
     def has_positions(self) -> bool:
@@ -157,7 +158,7 @@ class _Recorder:
         self.used = list(spans)
         return self._inner.correct(spans)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         return self._inner.warnings()
 
     def range_slopes(self) -> FloatArray | None:
@@ -247,7 +248,7 @@ def drive_of_log(
             f"{log.path.name} has {log.no_wheels or 'no wheels by these options.'} Name them with --topic.joint-states or --topic.odometry."
         )
     if motion_reference == "auto" and reference is None and log.sources.lidar is None and log.sources.imu is None:
-        alone = f"{log.path.name} has neither a LiDAR nor an IMU, and no reference was named: nothing measures what the wheels do."
+        alone = message("measured_motion.nothing", log=log.path.name)
         return Drive(log.path.name, robot, (), "none", warnings=(alone, *log.warnings()))
     inner = make_motion_reference(log, robot, motion_reference, reference, config, reference_sigmas, antenna)
     postures = None
@@ -258,7 +259,7 @@ def drive_of_log(
     if isinstance(inner[0], PositionMotionReference) and not inner[0].is_antenna_known and drive.maneuvers:
         (x, y), (sigma_x, sigma_y) = estimate_antenna(drive.maneuvers, robot)
         inner = inner[0].with_guess((x, y)), inner[1]
-        note = f"the antenna was estimated at ({x:.3f} +- {sigma_x:.2g}, {y:.3f} +- {sigma_y:.2g}) m, and counts as known there."
+        note = message("measured_motion.antenna", x=x, y=y, sigma_x=sigma_x, sigma_y=sigma_y)
         drive = drive_of_events(log.events(), log.path.name, robot, log.mounts, inner, config, postures)
         drive = dataclasses.replace(drive, warnings=(*drive.warnings, note))
     losses = tuple(EncoderLoss(f.joint, f.messages / max(drive.rolling_messages, f.messages), f.spells) for f in log.frozen_wheels())
@@ -327,19 +328,18 @@ def drive_of_events(
     )
 
 
-def _describe_gaps(gyro: GyroRecord) -> str:
-    gaps = "a gap" if gyro.gaps == 1 else f"{gyro.gaps} gaps"
-    return f"the IMU has {gaps} of {gyro.silent_s:.2g} s in all: headings follow the motion reference there. Check its driver and cable."
+def _describe_gaps(gyro: GyroRecord) -> Message:
+    if gyro.gaps == 1:
+        return message("measured_motion.gap", silent_s=gyro.silent_s)
+    return message("measured_motion.gaps", count=gyro.gaps, silent_s=gyro.silent_s)
 
 
-def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> str:
+def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> Message:
     length_s = float(np.median(spans[:, 1] - spans[:, 0])) * _NS if len(spans) else config.window_s
-    text = (
-        f"{len(windows.maneuvers)} windows of {length_s:.2g} s; left out: {windows.standing} standing, {windows.unmeasured} not measured."
-    )
+    counts = {"count": len(windows.maneuvers), "standing": windows.standing, "unmeasured": windows.unmeasured}
     if length_s > 1.3 * config.window_s and not any(m.middle for m in windows.maneuvers):
-        text += f" The motion reference is sparse, so that windows of {config.window_s:g} s were extended to its stamps."
-    return text
+        return message("measured_motion.sparse", length_s=length_s, window_s=config.window_s, **counts)
+    return message("measured_motion.windows", length_s=length_s, **counts)
 
 
 def find_message_loss(stamps: IntArray) -> MessageLoss | None:
@@ -512,7 +512,7 @@ def drive_of_runs(name: str, robot: Robot, runs: list[TableRun]) -> Drive:
         paths.append(path)
     drive = drive_of_table(name, robot, maneuvers, "runs")
     errors = np.array([run.vision_error_m for run in runs])
-    note = "x is the vision error; centres of gravity are those inferred for the seven configurations from `rotate` under diff_drive."
+    note = message("measured_motion.runs")
     return dataclasses.replace(drive, paths=tuple(paths), path_errors=errors, warnings=(note,))
 
 

@@ -18,6 +18,7 @@ from localization.diagnosis.drive_predictor import CHANNELS
 from localization.diagnosis.gate import HandoverCheck
 from localization.diagnosis.model_extension import Extension
 from localization.diagnosis.noise import Noise
+from localization.messages import Message, message, phrase
 from motion_models.se2 import FloatArray
 
 Verdict = Literal["consistent", "explained", "extended", "ambiguous", "unexplained", "undecidable"]
@@ -252,12 +253,12 @@ class Diagnosis:
     """Smallest size of each cause that this drive would show (three sigma, beside all that is tolerated)."""
     gain: Gain | None = None
     """Gain of correcting all findings together."""
-    contradictions: tuple[str, ...] = ()
+    contradictions: tuple[Message, ...] = ()
     """Measurements that exclude each other, in sentences."""
     outliers_s: tuple[float, ...] = ()
     """When windows began that no cause explains to eight sigma: jumps of the reference, or events on the floor."""
     windows: int = 0
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     too_little: str = ""
     """Why the drive was not searched for causes: too little was measured."""
     suspected: Finding | None = None
@@ -340,15 +341,12 @@ def describe_encoder_losses(losses: Sequence[EncoderLoss]) -> str:
     return f"{', '.join(each)} of the messages; the other wheels of its side replace it"
 
 
-def describe_standstill_turn(turn: StandstillTurn) -> str:
+def describe_standstill_turn(turn: StandstillTurn) -> Message:
     """A gyro that turns while the wheels stand, and what to check."""
-    first = f"first at {turn.first_s:.0f} s" if turn.first_s >= 0.0 else f"first {-turn.first_s:.0f} s before it drove"
+    at, before = phrase("measured_motion.first_at", seconds=turn.first_s), phrase("measured_motion.first_before", seconds=-turn.first_s)
     angle, rate = math.degrees(turn.angle_rad), math.degrees(turn.angle_rad / turn.seconds)
-    return (
-        f"in {turn.seconds:.2g} s of standing by the wheels, {first}, the gyro turned {angle:.0f} deg: its bias is {rate:.2g} deg/s, the "
-        "wheels' messages are wrong or belong to another time, or the robot was carried; check the joint states' topic and names, and the "
-        "gyro at rest."
-    )
+    first = at if turn.first_s >= 0.0 else before
+    return message("measured_motion.standstill_turn", seconds=turn.seconds, first=first, degrees=angle, rate=rate)
 
 
 def describe_tolerated(d: Diagnosis) -> list[str]:
@@ -362,11 +360,10 @@ def describe_tolerated(d: Diagnosis) -> list[str]:
     return found
 
 
-def noise_notes(rows: Mapping[str, Component]) -> tuple[str, ...]:
+def noise_notes(rows: Mapping[str, Component]) -> tuple[Message, ...]:
     """Rows in which nothing is significant, and whose noise is more than the motion reference states: it is the reference's."""
     return tuple(
-        f"{name} scatters by {row.expected_rms:.2g} {row.unit}, {row.noise_over_reference:.1f} times what the motion reference states, "
-        "without a pattern that a cause has: its stated noise is too small for this drive."
+        message("measured_motion.small_noise", row=name, rms=row.expected_rms, unit=row.unit, ratio=row.noise_over_reference)
         for name, row in rows.items()
         if row.status != "unexplained" and row.noise_over_reference > MAX_NOISE_OVER_REFERENCE
     )
@@ -400,15 +397,12 @@ def describe_row(row: Component) -> str:
     return f"{by} (within tolerance)" if row.status == "within tolerance" else by
 
 
-def describe_outliers(d: Diagnosis) -> list[str]:
+def describe_outliers(d: Diagnosis) -> list[Message]:
     """Windows that were left out of the table, in one sentence; empty without any."""
     if not d.outliers_s:
         return []
     times = ", ".join(f"{t:.0f}" for t in d.outliers_s[:5]) + (", ..." if len(d.outliers_s) > 5 else "")
-    return [
-        f"{len(d.outliers_s)} of {d.windows} windows are outliers of eight sigma that no cause explains (at {times} s) and are not in the "
-        "table: the reference jumps or turns there, or the robot hit something; check the reference at these times."
-    ]
+    return [message("measured_motion.outliers", count=len(d.outliers_s), windows=d.windows, times=times)]
 
 
 def unit_of(name: str) -> str:

@@ -20,6 +20,7 @@ from localization.diagnosis.causes.cause import Cause
 from localization.diagnosis.drive_predictor import DrivePredictor, Unmodelled, slip_columns
 from localization.diagnosis.linearization import LEVELS, Linearization
 from localization.diagnosis.noise import FLAT, estimate_drive_noise
+from localization.messages import Message, message
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -63,16 +64,11 @@ class MissingSlips(NamedTuple):
         return self.log_odds > _MAX_LOG_ODDS
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """That the model does not describe the drive, in a sentence."""
+    def notes(self) -> tuple[Message, ...]:
+        """That the model does not describe the drive."""
         if not self.is_shown:
             return ()
-        return (f"the contacts of this robot are not those of the friction model ({self.gain}): sizes have that error in their intervals.",)
-
-    @property
-    def gain(self) -> str:
-        """What they gain, in words."""
-        return f"log-likelihood +{0.5 * self.log_odds:.0f}"
+        return (message("contacts.other", gain=0.5 * self.log_odds),)
 
 
 def find_model_error(predictor: DrivePredictor, linearization: Linearization) -> MissingSlips:

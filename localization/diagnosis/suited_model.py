@@ -15,6 +15,7 @@ from localization.diagnosis.drive_predictor import Baseline
 from localization.diagnosis.findings import Diagnosis, unit_of
 from localization.diagnosis.linearization import default_model
 from localization.diagnosis.result import DiagnosisResult
+from localization.messages import Message, message
 from motion_models.base import MotionModel
 from motion_models.registry import make_model
 
@@ -30,18 +31,19 @@ class ModelDiagnosis:
     """Causes to which the diagnosis was limited; None without a limit."""
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What the model that suits the robot finds, as a sentence; empty without one."""
+    def notes(self) -> tuple[Message, ...]:
+        """What the model that suits the robot finds; empty without one."""
         if self.suited is None:
             return ()
         causes = ", ".join(f"{f.definition.label} {f.size:+.3g}{unit_of(f.cause)}" for f in self.suited.findings) or "no cause"
-        text = f"{self.suited.model}, which suits {self.suited.robot}, is {self.suited.verdict} on this drive and names {causes}"
+        names = {"model": self.suited.model, "robot": self.suited.robot, "verdict": self.suited.verdict, "causes": causes}
         if self.names is None:
-            return (f"{text}.",)
-        model = self.found.diagnosis.model
+            return (message("suited_model.all", **names),)
+        diagnosed = self.found.diagnosis.model
         is_missing = bool({c.id for c in self.names} - {f.cause for f in self.found.diagnosis.findings})
-        advice = f"; diagnosed by {self.suited.model}, robot.toml corrects {model} as well" if is_missing else ""
-        return (f"{text}: for {model} no other cause is searched{advice}.",)
+        if is_missing:
+            return (message("suited_model.corrects", diagnosed=diagnosed, **names),)
+        return (message("suited_model.limited", diagnosed=diagnosed, **names),)
 
 
 def examine_beside_suited(

@@ -30,6 +30,7 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.drive_predictor import DrivePredictor
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, setting_of
 from localization.diagnosis.model_error import CG_OFFSETS, cg_error_sigmas, cg_prior_sigmas, find_model_error
+from localization.messages import Message, message
 from motion_models.errors import CalibrationError
 from motion_models.friction import FrictionModel
 from motion_models.registry import make_model
@@ -86,7 +87,6 @@ _MAX_NOISE_RATIO = 3.0
 """Noise of the drive over that of its motion reference beyond which the friction model does not describe the drive."""
 _MAX_CORRECTION_SIGMAS = 2.5
 """Over the sigma of its prior; beyond it a correction stands for something else, which may be a part of the load."""
-_WIDENED = "The interval has the errors in it that the model has on other contacts; run `skidloc diagnose`, or weigh on scales."
 
 
 class SlopeWeighing(NamedTuple):
@@ -137,9 +137,9 @@ class DrivenWeighing:
     """Noise of the drive over that of the motion reference by its own covariance."""
     corrections: Mapping[str, Nuisance]
     """Parameters estimated jointly with the CG, by the label of their cause."""
-    model_errors: tuple[str, ...] = ()
+    model_errors: tuple[Message, ...] = ()
     """Why the friction model does not describe this drive, in sentences; the covariance has the errors of such models in it."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     slope: SlopeWeighing | None = None
     """Estimates that only a slope determines; None on a level floor."""
 
@@ -370,16 +370,16 @@ def _noise_ratio(predictor: DrivePredictor, linearization: Linearization) -> flo
     return float(np.median((linearization.noise.sigmas[:, :3] / np.where(known, claimed, 1.0))[known])) if known.any() else 1.0
 
 
-def _model_errors(predictor: DrivePredictor, estimate: MapEstimate, noise_ratio: float) -> tuple[str, ...]:
+def _model_errors(predictor: DrivePredictor, estimate: MapEstimate, noise_ratio: float) -> tuple[Message, ...]:
     """Why the friction model does not describe the drive."""
     found = []
     error = find_model_error(predictor, estimate.linearization)
     if error.is_shown:
-        found.append(f"the robot does not turn as the friction model has it, alike in all motions of one kind ({error.gain}).")
+        found.append(message("weighing.turns_otherwise", gain=0.5 * error.log_odds))
     sizes = {c: v / c.plausible for c, v in zip(estimate.causes, estimate.sizes.tolist(), strict=True) if c.id not in CG_OFFSETS}
     far = [f"{c.id} {v * c.plausible:+.3g} ({v:+.1f} sigma)" for c, v in sizes.items() if abs(v) > _MAX_CORRECTION_SIGMAS]
     if far:
-        found.append(f"{', '.join(far)}: more than robots differ by from their files; it may be a part of the load.")
+        found.append(message("weighing.far", causes=", ".join(far)))
     if noise_ratio > _MAX_NOISE_RATIO:
-        found.append(f"{noise_ratio:.1f} times the noise of the motion reference is left: something else turns this robot.")
-    return (*found, _WIDENED) if found else ()
+        found.append(message("weighing.noise", ratio=noise_ratio))
+    return (*found, message("weighing.widened")) if found else ()

@@ -110,7 +110,7 @@ def make_estimator(
     check_estimator(name, has_lidar)
     config = config or EstimatorConfig()
     if name == "odometry":
-        return DeadReckoning()
+        return DeadReckoning(make_corrections(model, "constant"), config.ekf.wheel_radius_sigma)
     if name == "lidar":
         return LidarOdometry(mounts, config.lidar)
     corrected, sensor = make_corrections(model, form), ScanMatchingSensor(mounts, config.lidar) if has_lidar else None

@@ -15,6 +15,7 @@ from localization.events import Step
 from localization.lidar import KissIcp, LidarConfig, Sweep, choose_voxel_size
 from localization.lidar.scan_matcher import MIN_POINTS
 from motion_models import se2
+from motion_models.online_calibration import Corrections
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray, Points2
 
@@ -23,27 +24,41 @@ _FALLBACK_VOXEL_M = 0.5
 
 
 class DeadReckoning(Estimator):
-    """Composes the predicted motions. With A = Ad(delta^-1), slip of covariance Q and CG of covariance C in each step:
+    """Composes the predicted motions. With A = Ad(delta^-1), slip of covariance Q in each step, and errors that last, each as its sigma:
 
-    P' = A P A^T + Q     D' = A D + (d delta / d CG) C^(1/2)
+    P' = A P A^T + Q     D' = A D + d     d = [ (d delta / d CG) C^(1/2)   (d delta / d params) B   (d delta / d radius) sigma ]
 
-    The pose has covariance P + D D^T. The CG error lasts: sigma does not depend on how the drive is cut into steps.
+    The pose has covariance P + D D^T. C is the CG's covariance, B B^T that of the motion model's parameters before a drive has corrected
+    them, and sigma the radius'. Errors that last do not depend on how the drive is cut into steps.
     """
 
-    def __init__(self) -> None:
-        self._pose, self._cov, self._by_cg = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 2))
+    def __init__(self, corrections: Corrections | None = None, radius_sigma: float = 0.0) -> None:
+        """``corrections`` of the motion model, with their prior; None for parameters that are exact."""
+        self._pose, self._cov = np.zeros(3), np.zeros((3, 3))
+        self._by_params = None if corrections is None else corrections.directions @ np.linalg.cholesky(corrections.cov)
+        self._radius_sigma = radius_sigma
+        self._lasting: FloatArray | None = None
 
     def step(self, step: Step) -> Estimate:
         """The pose by the wheels at the end of the step, with its covariance."""
-        motion = step.predicted
+        motion, dt = step.predicted, step.duration
         A = se2.adjoint(se2.inverse(motion.delta))
+        d = self._lasting_of(step)
         self._pose = se2.compose(self._pose, motion.delta)
         self._cov = A @ self._cov @ A.T + motion.cov
-        self._by_cg = A @ self._by_cg + motion.d_cg @ _square_root(step.cg_cov)
+        self._lasting = d if self._lasting is None else A @ self._lasting + d
         twist, twist_cov = step.twist, None
-        if step.duration > 0.0:
-            twist, twist_cov = twist_at_end(*mean_twist(motion.delta, step.cov, step.duration), step.twist - step.mean_twist, step.duration)
-        return Estimate(step.end_ns, self._pose, self._cov + self._by_cg @ self._by_cg.T, twist, twist_cov)
+        if dt > 0.0:
+            twist, twist_cov = twist_at_end(*mean_twist(motion.delta, motion.cov, dt), step.twist - step.mean_twist, dt)
+            twist_cov = twist_cov + d @ d.T / dt**2
+        return Estimate(step.end_ns, self._pose, self._cov + self._lasting @ self._lasting.T, twist, twist_cov)
+
+    def _lasting_of(self, step: Step) -> FloatArray:
+        """(3, m) what errors that last do to the motion of ``step``, each as its sigma."""
+        motion = step.predicted
+        by_radius = self._radius_sigma * np.append(-se2.inverse(motion.delta)[:2], 0.0)  # R^T (x, y)
+        columns = [motion.d_cg @ _square_root(step.cg_cov), by_radius[:, None]]
+        return np.hstack(columns if self._by_params is None else [*columns, motion.d_params @ self._by_params])
 
 
 def _square_root(cov: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from localization.lidar import LostScans
 from localization.lifting import Trajectory3
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid
+from localization.messages import Message
 from localization.trajectory import Trajectory
 from motion_models.se2 import FloatArray, Points2, Pose2
 
@@ -125,7 +126,7 @@ class Estimator(ABC):
         """Number of occurrences by name: scans, matched, searched, loops."""
         return {}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the measurements so far."""
         return []
 

@@ -27,6 +27,7 @@ from localization.estimate import Estimate, GyroCalibration
 from localization.estimators.estimator import NO_POINTS, Estimator, LearnedParameter, Residuals
 from localization.events import Step
 from localization.lidar import LostScans, ScanMatchingSensor
+from localization.messages import Message
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.motion import Motion
@@ -307,7 +308,7 @@ class EkfFusion(Estimator):
         found = {**self.counts_by_name, "prior_outliers": self._policies.outlier.count}
         return found if self._sensor is None else {**found, **self._sensor.lost.causes}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """A long way by wheels alone, and a clock offset that is large and certain."""
         return [*self._policies.open_way.warnings(), *clock_warnings(self.clocks_apart, self._has_gyro, self._sensor is not None)]
 

@@ -29,6 +29,7 @@ from localization.lidar.loop_detection import Keyframe, LoopDetector
 from localization.maps import KeyframeMap
 from localization.maps.grid import Grid, GrowingGrid
 from localization.maps.keyframe_map import MappedKeyframe, MeasuredMotion, make_map
+from localization.messages import Message, message
 from localization.trajectory import Trajectory
 from motion_models import se2
 from motion_models.groups import SE2, Group
@@ -103,7 +104,7 @@ class Smoothing:
     """(3, 3) of each keyframe, by the filter."""
     covs: FloatArray | None = None
     """(K, 3, 3) of the smoothed keyframes."""
-    failure: str = ""
+    failure: Message | None = None
     """Why the trajectory could not be smoothed."""
 
 
@@ -259,7 +260,7 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
         try:
             smoothed = self.graph.smooth()
         except EstimatorError as error:
-            self._smoothing.failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
+            self._smoothing.failure = message("smoothing.failed", reason=str(error))
             return None
         covs = [self._bound(*pair) for pair in zip(smoothed.covs, self._smoothing.filter_covs, strict=True)]
         self._smoothing.covs = np.array(covs)
@@ -283,10 +284,14 @@ class GraphFusion(FilteredOdometry[EkfFusion]):
             found["loops"] = len(self.graph.loops)
         return {**found, "positions": self._positions.count} if self._positions.count else found
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the measurements so far: those of the filter, and positions that could not be used, or contradict the other
         sensors."""
-        return [*self.odometry.warnings(), *([self._smoothing.failure] if self._smoothing.failure else []), *self._positions.warnings()]
+        return [
+            *self.odometry.warnings(),
+            *([] if self._smoothing.failure is None else [self._smoothing.failure]),
+            *self._positions.warnings(),
+        ]
 
     def keyframe_map(self) -> KeyframeMap | None:
         """Keyframes as they can be saved; None before the first. Poses are smoothed after `finish`."""

@@ -10,6 +10,7 @@ from localization.estimators.position_queue import PositionQueue, align_map
 from localization.events import PositionSample, Step
 from localization.lidar import OUTLIER_SIGMAS
 from localization.maps.position_plane import PositionPlane
+from localization.messages import Message, message
 from motion_models import se2
 from motion_models.se2 import Cov3, Pose2
 
@@ -59,11 +60,10 @@ class GraphPositions:
         alignment = self._graph.alignment()
         return None if alignment is None else PositionPlane(*alignment, self._graph.lever_arm()[0], self._origin)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Positions that could not be used, or contradict the other sensors."""
         found = self._queue.warnings(self.count, len(self._placed))
         n = int((self._graph.position_errors() > OUTLIER_SIGMAS).sum()) if self.count else 0
         if n:
-            contradicted = f"{n} of {self.count} positions are more than {OUTLIER_SIGMAS:g} sigma off wheels, gyro and LiDAR"
-            found.append(f"{contradicted}: they count little. Check the receiver, its covariance and the antenna's lever arm.")
+            found.append(message("positions.contradict", count=n, total=self.count, sigmas=OUTLIER_SIGMAS))
         return found

@@ -26,6 +26,7 @@ from localization.maps.localizer import Localizer
 from localization.maps.place_search import PlaceMap
 from localization.maps.position_plane import PositionFix, PositionPlane
 from localization.maps.recent_scans import RecentMotion
+from localization.messages import Message, message
 from motion_models import se2
 from motion_models.se2 import Cov3, Pose2
 
@@ -51,12 +52,11 @@ class MapPositions:
             return None
         return plane.to_map(position, due[-1].covariance)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """A sentence on positions that could not be used."""
         if not self._n_unused:
             return []
-        unused = f"{self._n_unused} positions could not be used: the map was built without such ones"
-        return [f"{unused}. Build it with --positions, or leave them out."]
+        return [message("positions.other_plane", count=self._n_unused)]
 
 
 class MapFusion(SavedMapFusion[EkfFusion]):
@@ -179,6 +179,6 @@ class MapFusion(SavedMapFusion[EkfFusion]):
         """`SavedMapFusion.localization`, and what has changed in the map."""
         return {**super().localization(), **({} if self._drive is None else self._drive.as_json())}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Those of `SavedMapFusion`, positions that could not be used, and what has changed in the map."""
         return [*super().warnings(), *self._positions.warnings(), *([] if self._drive is None else self._drive.warnings())]

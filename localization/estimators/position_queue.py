@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from localization.events import PositionSample, Step
+from localization.messages import Message, message, phrase
 from motion_models import se2
 from motion_models.se2 import FloatArray, Points2, Pose2
 
@@ -42,15 +43,14 @@ class PositionQueue:
                 continue
             yield sample, (sample.stamp_ns - step.start_ns) / max(step.end_ns - step.start_ns, 1)
 
-    def warnings(self, n_used: int, n_unused: int) -> list[str]:
+    def warnings(self, n_used: int, n_unused: int) -> list[Message]:
         """Warnings about positions without effect: all of them if ``n_used`` is 0 (``n_unused`` were taken, others wait), and late ones."""
-        found, n = [], n_unused + len(self._waiting)
+        found, n = list[Message](), n_unused + len(self._waiting)
         if n and not n_used:
-            needed = f"it takes {MIN_POSITIONS} over {MIN_BASELINE_M:g} m to give the map its heading"
-            found.append(f"{n} positions could not be used: {needed}.")
+            found.append(message("positions.too_few", count=n, least=MIN_POSITIONS, way_m=MIN_BASELINE_M))
         if self.n_late:
-            late = "1 position" if self.n_late == 1 else f"{self.n_late} positions"
-            found.append(f"{late} came after the estimate of a later stamp and had to be left out. Check the stamps.")
+            late = phrase("positions.one") if self.n_late == 1 else phrase("positions.many", count=self.n_late)
+            found.append(message("positions.late", positions=late))
         return found
 
 

@@ -10,6 +10,7 @@ from localization.maps import KeyframeMap
 from localization.maps.changes import Changes, find_changes
 from localization.maps.keyframe_map import MappedKeyframe, make_map
 from localization.maps.place_search import PlaceMap
+from localization.messages import Message, message, phrase
 
 _LISTED_CHANGES = 5
 _LEAST_CHANGED = 0.05
@@ -44,15 +45,12 @@ class RecordedDrive:
             return {}
         return {"changed_share": changes.changed_share, "changes": [asdict(change) for change in changes.places]}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """A sentence on the places where the map no longer fits, where they are more than scattered cells."""
         changes = self._changes
         if changes is None or changes.changed_share < _LEAST_CHANGED:
             return []
-        named = [f"{c.kind} at x {c.x:.1f} m, y {c.y:.1f} m ({c.size_m:.1f} m)" for c in changes.places[:_LISTED_CHANGES]]
-        rest = len(changes.places) - len(named)
-        more = f", and {rest} more" if rest else ""
-        return [
-            f"the map no longer fits at {len(changes.places)} places, {100 * changes.changed_share:.0f} % of the walls that were measured: "
-            f"{'; '.join(named)}{more}. --extend-map writes a map with them."
-        ]
+        named = [phrase("saved_map.place", kind=c.kind, x=c.x, y=c.y, size_m=c.size_m) for c in changes.places[:_LISTED_CHANGES]]
+        rest, count = len(changes.places) - len(named), len(changes.places)
+        listed = "; ".join(named) + (phrase("saved_map.more", count=rest) if rest else "")
+        return [message("saved_map.changed", count=count, percent=100.0 * changes.changed_share, places=listed)]

@@ -13,6 +13,7 @@ from localization.maps.grid import Grid
 from localization.maps.localizer import Localizer, State
 from localization.maps.space_localizer import SpaceLocalizer
 from localization.maps.space_places import Places, SpacePlaces
+from localization.messages import Message, message
 from motion_models.se2 import Cov3, FloatArray, Points2, Pose2
 
 
@@ -154,20 +155,14 @@ class SavedMapFusion(FilteredOdometry[Filter]):
         """Number of occurrences by name, as the filter counts them."""
         return self.odometry.counts()
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the measurements so far: those of the filter, and for how long the place in the map was not known."""
         found, times = list(self.odometry.warnings()), self._times
         if times.first_s is None and self.odometry.counts()["scans"]:
-            found.append(
-                "the robot was never localized in the map. It may be of another place, or much may have changed: check --map, or give "
-                "--initial-pose."
-            )
+            found.append(message("saved_map.never"))
         elif times.n_losses:
-            found.append(
-                f"the place in the map was lost {times.n_losses} times, for {times.lost_s:.0f} of {times.total_s:.0f} s, and is "
-                f"{self.localizer.state} at the end: poses of that time are by odometry alone. The robot was carried, or the map is out of "
-                "date."
-            )
+            lost = message("saved_map.lost", losses=times.n_losses, lost_s=times.lost_s, total_s=times.total_s, state=self.localizer.state)
+            found.append(lost)
         return found
 
     def occupancy(self) -> Grid | None:

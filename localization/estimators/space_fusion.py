@@ -24,6 +24,7 @@ from localization.estimators.estimator import Estimator
 from localization.events import Gravity, Step
 from localization.lidar import LidarConfig, LostScans
 from localization.lidar.cloud_sensor import CloudMatchingSensor
+from localization.messages import Message, message
 from localization.space_pose import Pose3, aligning
 from motion_models import se3
 from motion_models.robot import GyroNoise, Mount
@@ -166,18 +167,12 @@ class SpaceFusion(Estimator):
         """Number of occurrences by name: scans, matched, and those of lost scans by cause."""
         return {**self._counts, **self._sensor.lost.causes}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Warnings about inputs that poses in space need and that are missing, with the remedy."""
         if not self._has_vertical:
-            return [
-                "poses in space need the vertical, and no IMU with an accelerometer and a known mount has measured gravity: no cloud was "
-                "matched. Give the IMU's mount (/tf_static, or [mounts] of the robot file), or leave out --config.step.no-planar."
-            ]
+            return [message("poses_in_space.no_vertical")]
         if self._counts["planar"]:
-            return [
-                f"{self._counts['planar']} planar scans were not matched: poses in space take clouds of a 3D LiDAR (--topic.points). "
-                "Leave out --config.step.no-planar for a planar LiDAR."
-            ]
+            return [message("poses_in_space.planar_scans", count=self._counts["planar"])]
         return []
 
     def map_points(self) -> Points2:

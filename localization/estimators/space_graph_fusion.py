@@ -25,6 +25,7 @@ from localization.lidar.cloud_loops import make_map_closures
 from localization.lifting import Trajectory3
 from localization.maps import KeyframeMap
 from localization.maps.keyframe_map import MeasuredMotion
+from localization.messages import Message
 from localization.trajectory import Trajectory
 from motion_models import se2, se3
 from motion_models.groups import SE3
@@ -181,10 +182,10 @@ class SpaceGraphFusion(FilteredOdometry[SpaceFusion]):
         """Positions in the graph."""
         return 0 if self.graph.enu_T_map is None else len(self._placed)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Warnings of the filter, of a failed smoothing, and of positions that could not be used."""
-        failure = "" if self._smoothing is None else self._smoothing.failure
-        found = [*self.odometry.warnings(), *([failure] if failure else [])]
+        failure = None if self._smoothing is None else self._smoothing.failure
+        found = [*self.odometry.warnings(), *([] if failure is None else [failure])]
         return found + self._queue.warnings(self._n_positions, len(self._placed) - self._n_positions)
 
     def map_points(self) -> Points2:

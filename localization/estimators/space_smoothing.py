@@ -11,6 +11,7 @@ from localization.lidar.cloud_loops import find_loops
 from localization.lifting import SpaceTable, Trajectory3
 from localization.maps import KeyframeMap
 from localization.maps.keyframe_map import MappedKeyframe, MeasuredMotion, make_map
+from localization.messages import Message, message
 from localization.space_pose import Pose3
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se3
@@ -31,7 +32,7 @@ class SpaceSmoothing:
         """Poses in space by all measurements, once smoothed."""
         self.map: KeyframeMap | None = None
         """Keyframes as they can be saved, once smoothed."""
-        self.failure = ""
+        self.failure: Message | None = None
         """Why the trajectory could not be smoothed."""
 
     def add_keyframe(self, cloud: FloatArray | None, sensor: FloatArray) -> None:
@@ -55,7 +56,7 @@ class SpaceSmoothing:
             if graph.loops:
                 keyframes = graph.smooth()
         except EstimatorError as error:
-            self.failure = f"the trajectory could not be smoothed, and its poses are the live ones: {error}"
+            self.failure = message("smoothing.failed", reason=str(error))
             return None
         to_map = se3.lift(map_T_odom)
         mapped = zip(stamps[self.path.nodes].tolist(), to_map @ keyframes.poses, self._clouds, self._sensors, keyframes.covs, strict=True)

@@ -14,6 +14,7 @@ import numpy as np
 from localization.bounded_settings import Positive, Settings
 from localization.errors import EvaluationError
 from localization.evaluation.references import ReferenceTrack, Relations, no_overlap_message
+from localization.messages import Message
 from localization.trajectory import IntArray, Trajectory, path_nodes
 from motion_models import se2
 from motion_models.se2 import FloatArray
@@ -115,7 +116,7 @@ class Accuracy:
     reference_T_world: FloatArray | None = field(default=None, compare=False)
     """(3,) the alignment by the whole path: puts the trajectory's poses into the reference's plane."""
     errors: ErrorSeries | None = field(default=None, compare=False)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     """Remarks on the numbers."""
 
     def numbers(self) -> dict[str, float | int | None]:

@@ -20,6 +20,7 @@ from localization.evaluation.references import RELATION_COLUMNS, ReferenceTrack,
 from localization.events import Scan
 from localization.logs import Log
 from localization.logs.reference_topics import east_north, geodetic_to_ecef
+from localization.messages import Message, message
 from localization.trajectory import IntArray, number_rows, parse_float, tum_rows, whole_lines, yaw_of_quaternion
 from motion_models import se2
 from motion_models.input_files import read_table
@@ -54,7 +55,7 @@ class _Poses:
     quaternions: FloatArray | None = None
     yaws: FloatArray | None = None
     """(N,) [rad], where the file has a heading and no quaternions."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
 
 
 def read_reference_file(path: str | Path, log_stamps: LogStamps | None = None) -> ReferenceTrack | Relations:
@@ -127,7 +128,7 @@ def _read_tum(path: Path) -> ReferenceTrack:
     rows = list(tum_rows(path))
     values, stamps = np.array([row[2] for row in rows]), np.array([stamp for _, stamp, _ in rows], dtype=np.int64)
     if _is_w_first(values[:, 3:]):
-        text = f"the quaternions in {path} have w first (w x y z), where TUM has it last: read so."
+        text = message("reference_files.w_first", file=str(path))
         return _of_poses(_Poses(stamps, values[:, :3], values[:, [4, 5, 6, 3]], warnings=(text,)), path, None)
     return _of_poses(_Poses(stamps, values[:, :3], values[:, 3:]), path, None)
 
@@ -157,7 +158,7 @@ def _of_poses(found: _Poses, path: Path, log_stamps: LogStamps | None) -> Refere
     stamps = found.stamps_ns
     if stamps is None:
         stamps = _spread_stamps(len(found.positions), log_stamps, path)
-        warnings.append(f"{path} has no times: its {len(stamps)} poses are spread over the log's time, which may be seconds off.")
+        warnings.append(message("reference_files.no_times", file=str(path), count=len(stamps)))
     xy, yaws = found.positions[:, :2], found.yaws
     turns = None if found.quaternions is None or not found.quaternions.any() else found.quaternions
     if turns is not None:
@@ -167,7 +168,7 @@ def _of_poses(found: _Poses, path: Path, log_stamps: LogStamps | None) -> Refere
         if turns is not None:
             yaws = 2.0 * np.arctan2(turns[:, 1], turns[:, 3])
             yaws = se2.wrap_angle(yaws + _quarter_turn(xy, yaws))
-        warnings.append(f"the height in {path} is y (as of mocap and cameras): z and x are taken as the plane.")
+        warnings.append(message("reference_files.height_is_y", file=str(path)))
     track = make_track(stamps, xy, yaws, None, str(path))
     return replace(track, warnings=(*warnings, *track.warnings), has_times=has_times)
 
@@ -417,14 +418,14 @@ def _read_nmea(lines: Sequence[str], path: Path, log_stamps: LogStamps | None) -
     if not rows:
         raise EvaluationError(f"'{path}' has no {kind} sentence with a fix.")
     stamps = np.unwrap(np.array([row[0] for row in rows], dtype=float), period=float(_DAY_NS)).round().astype(np.int64)
-    warnings = (f"{path}: {lost} NMEA sentences with a wrong checksum are left out.",) if lost else ()
+    warnings = (message("reference_files.checksums", file=str(path), count=lost),) if lost else ()
     if midnight is None:
         own = np.empty(0, dtype=np.int64) if log_stamps is None else log_stamps()
         if not len(own):
             raise EvaluationError(f"'{path}' has no date: record RMC sentences too.")
         midnight = int(own[0]) // _DAY_NS * _DAY_NS
         midnight += round((int(own[0]) - midnight - int(stamps[0])) / _DAY_NS) * _DAY_NS
-        warnings = (*warnings, f"{path} has times of the day without a date (no RMC): the log's is taken.")
+        warnings = (*warnings, message("reference_files.no_date", file=str(path)))
     return _Poses(stamps + midnight, _local(np.array([row[1:] for row in rows])), warnings=warnings)
 
 
@@ -532,7 +533,7 @@ def _role(name: str) -> tuple[str, str]:
     return _NAMED.get(last, ""), found
 
 
-def _in_degrees(angles: FloatArray, path: Path) -> tuple[FloatArray, tuple[str, ...]]:
+def _in_degrees(angles: FloatArray, path: Path) -> tuple[FloatArray, tuple[Message, ...]]:
     """Latitudes and longitudes (N, 2) [deg], of NMEA's ddmm.mmmm where these are beyond 90; and a sentence of that."""
     known = angles[np.isfinite(angles).all(axis=1)]
     if not len(known) or float(np.abs(known[:, 0]).max()) <= 90.0:
@@ -540,7 +541,7 @@ def _in_degrees(angles: FloatArray, path: Path) -> tuple[FloatArray, tuple[str, 
     found = np.copysign(np.abs(angles) // 100.0 + np.abs(angles) % 100.0 / 60.0, angles)
     if (np.abs(known) % 100.0 >= 60.0).any() or float(np.nanmax(np.abs(found[:, 0]))) > 90.0:
         raise EvaluationError(f"'{path}': latitudes reach {np.abs(known[:, 0]).max():g}, beyond 90 degrees. {_KNOWN}")
-    return found, (f"latitudes in {path} are beyond 90 degrees: read as degrees and minutes (ddmm.mmmm, as of NMEA).",)
+    return found, (message("reference_files.degrees_and_minutes", file=str(path)),)
 
 
 _METRES = {"mm": 1e-3, "cm": 1e-2, "km": 1e3}

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from localization.errors import EvaluationError
 from localization.events import Reference
+from localization.messages import Message, message
 from localization.trajectory import IntArray, number_rows, parse_float, parse_seconds
 from motion_models.se2 import FloatArray
 
@@ -42,7 +43,7 @@ class ReferenceTrack:
     """Its name in messages: a topic or a file."""
     n_dropped: int = 0
     """Samples left out because they were not finite or repeated a stamp."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     """Remarks on this reference."""
     has_times: bool = True
     """False where the source has none, and the poses were spread over the log's scans."""
@@ -144,19 +145,19 @@ def make_track(
     dropped = len(stamps) - order.size
     if not order.size:
         raise EvaluationError(f"{source} holds no usable sample ({dropped} in it, none of them finite).")
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Message, ...] = ()
     held = _held(positions[order])
     if held.any():
         order = order[~held]
-        warnings += (f"{held.sum()} of {len(stamps)} positions of {source} were dropped: repeated until a jump, as trackers do when lost.",)
+        warnings += (message("reference.held", count=int(held.sum()), total=len(stamps), source=source),)
     far = _single_jumps(positions[order])
     if far.any():
         order = order[~far]
-        warnings += (f"{far.sum()} of {len(stamps)} positions of {source} were dropped: a jump away, and back with the next one.",)
+        warnings += (message("reference.jumped", count=int(far.sum()), total=len(stamps), source=source),)
     if dropped:
-        warnings += (f"{dropped} of {len(stamps)} samples of {source} were dropped: not finite, or of a repeated stamp.",)
+        warnings += (message("reference.not_finite", count=dropped, total=len(stamps), source=source),)
     if yaws is not None and frozen_yaw(positions[order], yaws[order]):
-        warnings += (f"the heading in {source} never changes though the path turns: taken as positions only.",)
+        warnings += (message("reference.frozen_heading", source=source),)
         yaws = None
     if covariances is not None and np.isnan(covariances).all():
         covariances = None

@@ -6,10 +6,9 @@ motion integrated out), `search`, `refine`, `verdict`, `entrance`. See docs/theo
 """
 
 from localization.evidence.entrance import SetUpLog, infer_set_up, open_log_as_declared, open_log_with_set_up
-from localization.evidence.verdict import CORRECTED, Hypothesis, SetUp
+from localization.evidence.verdict import Hypothesis, SetUp
 
 __all__ = [
-    "CORRECTED",
     "Hypothesis",
     "SetUp",
     "SetUpLog",

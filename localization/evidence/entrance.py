@@ -20,11 +20,12 @@ from localization.evidence.alternatives import Row
 from localization.evidence.fields import own_faults
 from localization.evidence.search import make_stacks
 from localization.evidence.signals import Source, bin_edges, from_gyro, from_joints, from_odometry, from_poses, is_comparable, scan_sources
-from localization.evidence.verdict import CORRECTED, SetUp, decide
+from localization.evidence.verdict import SetUp, decide
 from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.decode import MAX_RATE_RAD_S, JointReading, OdometryReading, imu_decoder
 from localization.logs.event_decoder import TopicDecoder, late_ns
 from localization.logs.wheel_messages import angle_period_rad, odometry_decoder, wheel_decoder
+from localization.messages import phrase
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -77,7 +78,7 @@ def open_log_as_declared(path: Path | str, robot: Robot, topics: TopicOverrides 
     refute the robot file: a calibration of wrong signs or units fits nothing."""
     found = open_log_with_set_up(path, robot, topics)
     if found.set_up.sentences:
-        texts = " ".join(found.set_up.sentences).replace(CORRECTED, "Write:")
+        texts = " ".join(each.but(correction=phrase("set_up.write")) for each in found.set_up.sentences)
         raise CalibrationError(f"{texts} Correct the robot file first; `skidloc check` writes it.")
     return found.log
 

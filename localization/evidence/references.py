@@ -18,6 +18,7 @@ from localization.evidence.alternatives.positions import Candidate, alternatives
 from localization.evidence.paths import make_path, make_track
 from localization.evidence.signals import Source
 from localization.evidence.verdict import CERTAIN, Hypothesis, Verdict
+from localization.messages import Message, message
 from localization.trajectory import IntArray, Trajectory
 from motion_models import se2
 from motion_models.robot import Robot
@@ -39,7 +40,7 @@ class ReferenceSetUp:
 
     verdict: Verdict
     hypotheses: tuple[Hypothesis, ...] = ()
-    sentences: tuple[str, ...] = ()
+    sentences: tuple[Message, ...] = ()
     """What contradicts the sensors."""
     scale: float = math.nan
     """Length of its ways over the sensors', by the most probable of all."""
@@ -106,10 +107,10 @@ def _decide(name: str, found: Sequence[Candidate]) -> ReferenceSetUp:
     if by_file > 1.0 - CERTAIN:
         return ReferenceSetUp("consistent", hypotheses, (), scale, delay_s)
     if kept[0][0] >= CERTAIN:
-        sentences = tuple(f"{name}: {row.text}. {row.remedy}".rstrip() for row in best.faults)
+        sentences = tuple(message("set_up.reference", reference=name, fault=row.text, remedy=row.remedy) for row in best.faults)
         return ReferenceSetUp("certain", hypotheses, sentences, scale, delay_s)
     ways = ", or ".join(f"{hypothesis.text} ({hypothesis.probability:.2f})" for hypothesis in hypotheses)
-    sentence = f"{name} contradicts the sensors: {ways}. This drive does not decide: record one with turns both ways and other speeds."
+    sentence = message("set_up.reference_ambiguous", reference=name, ways=ways)
     return ReferenceSetUp("ambiguous", hypotheses, (sentence,), scale, delay_s)
 
 

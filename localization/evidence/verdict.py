@@ -14,6 +14,7 @@ from localization.evidence.likelihood import Choice, Stack
 from localization.evidence.refine import measured_scales, refined_rows
 from localization.evidence.search import posterior, rows_of, search
 from localization.evidence.signals import Source
+from localization.messages import Message, message, phrase
 from motion_models.robot import Robot
 
 CERTAIN = 0.97
@@ -22,8 +23,6 @@ _NAMED = 0.01
 """Least probability of a set-up that is named beside others."""
 _SIGN_TURN_RAD, _SIGN_WAY_M = np.pi, 10.0
 """Turn and way after which a wheel noise that grows with the motion has the error of an unknown factor: (2 x)^2 = 4 pi x at x = pi."""
-CORRECTED = "Corrected in this run; write to the robot file:"
-"""Words in sentences about what is certain, before keys of the robot file."""
 
 Verdict = Literal["consistent", "certain", "ambiguous", "undecidable"]
 
@@ -50,7 +49,7 @@ class SetUp:
     robot: Robot
     """With what is certain corrected, and a covariance for what is not."""
     hypotheses: tuple[Hypothesis, ...] = ()
-    sentences: tuple[str, ...] = ()
+    sentences: tuple[Message, ...] = ()
     keys: dict[str, str] = field(default_factory=dict)
     """Entries to write to the robot file, by their key: text of the value in TOML."""
     is_gyro_used: bool = True
@@ -148,13 +147,18 @@ def _aligned(
     return SetUp("ambiguous", corrected, hypotheses, (*_correction_warnings(sources, common, usual, kept), text), keys, by_file=by_file)
 
 
-def _alignment_warning(sources: Sequence[Source], clock: Row, others: Sequence[str], keys: Mapping[str, str]) -> str:
+def _alignment_warning(sources: Sequence[Source], clock: Row, others: Sequence[str], keys: Mapping[str, str]) -> Message:
     written = "; ".join(f"{key} = {value}" for key, value in keys.items() if key.startswith("clock."))
     names = " and ".join(source.name for source in sources)
-    return (
-        f"{names}: their stamps are {abs(clock.value or 0.0):.2f} s apart, and nothing in the log shows whose clock is off"
-        f" ({_topic(sources, clock)}: {clock.text}; or {', '.join(others)}). {CORRECTED} {written}, or synchronize the clocks."
-        " The covariance has the way in that time."
+    return message(
+        "set_up.clocks",
+        sources=names,
+        seconds=abs(clock.value or 0.0),
+        topic=_topic(sources, clock),
+        clock=clock.text,
+        others=", ".join(others),
+        correction=phrase("set_up.in_this_run"),
+        entries=written,
     )
 
 
@@ -175,9 +179,9 @@ def _with_usual(robot: Robot, stacks: Sequence[Stack], choice: Choice) -> Robot:
 
 def _reported(
     sources: Sequence[Source], stacks: Sequence[Stack], robot: Robot, ranked: Sequence[tuple[float, Choice]], chosen: Choice
-) -> tuple[str, ...]:
-    """Sentences on what the robot file leaves open and should have, which the ``chosen`` set-up shows."""
-    found = list[str]()
+) -> tuple[Message, ...]:
+    """Messages on what the robot file leaves open and should have, which the ``chosen`` set-up shows."""
+    found = list[Message]()
     for row in rows_of(stacks, chosen):
         if not row.is_fault and row.is_reported:
             having = [(p, choice, (row,)) for p, choice in ranked if any(other.key == row.key for other in rows_of(stacks, choice))]
@@ -215,37 +219,40 @@ def _with_mixture_noise(robot: Robot, stacks: Sequence[Stack], unresolved: Seque
 
 def _correction_warnings(
     sources: Sequence[Source], common: Sequence[Row], robot: Robot, kept: Sequence[tuple[float, Choice, tuple[Row, ...]]]
-) -> list[str]:
+) -> list[Message]:
     found = []
-    probability = sum(p for p, _, _ in kept)
+    probability = min(sum(p for p, _, _ in kept), 0.999)
     for row in common:
         after = robot if row.correct is None else row.correct(robot)
         entries = changed_entries(robot, after)
         written = "; ".join(f"{key} = {value}" for key, value in entries.items())
-        end = f"{CORRECTED} {written}." if written else row.remedy or "Nothing is corrected: check this sensor."
-        found.append(
-            f"{_topic(sources, row)}: {row.text} (probability {min(probability, 0.999):.3f}, of {_witnesses(sources, row)}). {end}"
-        )
+        facts = {"topic": _topic(sources, row), "fault": row.text, "probability": probability, "witnesses": _witnesses(sources, row)}
+        if written:
+            found.append(message("set_up.certain", correction=phrase("set_up.in_this_run"), entries=written, **facts))
+        elif row.remedy:
+            found.append(message("set_up.by_hand", remedy=row.remedy, **facts))
+        else:
+            found.append(message("set_up.unknown", **facts))
     return found
 
 
 def _ambiguity_warnings(
     sources: Sequence[Source], kept: Sequence[tuple[float, Choice, tuple[Row, ...]]], rest: Sequence[tuple[Row, ...]]
-) -> list[str]:
+) -> list[Message]:
     if not rest:
         return []
-    ways = [f"{' and '.join(row.text for row in rows) or 'nothing more'} ({p:.2f})" for (p, _, _), rows in zip(kept, rest, strict=True)]
-    names = " and ".join(source.name for source in sources)
-    absent = [text for kind, text in _DECIDERS.items() if all(source.kind != kind for source in sources)]
-    record = f"record {' or '.join(absent)} as well, or " if absent else ""
+    ways = []
+    for (p, _, _), rows in zip(kept, rest, strict=True):
+        faults = " and ".join(row.text for row in rows) or phrase("set_up.nothing_more")
+        ways.append(phrase("set_up.one_way", faults=faults, probability=p))
+    absent = [phrase(text) for kind, text in _DECIDERS.items() if all(source.kind != kind for source in sources)]
+    record = phrase("set_up.record", sensors=phrase("set_up.or").join(absent)) if absent else ""
     listed = ", ".join(ways[:-1]) + (f", or {ways[-1]}" if len(ways) > 1 else ways[-1])
-    return [
-        f"{names} contradict each other: {listed}. Nothing in the log decides, nothing of it is corrected, and the covariance holds all of"
-        f" them: {record}watch one turn to the left, in which the right wheels' rates and the yaw rate must be positive."
-    ]
+    return [message("set_up.ambiguous", sources=" and ".join(source.name for source in sources), ways=listed, record=record)]
 
 
-_DECIDERS = {"gyro": "a gyro", "lidar": "a LiDAR"}
+_DECIDERS = {"gyro": "set_up.gyro", "lidar": "set_up.lidar"}
+"""Sensors that decide, as `phrase` has them."""
 
 
 def _topic(sources: Sequence[Source], row: Row) -> str:

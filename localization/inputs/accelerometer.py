@@ -15,6 +15,7 @@ import numpy as np
 
 from localization.events import ImuSample
 from localization.inputs.gyro import GRAVITY_SAMPLES, MAX_MOUNT_ERROR_RAD, is_gravity
+from localization.messages import Message, message, phrase
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY
@@ -36,18 +37,18 @@ class PlacedImu(NamedTuple):
     """Factor of the accelerometer's forces to m/s^2; 0 until it is known."""
 
 
-def scale_of_force(size: float, name: str) -> tuple[float, str]:
-    """Factor to m/s^2 of an accelerometer whose first samples have a mean of ``size``, which is gravity at rest; and its problem, as a
-    sentence about ``name``. The factor is 0 with a problem, and where all samples are zero (no accelerometer, no problem)."""
+def scale_of_force(size: float, name: str) -> tuple[float, Message | None]:
+    """Factor to m/s^2 of an accelerometer whose first samples have a mean of ``size``, which is gravity at rest; and its problem, a message
+    that begins with ``name``. The factor is 0 with a problem, and where all samples are zero (no accelerometer, no problem)."""
     if is_gravity(size):
-        return 1.0, ""
+        return 1.0, None
     if _IN_G[0] < size < _IN_G[1]:
-        return GRAVITY, ""
+        return GRAVITY, None
     if not size:
-        return 0.0, ""
+        return 0.0, None
     if size < _NO_GRAVITY:
-        return 0.0, f"{name} shows no gravity ({size:.2f} m/s^2 on average): its driver removes it."
-    return 0.0, f"{name} shows {size:.1f} m/s^2 on average, neither gravity in m/s^2 nor in g."
+        return 0.0, message("accelerometer.no_gravity", sensor=name, size=size)
+    return 0.0, message("accelerometer.other_size", sensor=name, size=size)
 
 
 class Accelerometer:
@@ -58,7 +59,7 @@ class Accelerometer:
         self._frame: str | None = None
         self._unmounted: str | None = None  # frame of an accelerometer whose mount is not known
         self._first: list[FloatArray] = []
-        self._problem = ""  # why there is no vertical
+        self._problem: Message | None = None  # why there is no vertical
         self._is_absent = False
         self.imu = PlacedImu(np.eye(3), np.zeros(3), 0.0)
         """The IMU that is used."""
@@ -66,7 +67,7 @@ class Accelerometer:
     @property
     def is_usable(self) -> bool:
         """Whether the vertical can be measured, as far as is known."""
-        return not (self._problem or self._is_absent)
+        return self._problem is None and not self._is_absent
 
     def accept(self, sample: ImuSample) -> bool:
         """Whether ``sample`` is of the IMU that is used, and this one usable; its first samples show the unit of the force."""
@@ -84,13 +85,11 @@ class Accelerometer:
 
     def _find_unit(self) -> None:
         size = float(np.linalg.norm(np.mean(self._first, axis=0)))
-        scale, self._problem = scale_of_force(size, f"the accelerometer of IMU '{self._frame}'")
-        if self._problem:
-            self._problem += " Slopes are not modelled."
-        elif scale:
+        scale, self._problem = scale_of_force(size, phrase("accelerometer.of_frame", frame=self._frame or ""))
+        if scale:
             mount = self._mounts[self._frame or ""]
             self.imu = PlacedImu(np.ascontiguousarray(mount.rotation), np.array([mount.x, mount.y, mount.z]), scale)
-        else:
+        elif self._problem is None:
             self._is_absent = True
 
     def is_above(self, up_z: float, turned: float, agreement: float) -> bool:
@@ -102,26 +101,25 @@ class Accelerometer:
         least = math.cos(MAX_MOUNT_ERROR_RAD)
         if up_z > least:
             return True
-        named = f"gravity contradicts the mount of IMU '{self._frame}'"
+        frame = self._frame or ""
         if up_z > -least:
             angle = math.degrees(math.acos(min(max(up_z, -1.0), 1.0)))
-            self._problem = f"{named} by {angle:.0f} deg. Slopes are not modelled. Correct the mount's roll and pitch."
+            self._problem = message("accelerometer.tilted_mount", frame=frame, degrees=angle)
         elif turned > _MIN_TURN_RAD:
             if agreement > 0.0:  # the gyro agrees with the mount: this driver publishes gravity, not specific force
                 self.imu = self.imu._replace(scale=-self.imu.scale)
             else:
-                self._problem = f"{named}: it hangs upside down. Slopes are not modelled. Correct the mount's roll or pitch."
+                self._problem = message("accelerometer.upside_down", frame=frame)
         return False
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the accelerometer, and their remedy."""
-        if self._problem:
+        if self._problem is not None:
             return [self._problem]
-        if self._frame is None and self._unmounted is not None:
-            where = "/tf_static or in the robot file's [mounts]"
-            return [f"the mount of IMU '{self._unmounted}' is unknown: slopes are not modelled. Give it in {where}."]
+        if self._frame is None:
+            return [] if self._unmounted is None else [message("accelerometer.no_mount", frame=self._unmounted)]
         if self.imu.scale == GRAVITY:
-            return [f"the accelerometer of IMU '{self._frame}' is in g, not m/s^2: it was scaled by {GRAVITY}."]
+            return [message("accelerometer.unit", frame=self._frame, scale=GRAVITY)]
         if self.imu.scale < 0.0:
-            return [f"the accelerometer of IMU '{self._frame}' publishes gravity, not specific force: its sign was turned."]
+            return [message("accelerometer.sign", frame=self._frame)]
         return []

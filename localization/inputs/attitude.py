@@ -19,6 +19,7 @@ from localization.events import Gravity, ImuSample, Turn
 from localization.inputs.accelerometer import Accelerometer, PlacedImu
 from localization.inputs.ground_curvature import GroundCurvature
 from localization.inputs.ground_tilt import GroundTilt
+from localization.messages import Message
 from localization.small_filters import propagate_in_place, update_in_place
 from localization.trajectory import IntArray
 from motion_models.compiled import kernel, subroutine
@@ -285,7 +286,7 @@ class AttitudeFilter:
         P = self._sums.cov
         return np.array([[P[1, 1], -P[0, 1]], [-P[0, 1], P[0, 0]]]) + _ACCELEROMETER_RAD**2 * np.eye(2)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the accelerometer, and their remedy."""
         return self._accelerometer.warnings()
 

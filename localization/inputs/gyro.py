@@ -11,6 +11,7 @@ import numpy as np
 
 from localization.events import ImuSample, Turn
 from localization.inputs.rate_series import MAX_GAP_NS, RateSeries
+from localization.messages import Message, message
 from motion_models.robot import GyroNoise, Mount
 from motion_models.se2 import FloatArray
 
@@ -120,26 +121,20 @@ class GyroBuffer:
             return None
         return turn if self._axis.sign > 0.0 else replace(turn, angle=-turn.angle, rate=None if turn.rate is None else -turn.rate)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the IMU and their remedy."""
-        found, spikes = [], self._series.spikes
+        found, spikes, frame = list[Message](), self._series.spikes, self._frame or ""
         if self._unused:
-            frames = " and ".join(f"'{frame}'" for frame in (self._frame, *self._unused))
-            found.append(f"IMU frames {frames} on one topic: only '{self._frame}' is used.")
+            frames = " and ".join(f"'{other}'" for other in (frame, *self._unused))
+            found.append(message("imu.several_frames", frames=frames, used=frame))
         if spikes:
-            plural = "s" * (spikes > 1)
-            found.append(f"IMU '{self._frame}': {spikes} reading{plural} dropped (the yaw rate jumped as no such robot's does).")
+            found.append(message("imu.spike", frame=frame) if spikes == 1 else message("imu.spikes", frame=frame, count=spikes))
         if not self._axis.is_mount_wrong or self._axis.is_force_reversed:
             return found
-        contradiction = f"the mount of IMU '{self._frame}' contradicts gravity"
         if self._axis.sign is None:
-            return [*found, f"{contradiction}, and the robot turned too little to find its axis: it was not used."]
+            return [*found, message("imu.no_axis", frame=frame)]
         axis = ", ".join(f"{value:+.2f}" for value in self._axis.sign * self._axis.axis)
-        return [
-            *found,
-            f"{contradiction}: the yaw rate was taken about [{axis}] in the IMU's frame. "
-            "Correct its roll, pitch and yaw in /tf_static or in the robot file's [mounts].",
-        ]
+        return [*found, message("imu.axis", frame=frame, axis=axis)]
 
     def _begin(self, sample: ImuSample) -> None:
         self._frame, self._axis = sample.frame_id, UprightAxis(self._mounts.get(sample.frame_id, Mount()).rotation[2])

@@ -9,6 +9,7 @@ from localization.events import BodyTurn, Gravity, ImuSample, Scan, Turn
 from localization.inputs.attitude import AttitudeFilter
 from localization.inputs.body_rates import BodyRates
 from localization.inputs.gyro import GyroBuffer
+from localization.messages import Message
 from motion_models.robot import Mount, Robot
 
 
@@ -59,6 +60,6 @@ class InertialSensors:
             return InertialMotion(turn)
         return InertialMotion(turn, self._body_rates.turn(start_ns, end_ns, scan), self.attitude.gravity)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the IMU."""
         return [*self.gyro.warnings(), *([] if self.attitude is None else self.attitude.warnings())]

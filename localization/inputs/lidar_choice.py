@@ -8,6 +8,7 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 from localization.events import Scan
+from localization.messages import Message, message, phrase
 
 _SILENT = 5.0
 """Periods without a scan, from where on a LiDAR is silent."""
@@ -101,14 +102,13 @@ class LidarChoice:
         now_ns = self._newest_ns
         return {frame: (now_ns - one.last_ns) * 1e-9 for frame, one in self.lidars.items() if one.is_silent(now_ns)}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """A sentence for each of several that was missing for long."""
         found, silent = [], self.silent()
         for frame, lidar in self.lidars.items():
             missing_s, lasted_s = lidar.silent_s + silent.get(frame, 0.0), (self._newest_ns - lidar.first_ns) * 1e-9
             if missing_s > _REPORTED_SHARE * lasted_s:
-                changed = f" The LiDAR in use was changed {self._changes} time{'s' * (self._changes > 1)}." * (self._changes > 0)
-                found.append(
-                    f"the LiDAR '{frame}' sent no scans for {missing_s:.1f} of {lasted_s:.1f} s. Check its driver and its network.{changed}"
-                )
+                changed = phrase("silent_lidar.changed", count=self._changes) if self._changes > 1 else ""
+                changed = phrase("silent_lidar.changed_once") if self._changes == 1 else changed
+                found.append(message("silent_lidar.silent", frame=frame, missing_s=missing_s, lasted_s=lasted_s, changed=changed))
         return found

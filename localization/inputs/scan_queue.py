@@ -11,13 +11,8 @@ from dataclasses import dataclass
 from localization.events import Scan
 from localization.inputs.lidar_choice import LidarChoice
 from localization.lidar.ground_hits import GroundHits
+from localization.messages import Message, message, phrase
 from motion_models.robot import Mount
-
-_UNKNOWN = "no transform or robot file gives the mount of the LiDAR's frame '{}'"
-_LATE = "/tf_static gave the mount of the LiDAR's frame '{}' late"
-_MEND = " Publish it on /tf_static, or add [mounts.{}] to the robot file."
-_CENTRED = "{} taken as if from the body's origin, and positions are off by about as much as it is away from there."
-_UNUSED = "{} not used, because scans of another frame are."
 
 
 class LidarFrames:
@@ -43,23 +38,36 @@ class LidarFrames:
         return is_used
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Message | None:
         """Message on the frame of the newest scan and the remedy; None where its mount is known."""
         frame = self._newest
         if frame is None or frame in self._mounts:
             return None
-        what = "are not used" if self._has_known or frame not in self._centred else "are taken as if from the body's origin"
-        return f"{_UNKNOWN.format(frame)}: its scans {what}.{_MEND.format(frame)}"
+        if self._has_known or frame not in self._centred:
+            return message("lidar_frames.now_unused", frame=frame)
+        return message("lidar_frames.now_centred", frame=frame)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """How many scans of which frames that concerned, and what a person should do about it, in sentences."""
-        found = []
-        for counts, outcome in ((self._centred, _CENTRED), (self._unused, _UNUSED)):
-            for frame, n in counts.items():
-                why, mend = (_LATE, "") if frame in self._mounts else (_UNKNOWN, _MEND)
-                what = outcome.format(f"{n} scans of it were" if n > 1 else "1 scan of it was")
-                found.append(f"{why.format(frame)}: {what}{mend.format(frame)}")
-        return found
+        late = self._mounts
+        found = [_centred(frame, _were(n), is_late=frame in late) for frame, n in self._centred.items()]
+        return [*found, *(_unused(frame, _were(n), is_late=frame in late) for frame, n in self._unused.items())]
+
+
+def _centred(frame: str, scans: str, *, is_late: bool) -> Message:
+    if is_late:
+        return message("lidar_frames.late_centred", frame=frame, scans=scans)
+    return message("lidar_frames.centred", frame=frame, scans=scans)
+
+
+def _unused(frame: str, scans: str, *, is_late: bool) -> Message:
+    if is_late:
+        return message("lidar_frames.late_unused", frame=frame, scans=scans)
+    return message("lidar_frames.unused", frame=frame, scans=scans)
+
+
+def _were(count: int) -> str:
+    return phrase("lidar_frames.many", count=count) if count > 1 else phrase("lidar_frames.one")
 
 
 @dataclass
@@ -75,21 +83,20 @@ class FaultyScans:
     has_turned: bool = False
     """The robot turned in a step with one of these."""
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """A sentence each."""
         found = []
         if self.empty:
-            scans = f"{self.empty} scan{'s' * (self.empty > 1)}"
-            found.append(f"{scans} without a usable point: the pose is by the other sensors there.")
+            found.append(message("scans.empty", scans=_scans(self.empty)))
         if self.late:
-            found.append(f"{self.late} scan{'s' * (self.late > 1)} came after later ones and could not be used.")
+            found.append(message("scans.late", scans=_scans(self.late)))
         if self.has_turned:
-            found.append(
-                f"{self.timeless} scan{'s' * (self.timeless > 1)} without the times of their points, taken as measured at one "
-                "instant: if the scanner sweeps, turns distort them. Let its driver publish the times (time_increment of a scan, a "
-                "field of a cloud)."
-            )
+            found.append(message("scans.without_times", scans=_scans(self.timeless)))
         return found
+
+
+def _scans(count: int) -> str:
+    return phrase("scans.many", count=count) if count > 1 else phrase("scans.one")
 
 
 class ScanQueue:

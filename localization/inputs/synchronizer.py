@@ -11,6 +11,7 @@ from localization.inputs.scan_queue import ScanQueue
 from localization.inputs.step_config import StepConfig
 from localization.inputs.wheel_gaps import UnknownVelocity
 from localization.inputs.wheel_motion import WheelMotion
+from localization.messages import Message
 from motion_models.base import MotionModel
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -77,7 +78,7 @@ class Synchronizer:
         """By the gyro's samples so far, as `GyroBuffer.turn`; changes nothing."""
         return self.inertial.gyro.turn(start_ns, end_ns, by_wheels=0.0) if end_ns > start_ns else None
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems of the sensors so far."""
         scans = self.scans
         of_scans = [*scans.faulty.warnings(), *scans.ground.warnings(), *scans.choice.warnings()]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from localization.inputs.wheel_buffer import WheelWindow
+from localization.messages import Message, message
 from localization.small_filters import FORGETTING
 from motion_models.compiled import kernel
 from motion_models.se2 import Cov3, FloatArray, Twist2
@@ -18,10 +19,7 @@ _CHANGES_WITHIN_S = 1.0
 _MAX_VARIANCE = np.array([math.inf, math.inf, math.pi**2 / 3.0])
 """Upper bounds of the variances of x, y and yaw; yaw: that of a uniform distribution from -pi to pi [rad^2]."""
 _LONG_S = 60.0
-_PAUSED = (
-    "Where no other sensor has data either, the recorder was paused, or the computer's clock was set forward: `skidloc info` has the gaps;"
-    " if it was the clock, cut the log there."
-)
+"""Time without wheel data, from which on a recorder that was paused explains it [s]."""
 
 
 class VelocityWithinIntervals:
@@ -123,9 +121,10 @@ class UnknownVelocity:
         self._unknown_m2 += after[0] - before[0] + after[1] - before[1]
         return np.diag(after - before)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """How long there were no wheel data in all, where more of the way is unknown by that than by the wheels themselves."""
         if self._unknown_m2 <= self.known_m2:
             return []
-        text = f"no wheel data for {self._total_s:.1f} s in all: motion there is predicted with a wide covariance."
-        return [text if self._total_s < _LONG_S else f"{text} {_PAUSED}"]
+        if self._total_s < _LONG_S:
+            return [message("wheel_gaps.no_data", total_s=self._total_s)]
+        return [message("wheel_gaps.long", total_s=self._total_s)]

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from localization.events import Scan
+from localization.messages import Message, message
 from motion_models.robot import Mount
 
 _SIGMAS = 2.0
@@ -47,19 +48,10 @@ class GroundHits:
         self._nearest_m, self._frame = min(self._nearest_m, math.sqrt(max(mount.z, 0.0) / rise)), scan.frame_id
         return above
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Sentences where scans, or many points, were left out."""
-        found = []
-        if self.held:
-            found.append(
-                f"{self.held} scans of a planar LiDAR were left out, until the way had shown whether the ground tilts or the IMU sits "
-                "askew. Publish how the IMU is mounted in /tf_static, or begin on level ground."
-            )
+        found = [message("ground_hits.held", count=self.held)] if self.held else []
         if self._left_out <= _REPORTED_SHARE * self._points:
             return found
-        return [
-            *found,
-            f"on hills the beams of the planar scanner '{self._frame}' may hit the ground from {self._nearest_m:.1f} m on: since "
-            f"the ground was found to tilt, {100.0 * self._left_out / self._points:.0f} % of its points are not used. Use a 3D "
-            "LiDAR there, or mount the scanner higher.",
-        ]
+        percent = 100.0 * self._left_out / self._points
+        return [*found, message("ground_hits.left_out", frame=self._frame, nearest_m=self._nearest_m, percent=percent)]

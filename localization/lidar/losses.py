@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from localization.lidar.lost_scans import MIN_LOST_S, LostScans
+from localization.messages import Message, Value, message, phrase
 
 MAX_LOST_SHARE = 0.05
 """Share of the time without a matched scan, beyond which a run is not recommended: wheels alone err by 0.7 to 0.9 m in 10 m (fr079,
@@ -16,32 +17,15 @@ MAX_LOST_S = 5.0
 0.15 m in it, from where on Gauss-Newton alone may end in a wrong place."""
 
 _CAUSES: Mapping[str, tuple[str, str]] = {
-    "lost": (
-        "fitted the map nowhere or in several places",
-        "Check the LiDAR's mount, its stamps and the wheels; in open or repetitive places take a longer range (lidar.max_range_m).",
-    ),
-    "sparse": (
-        "had too few points on walls",
-        "Check what covers the LiDAR, and lidar.min_range_m and lidar.max_range_m.",
-    ),
-    "stale": (
-        "repeated the ranges of the scan before while the robot drove",
-        "Check the LiDAR's driver.",
-    ),
-    "moved": (
-        "lost the map at once although the wheels hardly moved",
-        "Where the robot was moved by other than its wheels, or the LiDAR was turned, the pose is unknown until a mapped place is found; "
-        "where nothing was, take a longer range (lidar.max_range_m).",
-    ),
-    "excluded": (
-        "were left out by a check",
-        "See the warning about the LiDAR above.",
-    ),
+    "lost": ("lidar_losses.lost", "lidar_losses.lost_advice"),
+    "sparse": ("lidar_losses.sparse", "lidar_losses.sparse_advice"),
+    "stale": ("lidar_losses.stale", "lidar_losses.stale_advice"),
+    "moved": ("lidar_losses.moved", "lidar_losses.moved_advice"),
+    "excluded": ("lidar_losses.excluded", "lidar_losses.excluded_advice"),
 }
-"""What happened and what to do, by cause."""
+"""What happened and what to do, by cause, as `phrase` has them."""
 _BRIDGED = {"lost", "sparse", "excluded"}
 """Causes that single scans of a healthy LiDAR have."""
-_SILENCE_ADVICE = "Check the LiDAR's driver, cable and topic."
 
 
 @dataclass(frozen=True)
@@ -86,29 +70,35 @@ class LidarLosses:
     @property
     def summary(self) -> str:
         """Which part of the drive is without LiDAR, and where most of it."""
-        return f"LiDAR lost for {per_cent(self.share)} of the drive, longest {_seconds(self.longest_s)} at t = {self.since_s:.0f} s"
+        share, longest = per_cent(self.share), _seconds(self.longest_s)
+        return phrase("lidar_losses.summary", share=share, longest=longest, since_s=self.since_s)
 
     @property
     def advice(self) -> str:
         """What to do against missing scans, else against the most frequent cause; "" where nothing was lost."""
         if self.silences:
-            return _SILENCE_ADVICE
+            return phrase("lidar_losses.silence_advice")
         if not self.causes:
             return ""
         counts = dict(self.causes)
         if "moved" in counts:  # the scans after that are lost
             counts["moved"] += counts.pop("lost", 0)
-        return _CAUSES[max(counts, key=counts.__getitem__)][1]
+        return phrase(_CAUSES[max(counts, key=counts.__getitem__)][1])
 
-    def describe(self) -> str:
-        """What happened, where, why, and what to do; "" where every scan came and was matched."""
+    def warnings(self) -> list[Message]:
+        """What happened, where, why, and what to do; nothing where every scan came and was matched."""
         found = []
         if self.causes:
-            parts = ", ".join(f"{n} {_CAUSES[name][0]}" for name, n in self.causes.items())
-            found.append(f"{sum(self.causes.values())} of {self.scans} scans: {parts}")
-        if self.silences:
-            found.append("no scans came for a second or more" + (f", {self.silences} times" if self.silences > 1 else ""))
-        return f"{self.summary} ({'; '.join(found)}). The pose is by the other sensors there. {self.advice}" if found else ""
+            parts = ", ".join(f"{n} {phrase(_CAUSES[name][0])}" for name, n in self.causes.items())
+            found.append(phrase("lidar_losses.of_which", count=sum(self.causes.values()), scans=self.scans, parts=parts))
+        if self.silences > 1:
+            found.append(phrase("lidar_losses.silences", count=self.silences))
+        elif self.silences:
+            found.append(phrase("lidar_losses.silence"))
+        if not found:
+            return []
+        numbers: dict[str, Value] = {"share": per_cent(self.share), "longest": _seconds(self.longest_s), "since_s": self.since_s}
+        return [message("lidar_losses.of_scans", causes="; ".join(found), advice=self.advice, **numbers)]
 
     def numbers(self) -> dict[str, Any]:
         """Numbers of the losses, as `metrics.json` has them."""

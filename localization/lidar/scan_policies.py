@@ -50,7 +50,7 @@ class MovedRobot:
         self._at_ns: int | None = None
 
     def add_no_scan(self, step: Step) -> None:
-        """A step that ends without a scan."""
+        """A step that ends without a scan, or with one that shows nothing."""
         self.since = se2.compose(self.since, step.predicted.delta)
 
     def begin(self, scan: Scan) -> None:

@@ -79,6 +79,7 @@ class ScanMatchingSensor:
             self.merged.begin()
         self._frame = scan.frame_id
         if self._stale.is_stale(scan, step.is_standing):
+            self.moved.add_no_scan(step)
             return None, "stale"
         self._require_mount(scan.frame_id)
         if scan.beside or self.merged.corrections:
@@ -88,6 +89,7 @@ class ScanMatchingSensor:
             sweep = Sweep.from_scan(scan, mount, self._config.min_range_m, self._config.max_range_m)
         deskewed = self._deskew(sweep, step.twist, prior, cov)
         if len(deskewed.planar) < MIN_POINTS:
+            self.moved.add_no_scan(step)
             return None, "sparse"
         self._scan = deskewed
         if self._matcher is None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from localization.messages import Message, message, phrase
 from motion_models.center_of_gravity.parts import support_margin
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -29,7 +30,7 @@ class CgChoice(NamedTuple):
     """The topic, or none, and why."""
 
     topic: str | None
-    text: str
+    text: Message
 
 
 def choose_cg_topic(topics: Sequence[str], robot: Robot, mean_point: MeanPoint) -> CgChoice | None:
@@ -38,28 +39,27 @@ def choose_cg_topic(topics: Sequence[str], robot: Robot, mean_point: MeanPoint) 
     None for a single one whose name is of no other point.
     """
     if len(topics) == 1:
-        text = f"{topics[0]} is not used as center of gravity: by its name it is another point. If it is, pass --topic.center-of-gravity."
-        return CgChoice(None, text) if _words(topics[0]) & _OTHER else None
+        return CgChoice(None, message("topics.other_point", topic=topics[0])) if _words(topics[0]) & _OTHER else None
     points = {topic: point for topic in topics if (point := mean_point(topic)) is not None}
     inside = {topic for topic in points if support_margin(points[topic], robot.geometry.wheelbase_m, robot.geometry.track_width_m) > 0.0}
     values = ", ".join(f"{topic}{_value(points.get(topic))}" for topic in topics)
-    unknown = CgChoice(None, f"{values} could each be the center of gravity; name one with --topic.center-of-gravity.")
+    unknown = CgChoice(None, message("topics.several_points", topics=values))
     possible = [topic for topic in topics if topic in inside and not _words(topic) & _OTHER]
     named = [topic for topic in possible if _words(topic) & _GRAVITY]
     near = _nearest(possible, points, robot)
     if len(named) == 1 and (near in (None, named[0]) or _distance(points[named[0]], robot) <= _MAX_DISTANCE_M):
-        second = "its points lie between the wheels" if near is None else "the robot file's is near"
-        return _used(named[0], topics, f"by its name, and {second}")
+        by_place, by_file = phrase("topics.by_name_and_place"), phrase("topics.by_name_and_file")
+        return _used(named[0], topics, by_place if near is None else by_file)
     if not named and near is not None:
-        return _used(near, topics, "the robot file's is near")
+        return _used(near, topics, phrase("topics.by_file"))
     if not named and len(possible) == 1:
-        return _used(possible[0], topics, "names and places of the others are not those of one")
+        return _used(possible[0], topics, phrase("topics.by_others"))
     return unknown
 
 
 def _used(topic: str, topics: Sequence[str], why: str) -> CgChoice:
     others = ", ".join(other for other in topics if other != topic)
-    return CgChoice(topic, f"{topic} is used as center of gravity, and not {others}: {why}.")
+    return CgChoice(topic, message("topics.point", topic=topic, others=others, why=why))
 
 
 def _words(topic: str) -> set[str]:

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO, NamedTuple, Protocol
 import lz4.frame  # type: ignore[import-untyped]
 from rosbags.interfaces import MessageDefinition
 
+from localization.messages import Message
 from motion_models.input_files import open_input
 
 if sys.version_info >= (3, 14):
@@ -80,7 +81,7 @@ class Source(Protocol):
         ...
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Warnings about what was lost so far."""
         ...
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.events import CgSample, ImuSample, Scan
+from localization.messages import Message, message, phrase
 from motion_models.se2 import FloatArray
 
 MAX_SCAN_DURATION_S = 2.0
@@ -35,46 +36,48 @@ _MAX_CACHED_NAMES = 100  # of joint lists; bounds the memory where they change w
 
 
 class Oddity(Enum):
-    """Defects of messages; the value completes the sentence "TOPIC: N messages ..."."""
+    """Defects of messages; the value is that of what is reported of them."""
 
-    UNDECODABLE = "dropped (bytes that are not of the type)"
-    MALFORMED = "dropped (fields that contradict each other)"
-    NO_ANGLES = "dropped (angle_increment is zero, or makes more than a full turn: in degrees?); correct the driver's angles"
-    BEAM_TIME_UNIT = "with a time_increment that is not in seconds; it was scaled so that a sweep lasts as long as from scan to scan"
-    BEAM_TIMES = "with a time_increment that makes sweeps longer than the time from scan to scan; it was left out: correct the driver"
-    NOT_FINITE = "dropped (NaN or inf)"
-    BEYOND = "dropped (beyond what such a sensor can measure)"
-    NO_FIX = "left out (no GPS fix)"
-    NO_RATES = "left out (zero rates with a covariance of -1, and no orientation: this IMU has no gyro; name one that has)"
-    RATES_OF_ORIENTATION = "without a gyro (zero rates with a covariance of -1); its rates are those of the orientation"
-    NO_STAMP = "without a header stamp, placed by the time of recording"
-    FOREIGN_CLOCK = "stamped by another clock than the other topics', moved to the time of recording"
-    OUT_OF_ORDER = "recorded out of order, and sorted"
-    REPEATED = "dropped (stamp repeated)"
-    SECOND_FRAME = "dropped (stamp repeated by another frame: two sensors share the topic); give each of them its own topic"
-    LATE = "dropped (recorded long after newer ones)"
-    OVERTAKEN = "dropped (waited for the processor while newer ones came); free the processor, or lower the rate or the points of the LiDAR"
-    OLD = "dropped (stamped seconds before the topic's others: latched, or left in a buffer)"
-    OUTLIER = "dropped (stamp that fits neither its neighbours nor the time of recording)"
-    REBASED = "stamped after a jump of the clock, moved back by it"
-    RATE_OF_CLOCK = (
-        "stamped by a clock of another rate than the recorder's and the other topics', or that wait in a queue that grows; synchronize the"
-        " clocks, or make its driver faster"
-    )
-    POSE_JUMP = "with a pose that wheels cannot reach (a reset); the increment was taken from the rates"
-    NO_POSE = "with rates but a pose that never moves; the increment was taken from the rates"
-    NO_TWIST = "with a moving pose but no rates; these were taken from the pose"
-    TIPPING = "with arms at which the robot would tip over (joints in degrees?); their centre of gravity was left out"
-    TIPPING_CG = "with a centre of gravity at which the robot would tip over (not in metres, or not from base_link?); it was left out"
-    WHEEL_RATE = "with rates that wheels cannot reach; these were left out"
-    SECOND_PUBLISHER = "of a second publisher whose wheels turn no more, left out; stop one of the two (`ros2 topic info --verbose`)"
-    FROZEN_WHEEL = "with an angle that does not change while another wheel of its side turns; it was left out (check its encoder)"
-    CONSTANT_ANGLES = "with wheel angles that never change while the rates do; the increments were taken from the rates"
-    WHEEL_JUMP = "with a wheel angle that wheels cannot reach (a reset); the increment was taken from the rates"
+    UNDECODABLE = "odd_messages.undecodable"
+    MALFORMED = "odd_messages.malformed"
+    NO_ANGLES = "odd_messages.no_angles"
+    BEAM_TIME_UNIT = "odd_messages.beam_time_unit"
+    BEAM_TIMES = "odd_messages.beam_times"
+    NOT_FINITE = "odd_messages.not_finite"
+    BEYOND = "odd_messages.beyond"
+    NO_FIX = "odd_messages.no_fix"
+    NO_RATES = "odd_messages.no_rates"
+    RATES_OF_ORIENTATION = "odd_messages.rates_of_orientation"
+    NO_STAMP = "odd_messages.no_stamp"
+    FOREIGN_CLOCK = "odd_messages.foreign_clock"
+    OUT_OF_ORDER = "odd_messages.out_of_order"
+    REPEATED = "odd_messages.repeated"
+    SECOND_FRAME = "odd_messages.second_frame"
+    LATE = "odd_messages.late"
+    LATE_LIVE = "odd_messages.late_live"
+    OVERTAKEN = "odd_messages.overtaken"
+    OLD = "odd_messages.old"
+    OUTLIER = "odd_messages.outlier"
+    REBASED = "odd_messages.rebased"
+    RATE_OF_CLOCK = "odd_messages.rate_of_clock"
+    POSE_JUMP = "odd_messages.pose_jump"
+    NO_POSE = "odd_messages.no_pose"
+    NO_TWIST = "odd_messages.no_twist"
+    TIPPING = "odd_messages.tipping"
+    TIPPING_CG = "odd_messages.tipping_cg"
+    WHEEL_RATE = "odd_messages.wheel_rate"
+    SECOND_PUBLISHER = "odd_messages.second_publisher"
+    FROZEN_WHEEL = "odd_messages.frozen_wheel"
+    CONSTANT_ANGLES = "odd_messages.constant_angles"
+    WHEEL_JUMP = "odd_messages.wheel_jump"
 
-    def sentence(self, topic: str, n: int) -> str:
+    def describe(self, topic: str, n: int) -> Message:
         """``n`` messages of ``topic`` with this defect."""
-        return f"{topic}: {n} {'old ' if self is Oddity.OLD else ''}message{'s' if n > 1 else ''} {self.value}."
+        if self is Oddity.OLD:
+            messages = phrase("odd_messages.old_many", count=n) if n > 1 else phrase("odd_messages.old_one")
+        else:
+            messages = phrase("odd_messages.many", count=n) if n > 1 else phrase("odd_messages.one")
+        return message(self.value, topic=topic, messages=messages)
 
 
 class UnusableError(Exception):
@@ -107,10 +110,10 @@ class MessageStats:
         """``topic`` and the parts of it that are counted apart (a joint, two frames)."""
         return [topic, *sorted({name for name, _ in self._counts if name.startswith(f"{topic}, ")})]
 
-    def describe(self) -> list[str]:
-        """One sentence for each topic and oddity."""
+    def describe(self) -> list[Message]:
+        """A message for each topic and oddity."""
         ordered = sorted(self._counts.items(), key=lambda entry: (entry[0][0], list(Oddity).index(entry[0][1])))
-        return [oddity.sentence(topic, n) for (topic, oddity), n in ordered if n]
+        return [oddity.describe(topic, n) for (topic, oddity), n in ordered if n]
 
 
 @dataclass(frozen=True)

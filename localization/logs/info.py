@@ -18,6 +18,7 @@ from localization.logs.decode import imu_decoder
 from localization.logs.event_decoder import TopicDecoder
 from localization.logs.reader import Log
 from localization.logs.topic_roles import REFERENCE_TYPES, TYPES, TopicSource, short_type
+from localization.messages import Message, phrase
 from motion_models.se2 import FloatArray
 from motion_models.slope import GRAVITY
 
@@ -80,7 +81,7 @@ class LogInfo:
     """Frame to pose in the body frame [m, rad]."""
     problems: list[str]
     """What is missing or suspect, as sentences."""
-    warnings: list[str]
+    warnings: list[Message]
     """What was chosen, corrected or lost, as sentences."""
     tilt: str
     """Whether the ground's tilt can be measured, and what that brings."""
@@ -207,7 +208,9 @@ def _describe_tilt(log: Log) -> str:
         missing = "no IMU" if imu is None else f"no mount of the IMU's frame '{frame}'"
         return f"not available: there is {missing}, and the ground is taken as level."
     force = first_force(log, imu.topic)
-    scale, problem = scale_of_force(0.0 if force is None else float(np.linalg.norm(force)), f"the accelerometer of {imu.topic}")
+    scale, problem = scale_of_force(
+        0.0 if force is None else float(np.linalg.norm(force)), phrase("accelerometer.of_topic", topic=imu.topic)
+    )
     if not scale:
         return f"not available, and the ground is taken as level: {problem or f'{imu.topic} has no accelerometer.'}"
     in_g = ", which is in g and is scaled to m/s^2" if scale == GRAVITY else ""

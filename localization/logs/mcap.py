@@ -25,6 +25,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from localization.errors import LogError
 from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, decompress_message, in_log_order
 from localization.logs.set_back_clock import Times, describe_set_backs, find_set_backs, later_ns, move_chunks
+from localization.messages import Message, Value, message
 from motion_models.input_files import open_input
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -63,7 +64,7 @@ class McapFile:
         self._chunks: list[Chunk] = []
         self._run: Chunk | None = None
         self._reported: set[int] = set()
-        self.warnings: list[str] = []
+        self.warnings: list[Message] = []
         reason, unread = "", 0
         with open_input(path) as file:
             try:
@@ -84,8 +85,11 @@ class McapFile:
         self.start_ns = min((c.start_ns for c in self._chunks), default=0)
         self.end_ns = max((c.end_ns for c in self._chunks), default=0)
         if reason:
-            lost = f"; of its last {unread} bytes only what is whole could be read" if unread else ""
-            self.warnings.insert(0, f"{path.name} was read record by record ({reason}): {totals.total()} messages of it are used{lost}.")
+            counts: dict[str, Value] = {"file": path.name, "reason": reason, "count": totals.total()}
+            if unread:
+                self.warnings.insert(0, message("damaged_files.read_by_record_to_end", bytes=unread, **counts))
+            else:
+                self.warnings.insert(0, message("damaged_files.read_by_record", **counts))
         self.warnings += describe_set_backs(self._set_backs, self.start_ns)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -249,8 +253,11 @@ class McapFile:
             return
         self._reported.add(chunk.position)
         listed = sum(chunk.counts.values())
-        used = f"{count} of its {listed} messages are" if listed > count else f"{count} messages of it are"
-        self.warnings.append(f"A chunk at byte {chunk.position} of {self._path.name} is damaged ({damage}): {used} used.")
+        where: dict[str, Value] = {"byte": chunk.position, "file": self._path.name, "reason": damage, "count": count}
+        if listed > count:
+            self.warnings.append(message("damaged_files.chunk", listed=listed, **where))
+        else:
+            self.warnings.append(message("damaged_files.chunk_whole", **where))
 
     def _describe(self, op: int, record: bytes) -> None:
         try:
@@ -267,7 +274,7 @@ class McapFile:
                 kind, definition = self._schemas.get(schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, "")))
                 self._described.setdefault(key, _Topic(topic, normalize_msgtype(kind) if "/" in kind else kind, definition, encoding))
         except struct.error:
-            self.warnings.append(f"A description of a topic in {self._path.name} is damaged.")
+            self.warnings.append(message("damaged_files.description", file=self._path.name))
 
 
 def _checksum(file: BinaryIO, first: int, end: int) -> int:

@@ -30,6 +30,7 @@ from localization.logs.topic_names import find_in_namespace, is_measured_outside
 from localization.logs.topic_roles import REFERENCE_TYPES, Sides, TopicChooser, TopicOverrides, choose_roles
 from localization.logs.transforms import FixedTransforms
 from localization.logs.wheel_messages import TF_TYPES, odometry_edge
+from localization.messages import Message, message
 from motion_models.input_files import check_file, open_input, read_text
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -93,7 +94,7 @@ class Log:
         self.wheels_error = roles.wheels_error
         """Why `events` will refuse, if it will."""
         self._joints, self._arms, self._choice_notes = roles.joints, roles.arms, roles.warnings
-        self._mount_notes: list[str] = []
+        self._mount_notes: list[Message] = []
         self.frames: dict[str, str] = {}
         """Frame of the first message of each topic that is used."""
         self._clocks = self._plan_event_clocks()
@@ -229,11 +230,11 @@ class Log:
         frames = {frame for topic, frame in self.frames.items() if topic in used and frame}
         return frames - transforms.mounts().keys() - self.robot.mounts.keys()
 
-    def damage(self) -> list[str]:
+    def damage(self) -> list[Message]:
         """Warnings about which of its files could not be read, and how much could, so far."""
         return list(dict.fromkeys(self.source.warnings))
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Warnings about everything that was lost, corrected or chosen by default so far: `damage` first."""
         found = [*self.damage(), *self._mount_notes, *self._choice_notes]
         for stats in self._stats_by_topic.values():
@@ -244,7 +245,7 @@ class Log:
         """Wheel joints whose encoders failed in the `events` that were read last, so far; what they lost is replaced there."""
         return () if self._decoder is None else self._decoder.from_joints.frozen_wheels()
 
-    def add_notes(self, notes: Iterable[str]) -> None:
+    def add_notes(self, notes: Iterable[Message]) -> None:
         """Add sentences to `warnings`, before those about topics."""
         self._choice_notes = [*notes, *self._choice_notes]
 
@@ -309,11 +310,11 @@ class Log:
         late = {source.topic: late_ns(source.kind, self.robot.clock) for source in self.sources.used()}
         for topic in topics:
             found = first[topic] = []
-            for log_ns, message in self._first_messages(topic, 2 * FIRST_MESSAGES):
-                frame = frame_name(message.header.frame_id)
+            for log_ns, found_message in self._first_messages(topic, 2 * FIRST_MESSAGES):
+                frame = frame_name(found_message.header.frame_id)
                 self.frames.setdefault(topic, frame)
-                if stamp_ns(message):
-                    found.append(FirstMessage(log_ns, stamp_ns(message) - late.get(topic, 0), frame))
+                if stamp_ns(found_message):
+                    found.append(FirstMessage(log_ns, stamp_ns(found_message) - late.get(topic, 0), frame))
                 if len(found) >= FIRST_MESSAGES or (len(found) > 2 and log_ns - found[0].log_ns > _FIRST_READ_NS):
                     break
         return plan_clocks(first)
@@ -354,10 +355,10 @@ class DecompressedSource:
         self._inner = _open_file(target)
         self.is_ros1, self.channels = self._inner.is_ros1, self._inner.channels
         self.start_ns, self.end_ns = self._inner.start_ns, self._inner.end_ns
-        self._warnings = [f"{path.name} could not be decompressed to its end ({stopped})."] if stopped else []
+        self._warnings = [message("damaged_files.compressed", file=path.name, reason=stopped)] if stopped else []
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Warnings about what was lost so far."""
         return [*self._warnings, *self._inner.warnings]
 
@@ -393,8 +394,8 @@ def _open_folder(path: Path) -> Source:
     except (DamagedError, LogError) as error:
         return _recover_folder(path, str(error).rstrip("."))
     count = sum(channel.count for part in parts for channel in part.channels)
-    lost = [f"metadata.yaml of {path.name} lists {listed} messages; its files hold {count}."] if count < listed else []
-    return SplitSource(parts, lost)
+    lost = message("damaged_files.fewer", folder=path.name, listed=listed, count=count)
+    return SplitSource(parts, [lost] if count < listed else [])
 
 
 def _read_metadata(path: Path) -> tuple[list[str], int]:
@@ -426,12 +427,13 @@ def _recover_folder(path: Path, reason: str) -> Source:
         inside = f" ROS 1 bags in it: {', '.join(bags)}; name one of them." if bags else ""
         raise LogError(f"folder '{path}' is not a ROS 2 bag: {reason}, and it holds no .mcap or .db3 file.{inside}")
     parts: list[Source] = []
-    notes = [f"{path.name} is not whole ({reason}): its files {', '.join(f.name for f in files)} are read by themselves."]
+    names = ", ".join(f.name for f in files)
+    notes = [message("damaged_files.not_whole", folder=path.name, reason=reason, files=names)]
     for file in files:
         try:
             parts.append(_open_part(file))
         except LogError as error:
-            notes.append(str(error))
+            notes.append(message("damaged_files.unread_file", reason=str(error)))
     if not parts:
         raise LogError(" ".join(notes))
     return SplitSource(parts, notes)

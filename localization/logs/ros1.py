@@ -21,6 +21,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from localization.errors import LogError
 from localization.logs.chunks import Channel, Chunk, DamagedError, RawMessage, decompress, decompress_head, in_log_order
 from localization.logs.set_back_clock import Times, describe_set_backs, find_set_backs, later_ns, move_chunks
+from localization.messages import Message, Value, message
 from motion_models.input_files import open_input
 
 MAGIC = b"#ROSBAG V"
@@ -48,7 +49,7 @@ class Ros1Bag:
         self._path = path
         self._connections: dict[int, _Connection] = {}
         self._chunks: list[Chunk] = []
-        self.warnings: list[str] = []
+        self.warnings: list[Message] = []
         self._reported: set[int] = set()
         with open_input(path) as file:
             version = file.readline(32).removeprefix(MAGIC).strip()
@@ -86,11 +87,11 @@ class Ros1Bag:
                 try:
                     entries = [entry for entry in _entries(self._chunk_bytes(file, chunk)) if isinstance(entry, _Message)]
                 except DamagedError as reason:
-                    self._report(chunk, f"A chunk of {listed} messages at byte {chunk.position} was left out: {reason}.")
+                    self._report(chunk, message("damaged_files.chunk_left_out", listed=listed, byte=chunk.position, reason=str(reason)))
                     return []
                 if len(entries) < listed:
-                    where = f"A chunk at byte {chunk.position} of {self._path.name} is damaged"
-                    self._report(chunk, f"{where}: {len(entries)} of its {listed} messages are used.")
+                    counts = {"byte": chunk.position, "count": len(entries), "listed": listed}
+                    self._report(chunk, message("damaged_files.chunk_short", file=self._path.name, **counts))
                 return [
                     RawMessage(e.log_ns + later(chunk.position, i), wanted[e.key].topic, wanted[e.key].type, e.data)
                     for i, e in enumerate(entries)
@@ -106,7 +107,7 @@ class Ros1Bag:
         except DamagedError:
             return []
 
-    def _report(self, chunk: Chunk, note: str) -> None:
+    def _report(self, chunk: Chunk, note: Message) -> None:
         """Once for each chunk."""
         if chunk.position not in self._reported:
             self._reported.add(chunk.position)
@@ -178,20 +179,19 @@ class Ros1Bag:
             reason = reason if str(error) == reason else f"{reason}; {error}"
         count = sum(sum(c.counts.values()) for c in self._chunks)
         lost = end - whole
-        self.warnings.append(
-            f"{self._path.name} is damaged: {reason}. Its {count} readable messages are used; of its last {lost} bytes only what is"
-            " whole could be read."
-            if lost
-            else f"{self._path.name} is damaged: {reason}. All of its {count} messages could be read."
-        )
+        found: dict[str, Value] = {"file": self._path.name, "reason": reason, "count": count}
+        if lost:
+            self.warnings.append(message("damaged_files.index", bytes=lost, **found))
+        else:
+            self.warnings.append(message("damaged_files.index_alone", **found))
         if loose:
-            self.warnings.append(f"{loose} messages of {self._path.name} lie outside of chunks and were left out.")
+            self.warnings.append(message("damaged_files.loose", count=loose, file=self._path.name))
 
     def _add_chunk(self, position: int, header: Fields, data: bytes) -> None:
         try:
             plain, _ = decompress_head(data, header.get(b"compression", b"none").decode(errors="replace"))
         except DamagedError as reason:
-            self.warnings.append(f"A chunk at byte {position} of {self._path.name} was left out: {reason}.")
+            self.warnings.append(message("damaged_files.chunk_unread", byte=position, file=self._path.name, reason=str(reason)))
             return
         counts: Counter[int] = Counter()
         start, end = 2**63 - 1, 0

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from localization.logs.chunks import Chunk
+from localization.messages import Message, message
 
 MIN_STEP_NS = 1_000_000_000
 """Multi-threaded recorders store messages by fractions of a second out of order."""
@@ -125,10 +126,6 @@ def move_chunks(chunks: Sequence[Chunk], set_backs: Sequence[SetBack], read: Cal
     return moved
 
 
-def describe_set_backs(set_backs: Sequence[SetBack], start_ns: int) -> list[str]:
-    """A sentence for each time the clock was set back."""
-    return [
-        f"the recorder's clock was set back by {step.by_ns * 1e-9:.1f} s, {(step.at_ns - start_ns) * 1e-9:.1f} s after the start of the"
-        " log; later times of recording are moved by that."
-        for step in set_backs
-    ]
+def describe_set_backs(set_backs: Sequence[SetBack], start_ns: int) -> list[Message]:
+    """A message for each time the clock was set back."""
+    return [message("recorder_clock.set_back", seconds=step.by_ns * 1e-9, at_s=(step.at_ns - start_ns) * 1e-9) for step in set_backs]

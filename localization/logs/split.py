@@ -9,12 +9,13 @@ from itertools import chain, islice, pairwise
 
 from localization.logs.chunks import RawMessage, Source, merge_channels
 from localization.logs.set_back_clock import COMPARED, MIN_STEP_NS, SetBack, describe_set_backs, is_of_all, later_ns
+from localization.messages import Message
 
 
 class SplitSource:
     """Several files, as a recorder splits a long log, or one for each sensor. ``notes``: warnings about files that are not among them."""
 
-    def __init__(self, parts: list[Source], notes: list[str]) -> None:
+    def __init__(self, parts: list[Source], notes: list[Message]) -> None:
         self._parts = parts
         self.is_ros1 = False
         self.channels = merge_channels(chain.from_iterable(part.channels for part in parts))
@@ -27,7 +28,7 @@ class SplitSource:
         self._warnings = [*notes, *describe_set_backs(set_backs, self.start_ns)]
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Warnings about what was lost so far, of all parts."""
         return [*self._warnings, *chain.from_iterable(part.warnings for part in self._parts)]
 

@@ -22,6 +22,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from localization.errors import LogError
 from localization.logs.chunks import MAX_DECOMPRESSED_BYTES, Channel, DamagedError, RawMessage, decompress_message
 from localization.logs.set_back_clock import COMPARED, MAX_CANDIDATES, MIN_STEP_NS, SetBack, describe_set_backs, is_of_all, later_ns
+from localization.messages import Message, message
 from motion_models.input_files import open_input
 
 MAGIC = b"SQLite format 3\x00"
@@ -130,13 +131,10 @@ class SqliteFile:
         self._counts = Counter({key: n for key, n in count if key in self._topics})
         self.channels = _channels(self._topics, definitions, self._counts)
         self.start_ns, self.end_ns = min((begin for begin, _ in spans), default=0), max((end for _, end in spans), default=0)
-        self.warnings: list[str] = describe_set_backs(self._set_backs, self.start_ns)
+        self.warnings: list[Message] = describe_set_backs(self._set_backs, self.start_ns)
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
-            self.warnings.append(
-                f"{wal.name} holds rows that the recorder had not yet moved into {path.name}; they are not read."
-                " Opening that file once with SQLite's own shell moves them."
-            )
+            self.warnings.append(message("damaged_files.log_of_rows", rows=wal.name, file=path.name))
         self._rest: RecoveredSqlite | None = None
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
@@ -167,7 +165,7 @@ class SqliteFile:
         return [(first, end - 1, later_ns(self._set_backs, 0, first)) for first, end in itertools.pairwise(edges)]
 
     def _compare(self, found: int, listed: int) -> None:
-        note = f"{self._path.name} is damaged: {found} of {listed} messages of the topics in use could be read."
+        note = message("damaged_files.rows", file=self._path.name, count=found, listed=listed)
         if found < listed and note not in self.warnings:
             self.warnings.append(note)
 
@@ -199,9 +197,7 @@ class RecoveredSqlite:
             start, end = min(start, log_ns), max(end, log_ns)
         self.channels = _channels(self._topics, definitions, counts)
         self.start_ns, self.end_ns = (start, end) if counts else (0, 0)
-        self.warnings = [
-            f"{path.name} was read page by page ({reason}): {counts.total()} messages of it are used; the number of lost ones is not known."
-        ]
+        self.warnings = [message("damaged_files.pages", file=path.name, reason=reason, count=counts.total())]
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """The messages of these topics in the order in which they were recorded."""

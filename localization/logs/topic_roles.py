@@ -12,6 +12,7 @@ from localization.logs.chunks import Channel
 from localization.logs.driver_messages import DRIVER_MESSAGES, LEFT, RIGHT, is_by_driver
 from localization.logs.topic_names import find_in_namespace, is_by_wheels, is_filter, is_other_estimate, is_without_gyro, match_joints
 from localization.logs.wheel_messages import TF_TYPES, TWIST_TYPES, is_measured_twist
+from localization.messages import Message, message, phrase
 from motion_models.center_of_gravity.cg_model import CgModel
 from motion_models.center_of_gravity.files import arms_model
 from motion_models.robot import Robot
@@ -138,7 +139,7 @@ class TopicChooser:
                 self._types.setdefault(channel.topic, channel.type)
             elif channel.topic not in self._types:
                 self._empty.add(channel.topic)
-        self.warnings: list[str] = []
+        self.warnings: list[Message] = []
 
     def of_type(self, *types: str) -> list[str]:
         """Topics of one of these types, sorted."""
@@ -175,21 +176,22 @@ class TopicChooser:
         topics = self.candidates(kind)
         wanted = getattr(self._robot.topics, kind)
         topic = find_in_namespace(wanted, topics)
+        role = kind.replace("_", " ")
         if topic is not None and len(topics) > 1:
-            self.warnings.append(f"{topic} is used as {kind.replace('_', ' ')}: it is {wanted} in a namespace.")
+            self.warnings.append(message("topics.in_namespace", topic=topic, role=role, wanted=wanted))
             return TopicSource(topic, kind, "robot")
         without_gyro = [other for other in self.of_type(TYPES[kind]) if is_without_gyro(other) and other not in topics]
         if kind == "imu" and len(topics) == 1 and without_gyro:
-            self.warnings.append(f"{topics[0]} is used as imu: {', '.join(without_gyro)} by name without a gyro.")
+            self.warnings.append(message("topics.without_gyro", topic=topics[0], others=", ".join(without_gyro)))
             return TopicSource(topics[0], kind, "names")
         by_wheels = [topic for topic in topics if is_by_wheels(topic)] if kind == "odometry" else []
         if len(by_wheels) == 1 and len(topics) > 1:
             others = ", ".join(other for other in topics if other != by_wheels[0])
-            self.warnings.append(f"{by_wheels[0]} is used as odometry: of it and {others} it is by its name the wheels'.")
+            self.warnings.append(message("topics.by_wheels", topic=by_wheels[0], others=others))
             return TopicSource(by_wheels[0], kind, "names")
         if len(topics) > 1:
             option = f"--topic.{kind.replace('_', '-')}"
-            self.warnings.append(f"{', '.join(topics)} could each be the {kind.replace('_', ' ')}; name one with {option}.")
+            self.warnings.append(message("topics.several", topics=", ".join(topics), role=role, option=option))
         return TopicSource(topics[0], kind, "only") if len(topics) == 1 else None
 
     def candidates(self, kind: str) -> list[str]:
@@ -285,7 +287,7 @@ class TopicRoles:
     """CG model for the joint states of `Sources.arms`."""
     robot: Robot
     """The robot, its wheel joints by the log's names where these have another prefix."""
-    warnings: list[str]
+    warnings: list[Message]
 
 
 def choose_roles(
@@ -321,7 +323,7 @@ class _RoleChooser:
         self._more_wheels: tuple[TopicSource, ...] = ()
         self._error: TopicError | None = None
         self._joint_note = ""
-        self._warnings: list[str] = []
+        self._warnings: list[Message] = []
 
     def choose(self) -> TopicRoles:
         wheels, lidars, imu, center_of_gravity = self._wheels(), self._lidars(), self._choose("imu"), self._center_of_gravity()
@@ -344,12 +346,9 @@ class _RoleChooser:
         topics, missing = cover_joints(joints, received)
         strange = sorted(set().union(*received.values()) - set(joints) - {*robot.joints.left, *robot.joints.right})
         if missing and (topics or strange):
-            unknown = f" Joints in it that the robot does not have: {', '.join(strange)}." if strange else ""
-            self._warnings.append(
-                f"{', '.join(topics or received)} has no {', '.join(missing)} of the arms; until these are received, the centre of"
-                f" gravity stays at the robot file's value.{unknown} Name the joints as the log does, or list those that it has in the"
-                " robot file's [arms] joints."
-            )
+            unknown = phrase("topics.unknown_joints", joints=", ".join(strange)) if strange else ""
+            found = ", ".join(topics or received)
+            self._warnings.append(message("topics.missing_arms", topics=found, joints=", ".join(missing), unknown=unknown))
         if not topics:
             return (), None
         return tuple(TopicSource(topic, "joint_states", "robot") for topic in topics), model
@@ -373,9 +372,7 @@ class _RoleChooser:
         if source is not None and source.chosen_by == "only":
             wanted = getattr(self._robot.topics, source.kind)
             part = source.kind.replace("_", " ")
-            self._warnings.append(
-                f"{source.topic} is used as {part}: it is the only topic of its type, and the log has no {wanted} of that type."
-            )
+            self._warnings.append(message("topics.only", topic=source.topic, role=part, wanted=wanted))
         return source
 
     def _lidars(self) -> list[TopicSource]:
@@ -392,7 +389,7 @@ class _RoleChooser:
         for source in named:
             frame = (self._scan_frame(source.topic) if len(named) > 1 else "") or source.topic
             if frame in used:
-                self._warnings.append(f"{source.topic} is not used: its frame '{frame}' is that of {used[frame].topic}, one LiDAR's.")
+                self._warnings.append(message("topics.same_frame", topic=source.topic, frame=frame, other=used[frame].topic))
             used.setdefault(frame, source)
         return list(used.values())
 
@@ -406,7 +403,7 @@ class _RoleChooser:
         if len(own) < 2 or len({frames[topic] for topic in own}) < len(own) or "" in frames.values():
             return []
         listed = " and ".join(own)
-        self._warnings.append(f"{listed} are used as planar scanners, each by its own mount. --topic.scan {own[0]} uses that one alone.")
+        self._warnings.append(message("topics.scanners", topics=listed, first=own[0]))
         return [TopicSource(topic, "scan", "only") for topic in own]
 
     def _wheels(self) -> TopicSource | None:
@@ -425,21 +422,21 @@ class _RoleChooser:
             candidates = self._chooser.of_type(TYPES["joint_states"])
             fitting, known = self._fitting(candidates)
             if fitting:
-                self._warnings.append(f"{fitting[0][0]} is used as joint states: {named.topic} has none of the wheels.")
+                self._warnings.append(message("topics.other_joint_states", topic=fitting[0][0], named=named.topic))
                 named = TopicSource(fitting[0][0], "joint_states", "joints")
         if len(fitting) == 1:
             topic, self._joints = fitting[0]
             wanted = (*self._robot.joints.left, *self._robot.joints.right)
             absent = [joint for joint in wanted if joint not in (*self._joints[0], *self._joints[1])]
             if absent:
-                self._warnings.append(f"{topic} has no joints {', '.join(absent)}; their sides are the mean of the others.")
+                self._warnings.append(message("topics.missing_joints", topic=topic, joints=", ".join(absent)))
             return named if named is not None else self._warn_default(TopicSource(topic, "joint_states", "only"))
         parts = None if self._has_all_wheels(fitting) else self._wheels_in_parts(candidates)
         if parts is not None:
             return parts
         if len(fitting) > 1:
             topics = ", ".join(topic for topic, _ in fitting)
-            self._warnings.append(f"{topics} all have the wheel joints; name one with --topic.joint-states.")
+            self._warnings.append(message("topics.several_joint_states", topics=topics))
         driver = self._by_driver() if not fitting and self._overrides.joint_states is None else None
         return driver or self._odometry(named, known, bool(candidates) and not fitting)
 
@@ -453,13 +450,13 @@ class _RoleChooser:
             fitting, known = self._fitting(topics)
         if len(fitting) > 1:
             listed = ", ".join(topic for topic, _ in fitting)
-            self._warnings.append(f"{listed} could each be the wheels; name one with --topic.joint-states.")
+            self._warnings.append(message("topics.several_drivers", topics=listed))
             return None
         if not fitting:
             return self._wheels_in_parts(topics)
         ((topic, self._joints),) = fitting
         source = self._source_of_joints(topic)
-        self._warnings.append(f"{topic} ({short_type(source.type)}) is used as the wheels: no joint states of {self._log} have them.")
+        self._warnings.append(message("topics.driver_message", topic=topic, type=short_type(source.type), log=self._log))
         return source
 
     def _fitting(self, topics: list[str]) -> tuple[list[tuple[str, Sides]], set[str]]:
@@ -492,10 +489,7 @@ class _RoleChooser:
             (way,) = ways
             self._robot = replace(self._robot, joints=joints.renamed(way))
             ours, theirs = next(iter(way.items()))
-            self._warnings.append(
-                f"{', '.join(topics)}: its joints have other names than the robot file's, {theirs} for {ours}, and so on for all wheels;"
-                " they are taken as the same. Write the log's names to [joints], unless another robot's wheels are called so."
-            )
+            self._warnings.append(message("topics.renamed_joints", topics=", ".join(topics), theirs=theirs, ours=ours))
         elif ways:
             ours = joints.left[0]
             self._joint_note = f" {ours} may be {' or '.join(way[ours] for way in ways)}: those of several robots or axles."
@@ -514,11 +508,9 @@ class _RoleChooser:
         first = named if named is not None and named.topic in topics else self._source_of_joints(topics[0])
         self._more_wheels = tuple(self._source_of_joints(topic) for topic in topics if topic != first.topic)
         absent = [joint for joint in (*wanted.left, *wanted.right) if joint not in names]
-        rest = f" None has {', '.join(absent)}; their sides are the mean of the others." if absent else ""
-        self._warnings.append(
-            f"{', '.join(topics)} has no message with the wheels of both sides: those of {', '.join((*left, *right))} are put together,"
-            f" each interpolated between its stamps.{rest}"
-        )
+        rest = phrase("topics.absent", joints=", ".join(absent)) if absent else ""
+        joints = ", ".join((*left, *right))
+        self._warnings.append(message("topics.parts", topics=", ".join(topics), joints=joints, rest=rest))
         return first
 
     def _source_of_joints(self, topic: str) -> TopicSource:
@@ -536,7 +528,7 @@ class _RoleChooser:
             raise TopicError(f"{missing_joints}. Name them in the robot file's [joints].")
         odometry = self._choose("odometry") or self._other_odometry()
         if is_missing_joints and odometry is not None:
-            self._warnings.append(f"{missing_joints}; the wheels are taken from {odometry.topic}.")
+            self._warnings.append(message("topics.by_odometry", missing=missing_joints, topic=odometry.topic))
         elif is_missing_joints:
             self._error = TopicError(
                 f"{missing_joints}.{self._chooser.describe_other_odometry()} Name them in the robot file's [joints], or go without wheels"
@@ -550,7 +542,7 @@ class _RoleChooser:
             return None
         twists = [topic for topic in self._chooser.of_type(*TWIST_TYPES) if is_measured_twist(topic) and not is_other_estimate(topic)]
         if len(twists) > 1:
-            self._warnings.append(f"{', '.join(twists)} could each be the wheels' velocity; name one with --topic.odometry.")
+            self._warnings.append(message("topics.several_twists", topics=", ".join(twists)))
         is_filtered = any(map(is_filter, self._chooser.of_type(TYPES["odometry"])))  # which publishes the odometry's transform, too
         transforms = [topic for topic in self._chooser.of_type(*TF_TYPES) if not topic.endswith("_static") and not is_filtered]
         topics = twists or transforms
@@ -558,16 +550,13 @@ class _RoleChooser:
             return None
         topic = topics[0]
         source = TopicSource(topic, "odometry", "only", self._chooser.type_of(topic))
-        what = "velocity"
-        if source.type in TF_TYPES:
-            edge = self._odometry_edge(topic)
-            if edge is None:
-                return None
-            what = f"transform from '{edge[0]}' to '{edge[1]}'"
-        self._warnings.append(
-            f"{topic}: its {what} is used as the wheels' odometry: the log has neither joint states of wheels nor the driver's Odometry."
-            " If another node makes it (a command, a filter), record the wheels, or leave it out by an empty --topic.odometry."
-        )
+        if source.type not in TF_TYPES:
+            self._warnings.append(message("topics.velocity", topic=topic))
+            return source
+        edge = self._odometry_edge(topic)
+        if edge is None:
+            return None
+        self._warnings.append(message("topics.transform", topic=topic, parent=edge[0], frame=edge[1]))
         return source
 
     def _wheel_joints(self, topic: str) -> tuple[set[str], Sides | None]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from localization.logs.decode import frame_name
+from localization.messages import Message, message
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -30,29 +31,27 @@ class FixedTransforms:
         self._edges: Edges = {}
         self._fixed: set[tuple[str, str]] = set()
         self._moving: set[tuple[str, str]] = set()
-        self._contradictions: dict[str, str] = {}
-        self._no_rotations: dict[str, str] = {}
+        self._contradictions: dict[str, Message] = {}
+        self._no_rotations: dict[str, Message] = {}
 
-    def add(self, message: Any, *, is_static: bool) -> None:
+    def add(self, received: Any, *, is_static: bool) -> None:
         """Insert a TFMessage. On a static topic the last transform counts; on /tf one that changes is no mount."""
-        for transform in message.transforms:
+        for transform in received.transforms:
             edge = frame_name(transform.header.frame_id), frame_name(transform.child_frame_id)
             matrix = _matrix(transform.transform)
             if matrix is None and is_static and _is_unfilled(transform.transform):
                 matrix = _translation(transform.transform)
-                self._no_rotations[edge[1]] = (
-                    f"/tf_static: the transform from '{edge[0]}' to '{edge[1]}' has a quaternion of four zeros, which its publisher has not"
-                    " filled in: taken as no rotation. Write qw = 1 there, or its rotation."
-                )
+                self._no_rotations[edge[1]] = message("transforms.zeros", parent=edge[0], frame=edge[1])
             if matrix is None or edge[0] == edge[1]:
-                if is_static:
-                    reason = "its rotation is no unit quaternion" if matrix is None else "a frame cannot be its own parent"
-                    self._no_rotations[edge[1]] = f"/tf_static: the transform from '{edge[0]}' to '{edge[1]}' was left out: {reason}."
+                if is_static and matrix is None:
+                    self._no_rotations[edge[1]] = message("transforms.no_rotation", parent=edge[0], frame=edge[1])
+                elif is_static:
+                    self._no_rotations[edge[1]] = message("transforms.own_parent", parent=edge[0], frame=edge[1])
                 continue
             before = self._edges.get(edge)
             if is_static:
                 if edge in self._fixed and before is not None and not _agree(before, matrix):
-                    self._contradict(edge[1], f"'{edge[0]}' to '{edge[1]}' is published with two different poses")
+                    self._contradictions.setdefault(edge[1], message("transforms.two_poses", parent=edge[0], frame=edge[1]))
                 self._fixed.add(edge)
             elif edge in self._fixed:
                 continue
@@ -87,21 +86,16 @@ class FixedTransforms:
         self._compare(poses)
         return {frame: mount_of(pose) for frame, pose in poses.items()}
 
-    def contradictions(self) -> dict[str, str]:
-        """Frames whose poses in the log contradict each other, as found by `mounts`, with a sentence about each."""
+    def contradictions(self) -> dict[str, Message]:
+        """Frames whose poses in the log contradict each other, as found by `mounts`, with a message about each."""
         return dict(self._contradictions)
 
-    def describe_moving(self, frames: Iterable[str]) -> list[str]:
+    def describe_moving(self, frames: Iterable[str]) -> list[Message]:
         """Sentences about those of ``frames`` that move against the body, such as a LiDAR's on a pan joint."""
         moving = {child: parent for parent, child in self._moving if parent not in _WORLDS}
-        return [
-            f"/tf: '{frame}' moves against '{moving[frame]}' (a pan joint?): its data are taken as of a fixed one. Fix the joint, or leave"
-            f" its sensor out by an empty --topic option."
-            for frame in sorted(frames)
-            if frame in moving
-        ]
+        return [message("transforms.moving", frame=frame, parent=moving[frame]) for frame in sorted(frames) if frame in moving]
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Sentences about transforms that could not be used, or that contradict each other."""
         return [*self._contradictions.values(), *self._no_rotations.values()]
 
@@ -114,14 +108,7 @@ class FixedTransforms:
                 and child in poses
                 and not _agree(poses[parent] @ parent_T_child, poses[child])
             ):
-                self._contradict(child, f"the chain by way of '{parent}' leads to another pose of '{child}' than the shortest chain does")
-
-    def _contradict(self, frame: str, what: str) -> None:
-        self._contradictions.setdefault(
-            frame,
-            f"/tf_static contradicts itself: {what}. What is measured in '{frame}' may be placed wrongly; leave one publisher of that"
-            f" frame, or add [mounts.{frame}] to the robot file, which then is used.",
-        )
+                self._contradictions.setdefault(child, message("transforms.two_chains", parent=parent, frame=child))
 
 
 def _agree(one: FloatArray, other: FloatArray) -> bool:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,7 +33,6 @@ _LOST_AFTER_S = 1.0
 _SLIP_NIS = float(chi2.isf(1e-9, 3))
 """Innovation of a scan that noise exceeds once in 1e9 scans: the wheels slipped, or the robot was pushed."""
 _MILLIMETRES, _TENTHS = 3, 1
-_FAULT = re.compile(r"^at t = ([.0-9]+) s: (.*)", re.MULTILINE)
 """Time and text of a warning of the sensor checks."""
 
 
@@ -107,7 +105,7 @@ def _run(run: PlottedRun, start_ns: int, most: int, track: ReferenceTrack | None
         "loops": _loops(run),
         "lost": _lost(run, t),
         "slips": _slips(run, t),
-        "faults": [[float(at), text] for at, text in _FAULT.findall("\n".join(run.result.run.warnings))],
+        "faults": [[found.at_s, found.body] for found in run.result.run.warnings if found.at_s is not None],
         "parameters": {name: _history(rows, start_ns) for name, rows in _by_movement(run.result.run.parameter_history)},
     }
 

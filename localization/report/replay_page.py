@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
+from localization.messages import Message
 from localization.report import figures
 from localization.report import page as html
 from localization.report.interactive import Scans, explorer
@@ -67,7 +68,7 @@ class ReportHead:
     start: str
     """Time of the log's begin, readable."""
     duration_s: float
-    warnings: Sequence[str]
+    warnings: Sequence[Message]
     """Problems found in the log."""
     versions: Mapping[str, str]
     """Versions by library."""

@@ -27,6 +27,7 @@ from localization.calibration.windows import WindowConfig
 from localization.estimate import Estimate
 from localization.events import Event, Scan
 from localization.lidar.losses import MAX_LOST_S, LidarLosses
+from localization.messages import Message, message
 from localization.pipeline import Pipeline
 from motion_models.errors import SkidlocError
 from motion_models.robot import Mount, Robot
@@ -72,10 +73,6 @@ class Status:
     level: int = OK
     message: str = "ok"
     values: Mapping[str, str] = field(default_factory=dict)
-
-
-_NO_WHEELS = "no wheel data during the last step: the motion is by the LiDAR, or extrapolated. Check the driver of the wheels."
-_SLIP = "their motion differs from the robot's: slip. Drive more slowly, or calibrate the motion model."
 
 
 class Health:
@@ -153,7 +150,7 @@ class Health:
     def _of_estimate(self) -> Status:
         e = self.estimate
         if e is None:
-            return Status("estimate", WARN, "none yet: it begins with wheels that turn or a second scan")
+            return Status("estimate", WARN, message("diagnostics.no_estimate"))
         values = {"x_m": f"{e.pose[0]:.4f}", "y_m": f"{e.pose[1]:.4f}", "yaw_rad": f"{e.pose[2]:.5f}"}
         if e.covariance is not None:
             x, y, yaw = np.sqrt(np.diag(e.covariance))
@@ -163,15 +160,14 @@ class Health:
         problems = [*self._late_estimates(), *_wide_covariance(e)]
         return Status("estimate", max((level for level, _ in problems), default=OK), " ".join(text for _, text in problems) or "ok", values)
 
-    def _late_estimates(self) -> list[tuple[int, str]]:
+    def _late_estimates(self) -> list[tuple[int, Message]]:
         """Level and message where more than `_LATE_SHARE` of the last scans had to wait too long."""
         last = list(self._latencies)[-_LATENCIES:]
         late = float(np.quantile(last, 1.0 - _LATE_SHARE, method="lower")) if last else 0.0
         if late <= self.max_latency_s:
             return []
-        advice = "free the processor, or lower the rate or the points of the LiDAR"
         level = ERROR if late > _ERROR_RATIO * self.max_latency_s else WARN
-        return [(level, f"estimates come {late:.2f} s after their scans: {advice}.")]
+        return [(level, message("diagnostics.late", seconds=late))]
 
     def _of_lidar(self, pipeline: Pipeline) -> Status:
         counts, losses = {**pipeline.estimator.counts(), **pipeline.checks.counts()}, pipeline.lidar
@@ -194,25 +190,18 @@ class Health:
         if losses is not None and (lost := _of_losses(losses, values)) is not None:
             return lost
         if scene is not None and scene < _DEGENERATE:
-            return Status("lidar", WARN, "the scene holds no position along one direction (a corridor, one wall)", values)
+            return Status("lidar", WARN, message("diagnostics.one_direction"), values)
         if above > _MOST_ABOVE:
-            return Status(
-                "lidar", WARN, f"{100.0 * above:.0f} % of the innovations are beyond their 95 %: wheels and LiDAR disagree", values
-            )
+            return Status("lidar", WARN, message("diagnostics.innovations", percent=100.0 * above), values)
         return Status("lidar", values=values)
 
     def _of_wheels(self, pipeline: Pipeline) -> Status:
         vx, vy, wz = (float(v) for v in self._slip)
         values = {"slip_vx_m_s": f"{vx:.4f}", "slip_vy_m_s": f"{vy:.4f}", "slip_wz_rad_s": f"{wz:.4f}"}
         if pipeline.wheel_twist is None:
-            return Status(
-                "wheels",
-                WARN,
-                _NO_WHEELS,
-                values,
-            )
+            return Status("wheels", WARN, message("diagnostics.no_wheels"), values)
         if math.hypot(vx, vy) > _SLIP_M_S or abs(wz) > _SLIP_RAD_S:
-            return Status("wheels", WARN, _SLIP, values)
+            return Status("wheels", WARN, message("diagnostics.slip"), values)
         return Status("wheels", values=values)
 
 
@@ -220,11 +209,10 @@ def _of_contradictions(pipeline: Pipeline) -> Status:
     """What sensors contradict each other in, as warnings, and why the covariance is wide though no sensor is certainly at fault."""
     faults = pipeline.checks.warnings()
     others = [*pipeline.checks.inflation_reasons(), *pipeline.synchronizer.warnings(), *pipeline.estimator.warnings()]
-    notes = {f"note_{i}": note for i, note in enumerate(others, 1)}
+    notes: dict[str, str] = {}
+    for found in (*faults, *others):
+        notes[found.id] = f"{notes[found.id]} {found}" if found.id in notes else found
     return Status("sensors", WARN, " ".join(faults), notes) if faults else Status("sensors", values=notes)
-
-
-_BESIDE = "ready: its points are used as well once its mount is known"
 
 
 def _of_lidars(pipeline: Pipeline) -> list[Status]:
@@ -234,11 +222,11 @@ def _of_lidars(pipeline: Pipeline) -> list[Status]:
     for frame, lidar in choice.lidars.items():
         values = {"rate_hz": f"{1.0 / lidar.period_s:.1f}", "scans": str(lidar.scans)}
         if frame in silent:
-            found.append(Status(f"lidar {frame}", ERROR, f"no scans for {silent[frame]:.1f} s: check its driver.", values))
+            found.append(Status(f"lidar {frame}", ERROR, message("diagnostics.silent_lidar", seconds=silent[frame]), values))
         else:
             if (yaw := offsets.get(f"{frame}_offset_yaw_rad")) is not None:
                 values["turned_against_its_mount_deg"] = f"{math.degrees(yaw[0]):.2f} +- {math.degrees(yaw[1]):.2f}"
-            found.append(Status(f"lidar {frame}", OK, "in use" if frame == choice.used else _BESIDE, values))
+            found.append(Status(f"lidar {frame}", OK, "in use" if frame == choice.used else message("diagnostics.second_lidar"), values))
     return found
 
 
@@ -249,9 +237,9 @@ def _of_place(found: Mapping[str, Any]) -> Status:
         x, y, yaw = place["pose"]
         values[f"place_{i + 1}"] = f"x {x:.2f} m, y {y:.2f} m, yaw {math.degrees(yaw):.0f} deg: {place['probability']:.2f}"
     if found["state"] == "localized":
-        return Status("map", OK, "outside of the map: the pose is by odometry" if found["is_outside"] else "ok", values)
-    text = "the place in the map is searched: drive some metres, or publish it on /initialpose"
-    return Status("map", WARN, text if found["state"] == "searching" else f"lost: {text}", values)
+        return Status("map", OK, message("diagnostics.outside") if found["is_outside"] else "ok", values)
+    is_first = found["state"] == "searching"
+    return Status("map", WARN, message("diagnostics.searching") if is_first else message("diagnostics.lost_place"), values)
 
 
 def degeneracy(points: FloatArray) -> float | None:
@@ -296,7 +284,7 @@ class Doctor:
         self._next_s = time.monotonic() + period_s
         self._thread: threading.Thread | None = None
         self._process: multiprocessing.process.BaseProcess | None = None
-        self._status = Status(_NAME, OK, f"none yet: one is made every {period_s / 60.0:.3g} min")
+        self._status = Status(_NAME, OK, message("diagnostics.next_diagnosis", minutes=period_s / 60.0))
 
     @property
     def is_running(self) -> bool:
@@ -360,30 +348,30 @@ class Doctor:
             here.send(None)
             self._status = here.recv()
         except (EOFError, OSError):  # it was ended, by `close` or by its limits
-            self._status = Status(_NAME, OK, f"not finished: it took more than {_MAX_CPU_S} s of processor time, or was stopped")
+            self._status = Status(_NAME, OK, message("diagnostics.not_finished", seconds=_MAX_CPU_S))
         finally:
             here.close()
             if process.pid is not None:
                 process.join()
 
 
-def _wide_covariance(estimate: Estimate) -> list[tuple[int, str]]:
+def _wide_covariance(estimate: Estimate) -> list[tuple[int, Message]]:
     if estimate.covariance is None:
         return []
     x, y, yaw = np.sqrt(np.diag(estimate.covariance))
     if math.hypot(x, y) <= _MAX_SIGMA_M and yaw <= _MAX_SIGMA_RAD:
         return []
-    return [(WARN, f"the pose is uncertain by {math.hypot(x, y):.1f} m and {yaw:.2f} rad: set it on /initialpose or /set_pose.")]
+    return [(WARN, message("diagnostics.uncertain", position_m=math.hypot(x, y), yaw_rad=yaw))]
 
 
 def _of_losses(losses: LidarLosses, values: Mapping[str, str]) -> Status | None:
     """ERROR while the LiDAR is lost for long, WARN while it is lost or was for long, else None."""
     if losses.ongoing_s > MAX_LOST_S:
-        return Status("lidar", ERROR, f"lost for {losses.ongoing_s:.0f} s: the pose is by wheels and gyro. {losses.advice}", values)
+        return Status("lidar", ERROR, message("diagnostics.lost_long", seconds=losses.ongoing_s, advice=losses.advice), values)
     if losses.ongoing_s > 0.0:
-        return Status("lidar", WARN, f"lost for {losses.ongoing_s:.1f} s: the pose is by wheels and gyro. {losses.advice}", values)
+        return Status("lidar", WARN, message("diagnostics.lost", seconds=losses.ongoing_s, advice=losses.advice), values)
     if losses.is_long:
-        return Status("lidar", WARN, f"{losses.summary}. {losses.advice}", values)
+        return Status("lidar", WARN, message("diagnostics.was_lost", summary=losses.summary, advice=losses.advice), values)
     return None
 
 
@@ -397,8 +385,10 @@ def _of_messages(dropped: Sequence[str], silent: Mapping[str, float]) -> Status:
     values = {f"dropped_{i + 1}": sentence for i, sentence in enumerate(dropped)}
     values |= {f"silent {topic}": f"{seconds:.1f} s" for topic, seconds in silent.items()}
     if silent:
-        return Status("messages", ERROR, f"no messages on {', '.join(silent)}: check their drivers and the network", values)
-    return Status("messages", WARN if dropped else OK, "some are late, corrected or dropped: " + dropped[0] if dropped else "ok", values)
+        return Status("messages", ERROR, message("diagnostics.silent_topics", topics=", ".join(silent)), values)
+    if dropped:
+        return Status("messages", WARN, message("diagnostics.dropped", first=dropped[0]), values)
+    return Status("messages", values=values)
 
 
 Run = Callable[[Connection, Request], None]
@@ -439,7 +429,7 @@ def diagnose_events(events: Sequence[Event], request: Request) -> Status:
         drive = drive_of_events(events, name, robot, mounts, (reference, "scan matching" if has_lidar else "gyro"), config)
         found = examine(drive, make_model(request.model, robot))
     except SkidlocError as error:
-        return Status(_NAME, OK, f"{name} cannot be diagnosed: {error}")
+        return Status(_NAME, OK, message("diagnostics.not_diagnosed", drive=name, reason=str(error)))
     return _status_of(found, robot, name)
 
 

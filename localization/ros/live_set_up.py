@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from localization.events import Event, ImuSample, Scan, WheelSample
-from localization.evidence import CORRECTED, SetUp
+from localization.evidence import SetUp
 from localization.evidence.entrance import has_moved, infer, sources_of_readings
 from localization.evidence.signals import Source, scan_sources
 from localization.logs.decode import ArmReading, JointReading, OdometryReading
 from localization.logs.topic_roles import Sources
+from localization.messages import Message, phrase
 from localization.ros.transports.transport import Received
 from motion_models.robot import Mount, Robot
 
@@ -33,7 +34,6 @@ _SETTLED = 0.999
 """Probability of the robot file's set-up from where on no more is read: before any data it is 0.97."""
 _OPEN = 0.9
 """Probability of the robot file's set-up below which the poses' covariance has twice the way, until the answer is certain."""
-_NOW = "Corrected from the start of the drive on; write to the robot file:"
 
 
 @dataclass
@@ -98,9 +98,10 @@ class LiveSetUp:
         return self._messages.in_order()
 
     @property
-    def texts(self) -> tuple[str, ...]:
+    def texts(self) -> tuple[Message, ...]:
         """Sentences on what was found."""
-        return () if self.found is None else tuple(text.replace(CORRECTED, _NOW) for text in self.found.sentences)
+        found = () if self.found is None else self.found.sentences
+        return tuple(each.but(correction=phrase("set_up.since_start")) for each in found)
 
     @property
     def largest_error_m(self) -> float:
@@ -181,8 +182,8 @@ class EntranceChecks:
     def __init__(self, executor: Executor | None = None) -> None:
         self._executor = executor
         self.running: LiveSetUp | None = None
-        self.notes: list[str] = []
-        """Sentences on what was found."""
+        self.notes: list[Message] = []
+        """What was found."""
         self._corrected: set[str] = set()  # keys of the robot file
 
     def begin(self, sensors: LiveSensors) -> LiveSetUp | None:

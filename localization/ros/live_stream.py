@@ -18,6 +18,7 @@ from localization.logs.decode import ArmReading, MessageStats, Oddity
 from localization.logs.event_decoder import CLOCKS, EventDecoder, JointsToWheels, OdometryToWheels, decode_item
 from localization.logs.serialization import decoder
 from localization.logs.topic_roles import TYPES, Sources
+from localization.messages import Message, message
 from localization.ros.discovery import DiscoveredTopics
 from localization.ros.payloads import Payloads
 from localization.ros.transports.transport import Received
@@ -25,7 +26,6 @@ from motion_models.robot import Robot
 
 _NS = 1e-9
 _OLDEST_S, _NEWEST_S = 3600.0, 1.0
-_LATE = "dropped (came after newer ones)"
 _SILENT_S, _PERIODS = 1.0, 5.0
 _NEAR, _PAST, _LONGEST_S = 0.95, 1.1, 0.12
 _MIN_BEHIND_S, _MAX_LATENCY_S, _MIN_MESSAGES = 0.3, 0.1, 50
@@ -110,7 +110,7 @@ class LiveStream:
         lidar = self.sources.lidar
         return 0.0 if lidar is None else self.topic_rates[lidar.topic].rest(now_ns, (_NEAR, _PAST))
 
-    def behind(self) -> list[str]:
+    def behind(self) -> list[Message]:
         """Topics whose stamps are off the times of receiving, while those of the other sensors are not, as sentences."""
         sensors = {source.topic: CLOCKS[source.kind] for source in self.sources.used() if source.kind in CLOCKS}
         behind = {topic: late_s for topic, late_s in self._merger.behind_s(_MIN_MESSAGES).items() if topic in sensors}
@@ -118,21 +118,21 @@ class LiveStream:
         for topic, late_s in behind.items():
             others = [abs(other) for name, other in behind.items() if sensors[name] != sensors[topic]]
             if others and abs(late_s) >= _MIN_BEHIND_S and max(others) <= _MAX_LATENCY_S:
-                way, queue = ("behind", ", or it comes late with stamps that are right") if late_s > 0.0 else ("ahead of", "")
-                found.append(
-                    f"{topic}: its stamps are {abs(late_s):.2f} s {way} the times of receiving, those of the other sensors at most"
-                    f" {max(others):.2f} s: its clock is off{queue}. Synchronize the clocks."
-                )
+                seconds, others_s = abs(late_s), max(others)
+                if late_s > 0.0:
+                    found.append(message("live_stream.behind", topic=topic, seconds=seconds, others_s=others_s))
+                else:
+                    found.append(message("live_stream.ahead", topic=topic, seconds=seconds, others_s=others_s))
         return found
 
-    def dropped(self) -> list[str]:
+    def dropped(self) -> list[Message]:
         """Messages that were corrected or dropped, as sentences."""
         found = []
         for name in (name for topic in self.topic_rates for name in self._stats.parts(topic)):
             for oddity in Oddity:
                 if (count := self._stats.of(name, oddity)) and oddity is not Oddity.OUT_OF_ORDER:
-                    sentence = oddity.sentence(name, count)
-                    found.append(sentence.replace(oddity.value, _LATE) if oddity is Oddity.LATE else sentence)
+                    kind = Oddity.LATE_LIVE if oddity is Oddity.LATE else oddity
+                    found.append(kind.describe(name, count))
         return found
 
 

@@ -20,12 +20,14 @@ from typing import Any
 
 import numpy as np
 
+from localization.calibration.robot_notes import robot_notes
 from localization.errors import CheckpointError
 from localization.estimate import Estimate
 from localization.estimators import PriorMap, SavedMapFusion
 from localization.events import Event, Scan
 from localization.inputs.wheel_buffer import WheelBuffer
 from localization.logs.decode import MessageStats
+from localization.messages import Message, message
 from localization.pipeline import Pipeline, Trial
 from localization.ros.checkpoint import read_head
 from localization.ros.diagnostics import Doctor, Health, Status
@@ -46,7 +48,6 @@ from localization.ros.settings import LiveRun
 from localization.ros.start_pose import StartPose
 from localization.ros.transports.transport import Received, Transport
 from motion_models.errors import RobotError
-from motion_models.prior import prior_notes
 from motion_models.robot import Clock, Mount
 
 _POLL_S = 0.2
@@ -146,7 +147,7 @@ class Node:
         trial = run.make_trial(sources.lidar is not None)
         if trial.prior is not None:
             trial.prior.check_lidar(sources.has_clouds, bool(run.config.step.planar))
-        notes = prior_notes(run.robot, [trial.model.name])
+        notes = robot_notes(run.robot, [trial.model.name])
         for warning in (*notes, *notes_on_clocks(run.robot.clock), *discovered.parts.warnings):
             report(warning)
         node = cls(transport, run, discovered, trial, publisher, report, discovery, executor)
@@ -316,7 +317,7 @@ class Node:
         """Messages per second of the topics in use [Hz]."""
         return self.inputs.stream.rates()
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Everything that was lost or corrected, as sentences."""
         stream = self.inputs.stream
         return list(dict.fromkeys([*self._checks.notes, *stream.behind(), *stream.dropped(), *self.session.pipeline.warnings()]))
@@ -502,13 +503,13 @@ class Node:
             self.session.view.begin(self.inputs.robot, pipeline.mounts)
 
 
-def notes_on_clocks(clock: Clock) -> list[str]:
+def notes_on_clocks(clock: Clock) -> list[Message]:
     """Entries of the robot file that a node leaves out: live, a clock's rate has no start of a log from which it counts."""
     keys = [f"clock.{name}_rate_error" for name in ("wheel", "lidar", "gyro") if getattr(clock, f"{name}_rate_error")]
     if not keys:
         return []
     hold, them = ("holds", "it") if len(keys) == 1 else ("hold", "them")
-    return [f"{' and '.join(keys)} {hold} for logs alone, and the node does not use {them}; synchronize the clocks."]
+    return [message("robot_file.live_clock", keys=" and ".join(keys), hold=hold, them=them)]
 
 
 class StopSignal:

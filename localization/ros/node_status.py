@@ -66,7 +66,7 @@ class NodeStatus:
         """Report problems of the frames of scans and transforms, and faults of sensors, that are new."""
         problems = session.pipeline.synchronizer.scans.frames.problem, self._inputs.transforms.problem
         reports = {problem: problem for problem in problems if problem is not None}
-        reports |= {fault.message: found.sentence for fault, found in session.pipeline.checks.found.items()}  # its numbers may change
+        reports |= {fault.id: found.sentence for fault, found in session.pipeline.checks.found.items()}  # its numbers may change
         for problem, sentence in reports.items():
             if problem not in self._reported:
                 self._reported.add(problem)

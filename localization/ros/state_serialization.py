@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.errors import CheckpointError
+from localization.messages import Message
 
 PACKAGES = ("localization.", "motion_models.")
 KINDS = "biufc"
@@ -183,6 +184,8 @@ def _frozen_fields(value: Any) -> list[str]:
 def _state(value: Any) -> Any:
     if isinstance(value, tuple):  # a NamedTuple
         return tuple(value)
+    if isinstance(value, Message):
+        return value.__getnewargs__()
     state = value.__getstate__()
     if state is None:
         return {}
@@ -274,7 +277,7 @@ class _Reader:
 
     def _instance(self, index: int, module: str, name: str, state: Json) -> None:
         found = _class(module, name)
-        if issubclass(found, tuple):  # a NamedTuple
+        if issubclass(found, tuple | Message):
             self._made[index] = found(*self.get(state))
             return
         made: Any = object.__new__(found)

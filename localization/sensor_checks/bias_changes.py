@@ -8,8 +8,7 @@ from localization.estimators import Estimator
 from localization.sensor_checks.faults import FaultLog, SensorFault, is_certain
 
 BIAS_CHANGED = SensorFault(
-    "the gyro's bias has changed by {degrees:+.1f} deg/s between this rest and the one before. The covariance of what was driven between"
-    " them has that. Let the robot stand for a second now and then, and check the IMU's temperature and supply."
+    "bias_change.between_rests",
 )
 
 

@@ -13,6 +13,7 @@ from localization.estimators import Estimate, Estimator, Residuals
 from localization.events import ImuSample, Scan, Step
 from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
+from localization.messages import Message
 from localization.sensor_checks.bias_changes import BiasChangeCheck
 from localization.sensor_checks.clocks import ClockCheck
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
@@ -190,11 +191,11 @@ class SensorChecks:
         scans = self._steps.moving.report.scans
         return {"scans_with_moving_objects": scans} if scans else {}
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Problems so far."""
         return [*self._steps.tilt.warnings(), *self._faults.warnings()]
 
-    def inflation_reasons(self) -> list[str]:
+    def inflation_reasons(self) -> list[Message]:
         """See `SensorConsistency.inflation_reasons`."""
         return self._consistency.inflation_reasons()
 

@@ -10,24 +10,23 @@ from dataclasses import replace
 from typing import Literal
 
 from localization.estimators import Estimator
+from localization.messages import Message, Value
 from localization.sensor_checks.faults import FaultLog, SensorFault
 
 CLOCKS_APART = SensorFault(
-    "the wheels' stamps are {seconds:.2f} s {direction} than those of the {other}: the clock of one of both is off, and no third sensor"
-    " shows which. Poses have the {other}'s clock, and their covariance the way in that time. Synchronize the clocks, or write"
-    " clock.wheel_time_offset_s = {late:.2f} or clock.{role}_time_offset_s = {early:.2f} to the robot file."
+    "clocks_of_two.apart",
 )
 
 
-def _numbers(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: float, other_s: float) -> dict[str, float | str]:
-    direction = "later" if late_s > 0.0 else "earlier"
-    return {"other": other, "role": other.lower(), "seconds": abs(late_s), "direction": direction, "late": wheels_s, "early": other_s}
-
-
-def apart_message(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: float, other_s: float) -> str:
+def apart(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: float, other_s: float) -> Message:
     """That the wheels' stamps are later than the ``other`` sensor's by ``late_s`` [s]; ``wheels_s`` and ``other_s`` are the offsets that
     correct either [s]."""
-    return CLOCKS_APART.message.format(**_numbers(other, late_s, wheels_s, other_s))
+    return CLOCKS_APART.describe(_numbers(other, late_s, wheels_s, other_s))
+
+
+def _numbers(other: Literal["gyro", "LiDAR"], late_s: float, wheels_s: float, other_s: float) -> dict[str, Value]:
+    direction = "later" if late_s > 0.0 else "earlier"
+    return {"other": other, "role": other.lower(), "seconds": abs(late_s), "direction": direction, "late": wheels_s, "early": other_s}
 
 
 class ClockCheck:

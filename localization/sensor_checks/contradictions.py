@@ -16,12 +16,11 @@ from localization.sensor_checks.turn_votes import Sensor, TurnVotes
 from localization.sensor_checks.window import WINDOW_BINS, Bins, Window
 
 GYRO_STUCK = SensorFault(
-    "the gyro repeats one value while the wheels turn. It is not used as long as that lasts. Check the IMU and its driver.",
+    "stopped_gyro.repeats",
     reference="wheels",
 )
 LIDAR_DIRECTION = SensorFault(
-    "by the LiDAR the robot travels {degrees:.0f} deg to the {side} of where the wheels drive. Its scans are not used while that lasts."
-    " Correct the yaw of its frame by {correction:+.0f} deg in /tf_static or in the robot file's [mounts].",
+    "lidar_yaw.turned",
     reference="wheels and gyro",
     is_of_scans=True,
 )

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from localization.events import Step
+from localization.messages import Message, Value, message
 from localization.sensor_checks.inflation import CovarianceInflation, DeadReckoning
 from localization.sensor_checks.path_uncertainty import PathUncertainty
 
@@ -34,8 +35,8 @@ def is_certain(log_evidence: float) -> bool:
 class SensorFault(NamedTuple):
     """A kind of fault; each check has its own."""
 
-    message: str
-    """Template of the warning: fault and remedy, with format fields for numbers."""
+    id: str
+    """Subject and name of its message in `localization.messages`."""
     reference: DeadReckoning | None = None
     """Dead reckoning by sensors without this fault: its distance from the estimate inflates the covariance when the fault is found."""
     is_of_scans: bool = False
@@ -45,6 +46,10 @@ class SensorFault(NamedTuple):
     explains: SensorFault | None = None
     """A fault that is no longer reported where this one is."""
 
+    def describe(self, numbers: Mapping[str, Value]) -> Message:
+        """What is reported of it, with ``numbers`` of now."""
+        return message(self.id, **numbers)
+
 
 @dataclass(frozen=True)
 class DetectedFault:
@@ -53,12 +58,12 @@ class DetectedFault:
     fault: SensorFault
     at_s: float
     """Time of the fault since the first step [s]."""
-    message: str
+    message: Message
 
     @property
-    def sentence(self) -> str:
+    def sentence(self) -> Message:
         """When it began, and what it is."""
-        return f"at t = {self.at_s:.1f} s: {self.message}"
+        return self.message.at(self.at_s)
 
 
 class FaultLog:
@@ -83,11 +88,11 @@ class FaultLog:
             self._start_ns, self.start_s = step.start_ns, step.start_ns * _NS
         self.now_s = (step.end_ns - self._start_ns) * _NS
 
-    def declare(self, fault: SensorFault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+    def declare(self, fault: SensorFault, at_s: float, numbers: Mapping[str, Value]) -> None:
         """Report ``fault`` once, and inflate the covariance by how far the estimate is from the other sensors' dead reckoning."""
         if fault in self.declared or any(other.explains == fault for other in self.declared):
             return
-        self.declared[fault] = DetectedFault(fault, max(0.0, at_s), fault.message.format(**numbers))
+        self.declared[fault] = DetectedFault(fault, max(0.0, at_s), fault.describe(numbers))
         if fault.explains is not None:
             self.declared.pop(fault.explains, None)
         self.have_scans_led_away |= fault.is_of_scans
@@ -95,7 +100,7 @@ class FaultLog:
         if fault.reference is not None:
             self.inflation.add_distance_from(fault.reference)
 
-    def update(self, fault: SensorFault, at_s: float, numbers: Mapping[str, float | str]) -> None:
+    def update(self, fault: SensorFault, at_s: float, numbers: Mapping[str, Value]) -> None:
         """Report ``fault`` with the ``numbers`` of now, whether or not it was reported before."""
         self.declared.pop(fault, None)
         self.declare(fault, at_s, numbers)
@@ -118,7 +123,7 @@ class FaultLog:
         """Time at which the latest fault began; the present one without a fault [s]."""
         return max((found.at_s for found in self.found.values()), default=self.now_s)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """All so far, in sentences."""
         return [found.sentence for found in self.found.values()]
 

@@ -9,8 +9,7 @@ from localization.events import Step
 from localization.sensor_checks.faults import MEMORY_S, FaultLog, SensorFault
 
 GYRO_RATE = SensorFault(
-    "the gyro turns by {rate:.1f} rad/s against the wheels, more than slip explains. It is not used for 3 s after each time. Check"
-    " the units of the IMU's driver.",
+    "impossible_rates.against_wheels",
     reference="wheels",
 )
 _MAX_RATE_OFF_RAD_S, _MAX_RATE_OFF_SHARE = 2.0, 3.0

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from localization.events import Step
+from localization.messages import phrase
 from motion_models.se2 import FloatArray
 
 BIN_S = 0.5
@@ -114,15 +115,17 @@ class InnovationWindow(NamedTuple):
         found = [_explanation(cause, X[:, cause.regressor], weighted[:, [cause.regressor, -1]]) for cause in causes]
         best = max(found, key=operator.attrgetter("log_odds"))
         if np.allclose(X[:, [TURN, WAY]], 0.0):
-            return best._replace(regressor=SECONDS, sentence=_STANDING[pair.quantity].format(first=pair.first))
+            return best._replace(regressor=SECONDS, sentence=_describe_standing(pair))
         return best
 
 
 _END_S = operator.attrgetter("end_s")
-_STANDING = {
-    "turns": "The wheels stand: the {first}'s bias has changed, or the robot was turned by something else.",
-    "ways": "The wheels stand: objects move past the {first}, or the robot was moved by something else.",
-}
+
+
+def _describe_standing(pair: Pair) -> str:
+    if pair.quantity == "turns":
+        return phrase("sensor_pairs.standing_turns", first=pair.first)
+    return phrase("sensor_pairs.standing_ways", first=pair.first)
 
 
 def _explanation(cause: Cause, x: FloatArray, weighted: FloatArray) -> Explanation:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from localization.events import Scan
+from localization.messages import Message, message
 from motion_models.robot import Mount
 from motion_models.se2 import FloatArray
 
@@ -51,7 +52,7 @@ class LidarTilt:
         above = np.abs(points[:, 2] - mount.z)[points[:, 2] - _height(plane, points) > _THICKNESS_M]
         self._height += float(np.quantile(above, 0.9)) if len(above) else 0.0
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """Tilt and sway, where they are large."""
         n = int(self._found[0].sum())
         if n < _MIN_CLOUDS:
@@ -63,12 +64,16 @@ class LidarTilt:
         if max(tilt, sway) < _MIN_REPORTED_RAD:
             return []
         off_m = math.sin(math.hypot(tilt, 2.0 * sway)) * self._height / n
-        mend = f" Correct roll and pitch of the mount of '{self._frame}' in /tf_static or in the robot file's [mounts]."
-        return [
-            f"clouds are tilted against the ground by {math.degrees(tilt):.1f} deg (roll {math.degrees(roll):+.1f}, "
-            f"pitch {math.degrees(pitch):+.1f}), and sway by {math.degrees(sway):.1f} deg RMS on the way, but are matched as if upright: "
-            f"positions may be off by {100.0 * off_m:.0f} cm more than their covariance.{mend if tilt >= _MIN_REPORTED_RAD else ''}"
-        ]
+        found = {
+            "tilt": math.degrees(tilt),
+            "roll": math.degrees(roll),
+            "pitch": math.degrees(pitch),
+            "sway": math.degrees(sway),
+            "off_cm": 100.0 * off_m,
+        }
+        if tilt < _MIN_REPORTED_RAD:
+            return [message("cloud_tilt.swaying", **found)]
+        return [message("cloud_tilt.mount", frame=self._frame, **found)]
 
 
 def fit_ground(points: FloatArray) -> FloatArray | None:

@@ -12,8 +12,7 @@ from localization.sensor_checks.turn_votes import LIDAR_OPPOSITE, WHEELS_OPPOSIT
 from localization.sensor_checks.window import BIN_S
 
 MOVING_OBJECTS = SensorFault(
-    "moving objects in up to {percent:.0f} % of the beams, for {seconds:.0f} s in all. Only beams on surfaces that agree with the motion by"
-    " the wheels are matched meanwhile. Without people and vehicles about the robot, check the wheels' radius and what covers the LiDAR."
+    "moving_objects.in_scans",
 )
 _EXPLAINING = (LIDAR_OWN_BODY, LIDAR_OWN_PARTS, LIDAR_DIRECTION, LIDAR_OPPOSITE, WHEELS_OPPOSITE, WHEELS_STANDING)
 """Named faults of which parts of a scan, or the wheels, move otherwise."""
@@ -35,7 +34,7 @@ class MovingReport:
         self._begin_s = now_s if math.isnan(self._begin_s) else self._begin_s
         self._seconds += min(now_s - self._last_s, BIN_S)
         self.scans, self._last_s, self._largest = self.scans + 1, now_s, max(self._largest, share)
-        message = MOVING_OBJECTS.message.format(percent=100.0 * self._largest, seconds=self._seconds)
+        message = MOVING_OBJECTS.describe({"percent": 100.0 * self._largest, "seconds": self._seconds})
         self._faults.revise(DetectedFault(MOVING_OBJECTS, self._begin_s, message))
 
     def is_explained(self) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 
 from localization.events import Scan, Step
 from localization.lidar import LidarConfig
+from localization.messages import phrase
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.scan_motion import align_from, profile_of
 from localization.trajectory import BoolArray
@@ -21,9 +22,7 @@ from motion_models.robot import Mount
 from motion_models.se2 import FloatArray, Tangent2, Triple
 
 LIDAR_OWN_BODY = SensorFault(
-    "{percent:.0f} % of the LiDAR's points are the robot itself: {sectors} of the LiDAR they have the same ranges, up to {range_m:.2f} m,"
-    " while it drives. They are left out from then on. Remove what covers the LiDAR, or filter these beams in its driver (laser_filters),"
-    " or leave out all that is so near by config.estimator.lidar.min_range_m: {least_m:.2f} (from the wheelbase's centre).",
+    "own_body.in_scans",
     reference="wheels and gyro",
     is_of_scans=True,
     draws_map=True,
@@ -190,7 +189,8 @@ def _sectors(is_own: BoolArray) -> str:
         parts[0] = np.concatenate([parts.pop() - _BEARINGS, parts[0]])
     widest = sorted(sorted(parts, key=lambda part: part[0] - part[-1])[:3], key=lambda part: part[0])
     degrees = [[(int(b) + 180) % 360 - 180 for b in (part[0], part[-1])] for part in widest]
-    return "at bearings of " + ", ".join(f"{first} to {last + 1} deg" for first, last in degrees)
+    found = [phrase("own_body.sector", first=first, last=last + 1) for first, last in degrees]
+    return phrase("own_body.bearings", sectors=", ".join(found))
 
 
 @subroutine

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from localization.messages import phrase
 from localization.sensor_checks.clocks import CLOCKS_APART
 from localization.sensor_checks.contradictions import GYRO_STUCK, LIDAR_DIRECTION
 from localization.sensor_checks.faults import SensorFault
@@ -35,51 +36,34 @@ _OTHER = {"left": "right", "right": "left"}
 
 
 def _describe_bias(rate: float) -> str:
-    return f"A change of the gyro's bias by {math.degrees(rate):+.1f} deg/s explains it best."
+    return phrase("sensor_pairs.gyro_bias", degrees=math.degrees(rate))
 
 
 def _describe_turn_factor(change: float) -> str:
-    return (
-        f"A factor of {1.0 + change:.2f} on the wheels' turns explains it best: a floor that is more or less slippery, encoders that lose"
-        " counts, or the gyro's scale."
-    )
+    return phrase("sensor_pairs.turn_factor", factor=1.0 + change)
 
 
 def _describe_side(change: float) -> str:
     side = "left" if change < 0.0 else "right"
-    return f"Encoders that lose counts, or a smaller radius, of the {side} wheels explain it best, or the {_OTHER[side]} ones spin."
+    return phrase("sensor_pairs.side", side=side, other=_OTHER[side])
 
 
 def _describe_gyro_scale(change: float) -> str:
-    return f"A factor of {1.0 + change:.2f} on the gyro's turns explains it best: its scale, its range, or the tilt of its mount."
-
-
-def _describe_gyro_bias(rate: float) -> str:
-    return f"A change of the gyro's bias by {math.degrees(-rate):+.1f} deg/s explains it best."
+    return phrase("sensor_pairs.gyro_scale", factor=1.0 + change)
 
 
 def _describe_stamps(shift: float) -> str:
-    direction = "late" if shift < 0.0 else "early"
-    return (
-        f"LiDAR stamps that are {abs(shift):.3f} s too {direction} explain it best: a stamp is that of the first beam, and time_increment"
-        " has the sign of the sweep. Correct the LiDAR's driver, or its clock."
-    )
+    seconds = abs(shift)
+    return phrase("sensor_pairs.stamps_late", seconds=seconds) if shift < 0.0 else phrase("sensor_pairs.stamps_early", seconds=seconds)
 
 
 def _describe_way_factor(change: float) -> str:
-    if change < -1.0:
-        return (
-            f"A factor of {1.0 + change:.2f} on the wheels' ways explains it best: encoders, or a driver, that count the same forwards and"
-            " backwards."
-        )
-    return (
-        f"A factor of {1.0 + change:.2f} on the wheels' ways explains it best: wheels that spin, encoders that lose counts, or another"
-        " radius."
-    )
+    factor = 1.0 + change
+    return phrase("sensor_pairs.reversing_ways", factor=factor) if factor < 0.0 else phrase("sensor_pairs.way_factor", factor=factor)
 
 
 def _describe_moving(speed: float) -> str:
-    return f"Objects that move along at {abs(speed):.1f} m/s explain it best, or a robot that is pushed."
+    return phrase("sensor_pairs.moving", speed=abs(speed))
 
 
 GYRO_WHEELS = Pair("gyro", "wheels", "turns", _FLOOR_RAD)
@@ -106,7 +90,7 @@ CAUSES: Mapping[Pair, Causes] = {
     ),
     LIDAR_GYRO: (
         Cause(TURN_CHANGE, 0.1, _describe_stamps),
-        Cause(SECONDS, 0.1, _describe_gyro_bias),
+        Cause(SECONDS, 0.1, lambda rate: _describe_bias(-rate)),
         Cause(TURN, 0.2, _describe_gyro_scale),
     ),
     LIDAR_WHEELS_TURNS: (Cause(TURN, 0.5, _describe_turn_factor), Cause(WAY, 0.5, _describe_side)),

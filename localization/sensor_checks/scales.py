@@ -15,14 +15,13 @@ import math
 from dataclasses import replace
 
 from localization.estimators import LearnedParameter
+from localization.messages import Value
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault
 from localization.sensor_checks.innovations import SLIP_S
 from localization.sensor_checks.pairs import LIDAR_WHEELS_WAYS, NAMED, WAY_SLIP
 
 SCALES_APART = SensorFault(
-    "ways by the LiDAR are {percent:.0f} % {longer} than those by the wheels with this robot file's radius: its ranges are that much too"
-    " {long}, or the wheels that much {larger}, and no third sensor shows which. The covariance has the difference from the start on."
-    " Compare a range with a tape measure, and correct the LiDAR's driver or geometry.wheel_radius_m."
+    "lidar_scale.apart",
 )
 RADIUS = "wheel_radius_scale"
 _MIN_PRIOR_SIGMAS, _MIN_SIGMAS, _MIN_REPORTED_SIGMAS = 2.0, 2.0, 4.0
@@ -61,9 +60,9 @@ class ScaleCheck:
         if is_off and scale > _MIN_REPORTED_SIGMAS * math.hypot(sigma, slip) and round(scale, 2) != self._reported:
             self._reported = round(scale, 2)
             words = ("longer", "long", "larger") if off > 0.0 else ("shorter", "short", "smaller")
-            numbers = dict(zip(("longer", "long", "larger"), words, strict=True))
-            message = SCALES_APART.message.format(percent=100.0 * scale, **numbers)
-            self._faults.revise(DetectedFault(SCALES_APART, 0.0, message))
+            numbers: dict[str, Value] = dict(zip(("longer", "long", "larger"), words, strict=True))
+            found = SCALES_APART.describe({"percent": 100.0 * scale, **numbers})
+            self._faults.revise(DetectedFault(SCALES_APART, 0.0, found))
 
 
 def _error_of_ranges(off: float, radius: LearnedParameter) -> float:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from localization.estimators import LearnedParameter, Residuals
 from localization.events import Step
+from localization.messages import Message, Value, message, phrase
 from localization.sensor_checks.faults import DetectedFault, FaultLog, SensorFault, is_certain
 from localization.sensor_checks.innovations import (
     NO_REGRESSORS,
@@ -36,29 +37,14 @@ from localization.sensor_checks.scales import RADIUS, ScaleCheck
 from motion_models.se2 import FloatArray
 
 DIFFERENCES: Mapping[Pair, SensorFault] = {
-    pair: SensorFault(
-        f"the {pair.quantity} by the {pair.first} and those by the {pair.second} differ by more than both"
-        " sensors' noise ({sigmas:.1f} sigma: {difference} in {window:.0f} s). {cause} {use}"
-    )
-    for pair in NAMED
+    GYRO_WHEELS: SensorFault("sensor_pairs.gyro_and_wheels"),
+    LIDAR_GYRO: SensorFault("sensor_pairs.lidar_and_gyro"),
+    LIDAR_WHEELS_TURNS: SensorFault("sensor_pairs.turns_of_lidar_and_wheels"),
+    LIDAR_WHEELS_WAYS: SensorFault("sensor_pairs.ways_of_lidar_and_wheels"),
 }
 """What is reported of each pair that differs."""
 PARAMETER_FAR = SensorFault(
-    "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, {sigmas:.0f} sigma from this robot's file ({file:.3g}). Another floor or"
-    " load, {cause}. {use} Fit the file with `skidloc calibrate`.",
-)
-_INFLATION = "From t = {at_s:.1f} s on the covariance has the distance from the dead reckoning by the robot file: {what}."
-_BY_PAIR = (
-    "{quantity} by the {first} and those by the {second} differ by {difference} in {seconds:.0f} s, as on some floors, and no scan shows"
-    " which are right"
-)
-_BY_PARAMETER = (
-    "{name} of {owner} is learned as {value:.3g} +- {sigma:.2g}, where the file has {file:.3g}, and no scan shows whether another floor or"
-    " load does that, or a gyro or encoders of another scale"
-)
-_TURNING_CAUSE = (
-    "a wrong scale of the gyro, encoders that lose counts, or a driver's odometry with another track or wheel_separation_multiplier than in"
-    " [driver]"
+    "sensor_pairs.learned",
 )
 _NAMED_WITHIN_S = 10.0
 """A named fault is found at most so long after a pair begins to differ."""
@@ -78,12 +64,6 @@ _MAX_CLIPPED_SIGMAS = 3.0
 """Largest sum of innovations over a window, in sigmas, where the gyro's rates end at a value."""
 _REPEATED_RAD_S, _MIN_REPEATED_S, _MIN_CLIPPED_RAD_S = 1e-9, 0.5, 0.05
 """Rates that are equal to the last digit, for so long, and far from zero, are the end of the gyro's range."""
-_PLAIN_MODEL = (
-    " The model is {model} with a wheel_separation_multiplier of 1: where wheels slide as the robot turns, that is the factor, and `skidloc"
-    " calibrate` fits it."
-)
-_USE_WITHOUT_SCANS = "The covariance has the distance between both while that lasts."
-_USE_WITH_SCANS = "The scans decide."
 
 
 class _Episode(NamedTuple):
@@ -124,10 +104,10 @@ class SensorConsistency:
         self._reported: dict[SensorFault, _Reported] = {}
         self._inflation_reasons: dict[SensorFault, tuple[float, str]] = {}
 
-    def inflation_reasons(self) -> list[str]:
+    def inflation_reasons(self) -> list[Message]:
         """Why the covariance has more than the sensors' noise, though no fault is probable enough to be reported."""
         reasons = [(at_s, what) for fault, (at_s, what) in self._inflation_reasons.items() if fault not in self._faults.found]
-        return [_INFLATION.format(at_s=max(at_s, 0.0), what=what) for at_s, what in reasons]
+        return [message("sensor_pairs.widened", at_s=max(at_s, 0.0), what=what) for at_s, what in reasons]
 
     def add(self, step: Step, residuals: Residuals, learned: Callable[[], Sequence[LearnedParameter]]) -> None:
         """Take the ``residuals`` of ``step``; compare each pair once for each bin."""
@@ -187,7 +167,7 @@ class SensorConsistency:
         regressor, cause = best.regressor, best.sentence
         if regressor == TURN:
             unset = [p for p in learned() if p.name == _MULTIPLIER and p.file_value == 1.0 < p.value]
-            cause += "".join(_PLAIN_MODEL.format(model=p.owner) for p in unset)
+            cause += "".join(phrase("sensor_pairs.plain_model", model=p.owner) for p in unset)
         if is_clipped:
             regressor, cause = TURN, self._clipping.describe()
         is_by_lidar = regressor == TURN_CHANGE
@@ -195,12 +175,12 @@ class SensorConsistency:
         begin_s, poses = (worst.bins[1].end_s, worst.bins[1].poses) if before is None else (before.begin_s, before.poses)
         row = FILE_GYRO if pair == LIDAR_GYRO else FILE
         episode = self._episodes[fault] = _Episode(begin_s, poses, row, is_by_lidar)
-        unit = f"{math.degrees(worst.innovation):+.0f} deg" if pair.quantity == "turns" else f"{worst.innovation:+.2f} m"
-        numbers: dict[str, float | str] = {"difference": unit, "window": worst.seconds, "cause": cause}
+        difference = math.degrees(worst.innovation) if pair.quantity == "turns" else worst.innovation
+        numbers: dict[str, Value] = {"difference": difference, "window": worst.seconds, "cause": cause}
         if is_clipped or is_certain(best.log_odds):  # what floors do as well is no fault of a sensor
             self._report(fault, episode, worst.sigmas if is_clipped else best.sigmas, numbers)
         elif self._is_inflating(episode):
-            self._inflation_reasons[fault] = begin_s, _BY_PAIR.format(**pair._asdict(), difference=unit, seconds=worst.seconds)
+            self._inflation_reasons[fault] = begin_s, _describe_difference(pair, difference, worst.seconds)
 
     def _compare_parameters(self, learned: Sequence[LearnedParameter]) -> None:
         """Report the learned parameter that is farthest from the robot file, where it is too far; the radius has its own check."""
@@ -214,14 +194,13 @@ class SensorConsistency:
         bins = next(window.bins for window in self._windows.values() if window.bins)
         episode = self._episodes.setdefault(PARAMETER_FAR, _Episode(bins[0].end_s, bins[0].poses, FILE))
         off = max(outside, key=self._evidence)
-        numbers: dict[str, float | str] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
+        numbers: dict[str, Value] = {"name": off.name, "owner": off.owner, "value": off.value, "sigma": off.sigma}
         ahead_m = off.value - off.file_value
-        far = f"or a LiDAR that is over {abs(ahead_m):.2f} m {'behind' if ahead_m > 0.0 else 'ahead of'} where its mount has it"
-        numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": far if off.name.startswith(_CENTER_X) else _TURNING_CAUSE}
+        numbers |= {"file": round(off.file_value, 6) + 0.0, "cause": _describe_cause(off)}
         if is_certain(self._evidence(off)):
             self._report(PARAMETER_FAR, episode, abs(ahead_m) / off.sigma, numbers)
         elif self._is_inflating(episode):
-            self._inflation_reasons[PARAMETER_FAR] = episode.begin_s, _BY_PARAMETER.format(**numbers)
+            self._inflation_reasons[PARAMETER_FAR] = episode.begin_s, phrase("sensor_pairs.learned_otherwise", **numbers)
 
     def _evidence(self, p: LearnedParameter) -> float:
         """Logarithm of the evidence that something is wrong with ``p``, over that for a healthy robot: Bayes factor of two normal
@@ -247,16 +226,17 @@ class SensorConsistency:
             self._reported.pop(fault, None)
         return True
 
-    def _report(self, fault: SensorFault, episode: _Episode, sigmas: float, numbers: Mapping[str, float | str]) -> None:
+    def _report(self, fault: SensorFault, episode: _Episode, sigmas: float, numbers: Mapping[str, Value]) -> None:
         """Report the begin of the first episode, and the numbers of the worst moment."""
         before = self._reported.get(fault)
         if before is not None and sigmas < before.sigmas:
             return
         begin_s = episode.begin_s if before is None else before.begin_s
         self._reported[fault] = _Reported(begin_s, sigmas)
-        use = _USE_WITHOUT_SCANS if self._is_inflating(episode) else _USE_WITH_SCANS
-        message = fault.message.format(sigmas=sigmas, use=use, **numbers)
-        self._faults.revise(DetectedFault(fault, begin_s, message))
+        is_wide = self._is_inflating(episode)
+        use = phrase("sensor_pairs.without_scans") if is_wide else phrase("sensor_pairs.with_scans")
+        found = fault.describe({"sigmas": sigmas, "use": use, **numbers})
+        self._faults.revise(DetectedFault(fault, begin_s, found))
 
     def _end(self, fault: SensorFault) -> None:
         """The sensors agree again: what the pose is off by stays."""
@@ -276,6 +256,23 @@ def _innovations(step: Step, residuals: Residuals) -> Sequence[tuple[Pair, tuple
     if step.turn is None:
         return (LIDAR_WHEELS_TURNS, residuals.scan_turn if step.has_wheels else None), ways
     return (GYRO_WHEELS, residuals.turn if step.has_wheels else None), (LIDAR_GYRO, residuals.scan_turn), ways
+
+
+def _describe_difference(pair: Pair, difference: float, seconds: float) -> str:
+    """That ``pair`` differs as it does on some floors, as part of a sentence."""
+    if pair.quantity == "turns":
+        return phrase("sensor_pairs.turns_as_on_floors", first=pair.first, second=pair.second, difference=difference, seconds=seconds)
+    return phrase("sensor_pairs.ways_as_on_floors", first=pair.first, second=pair.second, difference=difference, seconds=seconds)
+
+
+def _describe_cause(learned: LearnedParameter) -> str:
+    """What may be the reason why ``learned`` is far from the robot file, as part of a sentence."""
+    if not learned.name.startswith(_CENTER_X):
+        return phrase("sensor_pairs.turning_cause")
+    ahead_m = learned.value - learned.file_value
+    if ahead_m > 0.0:
+        return phrase("sensor_pairs.center_behind", distance_m=ahead_m)
+    return phrase("sensor_pairs.center_ahead", distance_m=-ahead_m)
 
 
 def _is_outside_prior(p: LearnedParameter) -> bool:
@@ -304,4 +301,4 @@ class _Clipping:
 
     def describe(self) -> str:
         """The fault in a sentence."""
-        return f"The gyro's rates end at {math.degrees(self._largest):.3g} deg/s, its range: set a larger one, or turn more slowly."
+        return phrase("sensor_pairs.clipped", degrees=math.degrees(self._largest))

@@ -5,24 +5,24 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from localization.events import ImuSample, Step
 from localization.inputs.step_config import StepConfig
 from localization.inputs.wheel_gaps import UnknownVelocity
+from localization.messages import phrase
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.window import Bins, Window
 from motion_models.se2 import FloatArray
 
+Motion = Literal["", "lidar_moved", "imu_shakes"]
+"""Sensor that shows that the robot drives; empty where none does."""
 WHEELS_STANDING = SensorFault(
-    "the wheels read zero while {others}. They count as unknown there. Check the encoders, the driver of the wheels and the"
-    " joints' names in the robot file's [joints].{besides}"
+    "standing_wheels.while_moving",
 )
 
-_OR_OBJECTS = " The other explanation is objects that move in the scans around a standing robot: no gyro or IMU decides."
-
-_LIDAR_MOVED = "the LiDAR moved"
 _RECENT_BINS, _MIN_LIDAR_S = 8, 1.0
 """Bins in which the LiDAR's speed is measured while the wheels read zero, and the least time in them [s]."""
 _STANDING_SPEED_M_S = 0.1
@@ -96,8 +96,9 @@ class Standstill:
         moving = self._moving()
         contradicted_s = stop.stood_s if moving else stop.turned_s
         if moving or stop.turned_s >= _MIN_TURNING_S:
-            besides = _OR_OBJECTS if moving == _LIDAR_MOVED and not stop.is_confirmed else ""
-            numbers = {"others": moving or "the gyro turned", "besides": besides}
+            is_unsure = moving == "lidar_moved" and not stop.is_confirmed
+            besides = phrase("standing_wheels.or_objects") if is_unsure else ""
+            numbers = {"others": _describe_motion(moving), "besides": besides}
             self._faults.declare(WHEELS_STANDING, self._faults.now_s - contradicted_s, numbers)
             self._is_dead |= not self._have_turned and (stop.is_confirmed or stop.turned_s >= _MIN_TURNING_S)
         if not contradicted_s and not self._is_dead:
@@ -120,7 +121,7 @@ class Standstill:
         has_imu = any(detector.has_noise and not detector.lasted_s for detector in self._shaking.values())
         return step.is_standing and step.has_wheels and step.turn is not None and not _is_turning(step) and has_imu
 
-    def _moving(self) -> str:
+    def _moving(self) -> Motion:
         """What shows that the robot drives; "" where nothing does."""
         recent = self._window.bins
         is_compared = (recent.is_standing > 0.0) & np.isfinite(recent.lidar[:, 0])
@@ -132,9 +133,16 @@ class Standstill:
             rates = bins.gyro / bins.durations_s
             self._stop.is_confirmed |= is_shaking or _has_turned(rates)
             has_second = _is_working(rates) or any(detector.has_noise for detector in self._shaking.values())
-            return _LIDAR_MOVED if self._stop.is_confirmed or not has_second else ""
+            return "lidar_moved" if self._stop.is_confirmed or not has_second else ""
         is_alone = not len(bins.rows) and any(detector.is_unusual for detector in shaking)
-        return "the IMU shakes as if it moved" if is_alone else ""
+        return "imu_shakes" if is_alone else ""
+
+
+def _describe_motion(moving: Motion) -> str:
+    """What ``moving`` is, as part of the sentence."""
+    if moving == "lidar_moved":
+        return phrase("standing_wheels.lidar_moved")
+    return phrase("standing_wheels.imu_shakes") if moving else phrase("standing_wheels.gyro_turned")
 
 
 def _is_turning(step: Step) -> bool:

@@ -13,28 +13,25 @@ from dataclasses import replace
 import numpy as np
 
 from localization.events import Scan
+from localization.messages import Value, phrase
 from localization.sensor_checks.faults import FaultLog, SensorFault
 from localization.sensor_checks.scan_motion import Profile
 from localization.sensor_checks.sweep_distortion import TimedProfile, WeightedMean, fit_factor, times_by_bearing, times_derivative
 from localization.sensor_checks.window import Window
 
 REVERSED_TIMES = SensorFault(
-    "as the robot turns, scans are distorted as if their points were measured in the opposite order ({sigmas:.1f} sigma): the sweep goes"
-    " the other way than time_increment, or the points' times, have it. From now on they are reversed; correct the LiDAR's driver.",
+    "sweep_times.reversed",
     reference="wheels and gyro",
     draws_map=True,
 )
 
 NO_SWEEP = SensorFault(
-    "as the robot turns, scans are not distorted as if their points were measured one after the other ({factor:+.2f} +- {sigma:.2f} times"
-    " what their times have): the beams are measured at once, or a driver has deskewed them. From now on these times are left out; let the"
-    " driver publish a time_increment of 0, or clouds without times.",
+    "sweep_times.no_sweep",
     reference="wheels and gyro",
 )
 
 OTHER_UNIT = SensorFault(
-    "as the robot turns, scans are distorted {factor:+.1f} +- {sigma:.1f} times as much as the times of their points have it: these have"
-    " another unit{way}. From now on they are {used:g} times what they were; correct the LiDAR's driver.",
+    "sweep_times.other_unit",
     reference="wheels and gyro",
     draws_map=True,
 )
@@ -119,8 +116,8 @@ class SweepTimes:
         elif self._is_decided and is_large:
             decades = math.log10(abs(factor))
             self.unit = 10.0 ** round(decades) if abs(decades - round(decades)) < _SAME_DECADE else abs(factor)
-            way = ", and the sweep goes the other way" if self.is_reversed else ""
-            numbers: dict[str, float | str] = {"factor": factor, "sigma": sigma, "way": way, "used": math.copysign(self.unit, factor)}
+            way = phrase("sweep_times.other_way") if self.is_reversed else ""
+            numbers: dict[str, Value] = {"factor": factor, "sigma": sigma, "way": way, "used": math.copysign(self.unit, factor)}
             self._faults.declare(OTHER_UNIT, self._faults.now_s, numbers)
         elif self.is_reversed:
             self._faults.declare(REVERSED_TIMES, self._faults.now_s, {"sigmas": -sigmas})

@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from localization.messages import Value, phrase
 from localization.sensor_checks.faults import CERTAIN, FaultLog, SensorFault
 from localization.sensor_checks.gyro_rate import GYRO_RATE
 from localization.sensor_checks.innovations import TURN, WAY
@@ -28,26 +29,23 @@ from motion_models.se2 import FloatArray
 Sensor = Literal["wheels", "gyro", "LiDAR"]
 
 GYRO_OPPOSITE = SensorFault(
-    "the gyro turns opposite to {others}. It is not used while that lasts. Correct the IMU's mount, or its driver's sign{or_wheels}.",
+    "opposite_turns.gyro",
     reference="wheels",
 )
 GYRO_UNIT = SensorFault(
-    "the gyro's rates are {ratio:.2g} times those of {others} (deg/s?). It is not used while that lasts. Let its driver publish rad/s.",
+    "opposite_turns.gyro_unit",
     reference="wheels",
     explains=GYRO_RATE,
 )
 WHEELS_OPPOSITE = SensorFault(
-    "the wheels turn opposite to {others}. They are not used while that lasts. Swap left and right in the robot file's [joints].",
+    "opposite_turns.wheels",
     reference="wheels and gyro",
 )
 LIDAR_OPPOSITE = SensorFault(
-    "the LiDAR turns opposite to {others}. Its scans are not used while that lasts. It is mounted upside down, or left and right wheels"
-    " are swapped: correct the roll of its frame in /tf_static or in the robot file's [mounts], or the robot file's [joints].",
+    "opposite_turns.lidar",
     reference="wheels and gyro",
     is_of_scans=True,
 )
-_OR_WHEELS = ", or, as nothing else measures turns, the robot file's [joints]: left and right may be swapped, or all wheels count backwards"
-
 _SENSORS: tuple[Sensor, ...] = "wheels", "gyro", "LiDAR"
 _WHEELS, _GYRO = 0, 1
 _COLUMNS = [3, 4, 7]
@@ -158,15 +156,15 @@ class _Votes:
         """That one of ``sensors`` has a fault."""
         return float(self._posterior[_IS_NAMED & np.isin(_SENSOR_OF_ROW, sensors)].sum())
 
-    def numbers(self) -> dict[str, float | str]:
+    def numbers(self) -> dict[str, Value]:
         """Numbers of the message of the most probable fault."""
         others = [k for k in range(len(_SENSORS)) if self._has_measured[k] and _SENSORS[k] != self.best.sensor]
         are_outvoting = len(others) > 1 and self._probability_of(others) < 1.0 - CERTAIN
         a, b = self._z[:, [others[-1], _SENSORS.index(self.best.sensor)]].T
-        both = np.isfinite(a + b)
+        both, one = np.isfinite(a + b), phrase("opposite_turns.one", sensor=_SENSORS[others[0]])
         return {
-            "others": " and ".join(_SENSORS[k] for k in others) if are_outvoting else f"the {_SENSORS[others[0]]}",
-            "or_wheels": "" if are_outvoting else _OR_WHEELS,
+            "others": " and ".join(_SENSORS[k] for k in others) if are_outvoting else one,
+            "or_wheels": "" if are_outvoting else phrase("opposite_turns.or_wheels"),
             "ratio": float(np.linalg.norm(b[both]) / np.linalg.norm(a[both])),
         }
 

@@ -29,7 +29,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -230,8 +230,22 @@ def read_windows(path: str | Path) -> list[Maneuver]:
     return [_maneuver(list(of), columns, path) for _, of in itertools.groupby(rows, key=lambda row: row[1]["window"])]
 
 
-def without_foreign_frames(maneuvers: Sequence[Maneuver], wheel_radius_m: float) -> tuple[list[Maneuver], list[str]]:
-    """``maneuvers`` without those whose positions are in another frame than that of the body at their start; and notes for the user.
+class ForeignWindows(NamedTuple):
+    """Windows whose positions are in another frame than that of the body at their start."""
+
+    kind: Literal["far", "turned"]
+    """Farther off than the wheels rolled, or off their direction."""
+    left_out: int
+    compared: int
+    """Windows that could be."""
+    largest: float
+    """Distance [m], or angle [rad]."""
+    groups: str
+    """Names of their groups."""
+
+
+def without_foreign_frames(maneuvers: Sequence[Maneuver], wheel_radius_m: float) -> tuple[list[Maneuver], list[ForeignWindows]]:
+    """``maneuvers`` without those whose positions are in another frame than that of the body at their start; and what was left out.
 
     A position must lie where the wheels drove. Where its frame is turned (world frame, mean of wrapped headings, sensor's axes), it lies
     elsewhere, while the distance is right; where its frame begins elsewhere (at the drive's start), it lies farther off than the wheels
@@ -243,22 +257,22 @@ def without_foreign_frames(maneuvers: Sequence[Maneuver], wheel_radius_m: float)
     is_far = excess > 0.0  # false for NaN
     is_turned = ~is_far & (np.abs(off) > _MAX_TURN_RAD + _PER_TURN * turn)
     rule = "x_m and y_m must be in the frame of the body at the start of the window, x ahead and y to the left"
-    notes = []
-    for is_foreign, compared, where in (
-        (is_far, int(np.isfinite(excess).sum()), f"up to {np.max(distance[is_far], initial=0.0):.1f} m from the start of their windows, "
-         "farther than their wheels rolled"),
-        (is_turned, int(np.isfinite(off).sum()), "off the direction of their wheels, by up to "
-         f"{np.degrees(np.max(np.abs(off[is_turned]), initial=0.0)):.0f} deg"),
-    ):  # fmt: skip
+    found = []
+    kinds: tuple[tuple[Literal["far", "turned"], NDArray[np.bool_], int, FloatArray], ...] = (
+        ("far", is_far, int(np.isfinite(excess).sum()), distance),
+        ("turned", is_turned, int(np.isfinite(off).sum()), np.abs(off)),
+    )
+    for kind, is_foreign, compared, sizes in kinds:
         n = int(is_foreign.sum())
         if n == 0:
             continue
-        text = f"the measured positions of {n} of {compared} windows lie {where}"
         if compared >= _MIN_COMPARED and n > _MAX_TURNED_SHARE * compared:
-            raise CalibrationError(f"{text}: {rule}.")
+            far = "from the start of their windows, farther than their wheels rolled"
+            where = far if kind == "far" else "off the direction of their wheels"
+            raise CalibrationError(f"the measured positions of {n} of {compared} windows lie {where}: {rule}.")
         groups = ", ".join(dict.fromkeys(m.group for m, foreign in zip(maneuvers, is_foreign, strict=True) if foreign))
-        notes.append(f"{text}, and were left out ({groups}): {rule}.")
-    return [m for m, foreign in zip(maneuvers, is_far | is_turned, strict=True) if not foreign], notes
+        found.append(ForeignWindows(kind, n, compared, float(sizes[is_foreign].max()), groups))
+    return [m for m, foreign in zip(maneuvers, is_far | is_turned, strict=True) if not foreign], found
 
 
 def _excess(maneuver: Maneuver, wheel_radius_m: float) -> tuple[float, float]:

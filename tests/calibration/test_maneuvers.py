@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from localization.calibration.windows import describe_foreign
 from motion_models import se2
 from motion_models.calibration.maneuvers import Maneuver, without_foreign_frames
 from motion_models.errors import CalibrationError
@@ -29,7 +30,7 @@ def test_turned_frames_of_the_drive_husky_are_found() -> None:
     turn = np.abs(se2.wrap_angle(drive_husky.frame_turn(drive_husky.columns())))
     assert len(left_out) == 5
     assert left_out <= set(np.flatnonzero(turn > 1.0))
-    assert "5 of 431 windows lie off the direction of their wheels" in note
+    assert (note.kind, note.left_out, note.compared) == ("turned", 5, 431)
 
 
 def test_turned_frames_of_corrected_windows_are_none() -> None:
@@ -51,6 +52,7 @@ def test_positions_from_the_start_of_the_drive_are_named_with_their_distance() -
     moved = [dataclasses.replace(m, measured=m.measured + np.array([8.0, 0.0, 0.0])) for m in windows]
     kept, (note,) = without_foreign_frames([*moved[:3], *windows[3:]], RADIUS_M)
     assert len(kept) == len(windows) - 3
-    assert "3 of 603 windows lie up to" in note
+    assert (note.kind, note.left_out, note.compared) == ("far", 3, 603)
+    assert describe_foreign([note])[0].startswith("the measured positions of 3 of 603 windows lie up to 9.")
     with pytest.raises(CalibrationError, match="from the start of their windows, farther than their wheels rolled"):
         without_foreign_frames(moved, RADIUS_M)

@@ -449,7 +449,7 @@ def standing_log(tmp_path: Path) -> Path:
 def test_calibrate_without_motion_names_what_to_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     message = refused(capsys, standing_log(tmp_path), "--robot", "vaultbot")
     assert "no motion to calibrate on" in message
-    assert "4 standing still" in message
+    assert "left out: 4 standing" in message
     assert "turning in place to each side" in message
 
 

@@ -32,7 +32,8 @@ def test_insert_of_scan_before_the_last_step_counts_it_as_late():
     for stamp_ms in (99, 100, 101):
         queue.insert(scan(stamp_ms), used_until_ns=100 * MS)
     assert waiting_ms(queue) == [100, 101]
-    assert queue.faulty.warnings() == ["1 scan came after later ones and could not be used."]
+    assert [found.id for found in queue.faulty.warnings()] == ["scans.late"]
+    assert queue.faulty.warnings()[0].startswith("1 scan came after later ones and could not be used. ")
 
 
 def test_insert_of_scan_in_unknown_frame_after_a_known_one_leaves_it_out():

@@ -42,8 +42,10 @@ def test_losses_of_scans_have_share_and_longest_gap() -> None:
     assert losses.share == pytest.approx(4.0 / 8.0)
     assert (losses.longest_s, losses.since_s, losses.ongoing_s) == (2.0, 6.0, 2.0)
     assert losses.causes == {"lost": 3, "stale": 1}
-    assert losses.describe().startswith("LiDAR lost for 50 % of the drive, longest 2 s at t = 6 s (4 of 9 scans: 3 fitted the map nowhere")
-    assert losses.describe().endswith(losses.advice)
+    assert losses.warnings()[0].startswith(
+        "LiDAR lost for 50 % of the drive, longest 2 s at t = 6 s (4 of 9 scans: 3 fitted the map nowhere"
+    )
+    assert losses.warnings()[0].endswith(losses.advice)
 
 
 def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
@@ -54,7 +56,7 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
     losses = LidarLosses.of(lost)
     assert (losses.scans, losses.matched, losses.ongoing_s) == (10, 10, 6.0)
     assert losses.is_long
-    assert losses.describe() == (
+    assert losses.warnings()[0] == (
         "LiDAR lost for 40 % of the drive, longest 6 s at t = 9 s (no scans came for a second or more). "
         "The pose is by the other sensors there. Check the LiDAR's driver, cable and topic."
     )
@@ -64,7 +66,7 @@ def test_losses_of_a_lidar_that_dies_are_described_and_long() -> None:
 def test_losses_of_scans_left_out_are_no_silence() -> None:
     losses = LidarLosses.of(counted("mmmmxxxxxxmm"))
     assert (losses.scans, losses.matched, losses.silences) == (12, 6, 0)
-    assert "6 of 12 scans: 6 were left out by a check" in losses.describe()
+    assert "6 of 12 scans: 6 were left out by a check" in losses.warnings()[0]
     assert losses.advice == "See the warning about the LiDAR above."
 
 
@@ -79,7 +81,7 @@ def test_advice_is_about_the_most_frequent_cause(causes: dict[str, int], words: 
 
 def test_describe_without_lost_scans_is_empty() -> None:
     losses = LidarLosses.of(counted("mmmm"))
-    assert losses.describe() == losses.advice == ""
+    assert (losses.warnings(), losses.advice) == ([], "")
     assert not losses.is_long
 
 

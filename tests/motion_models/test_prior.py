@@ -8,12 +8,13 @@ import math
 import numpy as np
 import pytest
 
+from localization.calibration.robot_notes import robot_notes
 from motion_models.calibration.fit import FitConfig
 from motion_models.calibration.plan import calibrate, free_of
 from motion_models.calibration.regressions import read_rotation_table, rotations_as_maneuvers
 from motion_models.friction.model import FrictionModel
 from motion_models.online_calibration import make_corrections
-from motion_models.prior import EVIDENCE, geometric_scaling, prior_notes, scaling_sigma, skid_prior, slip_at_speed
+from motion_models.prior import EVIDENCE, geometric_scaling, scaling_sigma, skid_prior, slip_at_speed
 from motion_models.registry import advice, make_model, recommended_model, usual_models
 from motion_models.robot import Driver, Geometry, Robot
 from motion_models.robot_file import load_robot, parse_robot
@@ -100,11 +101,11 @@ def test_corrections_of_slip_at_speed_have_centripetal_size() -> None:
 
 
 def test_prior_notes_show_k_and_sigma_only_without_a_calibration() -> None:
-    (note,) = prior_notes(parse_robot(BARE, "bare.toml"))
+    (note,) = robot_notes(parse_robot(BARE, "bare.toml"))
     assert "k = 0.66 +- 0.07 from geometry" in note
     assert "skidloc calibrate" in note
-    assert prior_notes(load_robot("vaultbot")) == []
-    assert prior_notes(parse_robot(BARE, "bare.toml"), ["diff_drive"]) == []
+    assert robot_notes(load_robot("vaultbot")) == []
+    assert robot_notes(parse_robot(BARE, "bare.toml"), ["diff_drive"]) == []
 
 
 def test_skid_prior_of_driven_wheels_and_a_caster_has_no_slip() -> None:
@@ -112,7 +113,7 @@ def test_skid_prior_of_driven_wheels_and_a_caster_has_no_slip() -> None:
     model = make_model("skid_steer", robot)
     assert model.nominal[0] == 1.0
     assert not np.any(model.nominal[1:])
-    assert "diff_drive is its model" in prior_notes(robot)[0]
+    assert "diff_drive is its model" in robot_notes(robot)[0]
 
 
 def test_skid_prior_of_a_cg_outside_its_wheels_is_geometric() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from localization.calibration.robot_notes import robot_notes
 from localization.events import WheelSample
 from localization.inputs.wheel_motion import WheelMotion
 from motion_models import se2
@@ -16,7 +17,6 @@ from motion_models.errors import RobotError
 from motion_models.extended_model import ExtendedModel, in_series
 from motion_models.online_calibration import add_correction_parameters, make_corrections
 from motion_models.preintegration import preintegrate
-from motion_models.prior import prior_notes
 from motion_models.registry import make_model
 from motion_models.robot import Robot, WheelNoise
 from motion_models.robot_file import load_robot, parse_robot, robot_toml
@@ -113,8 +113,8 @@ def test_robot_toml_with_terms_is_read_as_it_was_written() -> None:
 
 def test_terms_of_another_model_are_said() -> None:
     robot = husky('vy = {"wz" = 0.1}', "icr")
-    assert "are of icr, and skid_steer runs without them" in prior_notes(robot)[0]
-    assert not any("terms" in note for note in prior_notes(robot, ["icr", "skid_steer"]))
+    assert "are of icr, and skid_steer runs without them" in robot_notes(robot)[0]
+    assert not any("terms" in note for note in robot_notes(robot, ["icr", "skid_steer"]))
     assert type(make_model("skid_steer", robot)).__name__ == "SkidSteer"
 
 

@@ -12,6 +12,7 @@ from localization.evaluation.references import ReferenceTrack
 from localization.evaluation.scores import score
 from localization.log_replay import Run
 from localization.maps.keyframe_map import KeyframeMap
+from localization.messages import message
 from localization.report.interactive import explorer_data
 from localization.report.replay_page import ReportHead, page
 from localization.report.runs import plotted_runs
@@ -84,7 +85,7 @@ def results():
         nis=nis,
         map_points=np.ones((9, 2)),
         parameter_history={"k_0": np.array([[0.0, 0.5, 0.1], [40.0, 0.55, 0.01]])},
-        warnings=("at t = 12.3 s: the gyro's rates stand still.", "another problem."),
+        warnings=(message("stopped_gyro.repeats").at(12.3), message("wheel_gaps.no_data", total_s=1.0)),
         keyframes=one_loop(),
     )
     reference = ReferenceTrack(STAMPS[::4], POSES[::4, :2], POSES[::4, 2])
@@ -138,7 +139,7 @@ def test_explorer_in_a_browser_moves_with_its_slider(tmp_path: Path):
     assert seen["atStart"] == pytest.approx(2.0, abs=0.01)
     assert seen["events"] == [
         "9.9 s: no scan matched for 10.1 s, ekf · diff_drive",
-        "12.3 s: fault: the gyro's rates stand still.",
+        f"12.3 s: fault: {message('stopped_gyro.repeats')}",
         "25.1 s: scan against wheels 10 sigma (slip or push), ekf · diff_drive",
         "40.0 s: loop closed, ekf · diff_drive",
     ]

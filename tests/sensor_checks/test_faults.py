@@ -36,22 +36,29 @@ def test_evidence_lasts_from_the_last_comparison_that_did_not_show_it(between: b
 
 
 def test_fault_that_another_one_explains_is_reported_no_more() -> None:
-    log, rate = FaultLog(CovarianceInflation()), SensorFault("by {rate} rad/s")
-    unit = SensorFault("in deg/s", explains=rate)
+    log, rate = FaultLog(CovarianceInflation()), SensorFault("impossible_rates.against_wheels")
+    unit = SensorFault("opposite_turns.gyro_unit", explains=rate)
     log.start_step(Step(5 * S, 7 * S, Motion(np.zeros(3), np.eye(3)), np.zeros(3), np.zeros(3), False, True))
     assert log.now_s == 2.0
     log.declare(rate, 1.0, {"rate": 3})
     log.declare(rate, 2.0, {"rate": 4})
-    assert log.warnings() == ["at t = 1.0 s: by 3 rad/s"]
-    log.declare(unit, -1.0, {})
+    (found,) = log.warnings()
+    assert found.startswith("at t = 1.0 s: the gyro turns by 3.0 rad/s against the wheels")
+    assert (found.id, found.at_s, found.values) == (rate.id, 1.0, {"rate": 3})
+    log.declare(unit, -1.0, {"ratio": 57.3, "others": "wheels"})
     log.declare(rate, 3.0, {"rate": 5})
-    assert log.warnings() == ["at t = 0.0 s: in deg/s"]
+    assert [(found.id, found.at_s) for found in log.warnings()] == [(unit.id, 0.0)]
 
 
 def test_fault_whose_numbers_change_is_reported_last() -> None:
     log = FaultLog(CovarianceInflation())
-    slip, other = SensorFault("slip"), SensorFault("other")
-    log.revise(DetectedFault(slip, 1.0, "for 1 s"))
+    slip, other = SensorFault("corridor.by_wheels"), SensorFault("stopped_gyro.repeats")
+
+    def of(way_m: float) -> DetectedFault:
+        return DetectedFault(slip, 1.0, slip.describe({"way_m": way_m, "begin_s": 1.0, "sigma_m": 0.5}))
+
+    log.revise(of(1.0))
     log.declare(other, 2.0, {})
-    log.revise(DetectedFault(slip, 1.0, "for 2 s"))
-    assert log.warnings() == ["at t = 2.0 s: other", "at t = 1.0 s: for 2 s"]
+    log.revise(of(2.0))
+    assert [found.id for found in log.warnings()] == [other.id, slip.id]
+    assert log.warnings()[1].startswith("at t = 1.0 s: 2 m along a corridor")

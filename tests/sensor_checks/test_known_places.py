@@ -21,7 +21,7 @@ def _scan(pose: np.ndarray):
 
 
 def _add_fault(faults: FaultLog, begin_s: float, now_s: float) -> None:
-    faults.declare(SensorFault("of a test"), begin_s, {})
+    faults.declare(SensorFault("stopped_gyro.repeats"), begin_s, {})
     faults.inflation.add(np.array([5.0, 0.0, 0.5]))
     faults.now_s = now_s
 

@@ -132,13 +132,18 @@ def draw_slip(twists: FloatArray, noise: Noise, rng: np.random.Generator) -> Flo
 
 
 def _gyro(drive: rooms.Drive, factor: float, rng: np.random.Generator) -> list[Event]:
-    """Mean rates from sample to sample, with white noise, bias and an error of scale as `GyroNoise` has them, times ``factor``."""
+    """A gyro whose white noise, bias and error of scale are as `GyroNoise` has them, times ``factor``."""
     assumed: GyroNoise = rooms.ROBOT.gyro_noise
     bias, scale = factor * rng.normal(size=2) * [assumed.bias_sigma_rad_per_s, assumed.scale_sigma]
+    return gyro_samples(drive, bias, scale, factor * assumed.white_rad_per_sqrt_s, rng)
+
+
+def gyro_samples(drive: rooms.Drive, bias: float, scale: float, white: float, rng: np.random.Generator) -> list[Event]:
+    """Mean rates from sample to sample, with a ``bias`` [rad/s], an error of ``scale``, and ``white`` noise [rad/sqrt(s)]."""
     yaw = np.unwrap(drive.track[::_GYRO_STEPS, 2])
     dt = _GYRO_STEPS * _STEP_S
     rates = (1.0 + scale) * np.gradient(yaw, dt) + bias
-    rates += factor * assumed.white_rad_per_sqrt_s / math.sqrt(dt) * rng.normal(size=len(rates))
+    rates += white / math.sqrt(dt) * rng.normal(size=len(rates))
     stamps = rooms.WALL_START_NS + np.arange(len(yaw)) * round(dt * 1e9)
     return [ImuSample(int(t), np.array([0.0, 0.0, rate]), _GRAVITY, "base_link") for t, rate in zip(stamps, rates, strict=True)]
 

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 from localization.core.state import State
 from localization.lidar import OUTLIER_SIGMAS
+from localization.messages import Message, message
 
 _MIN_CLOCK_OFFSET_S = 0.05
 """Smallest offset of the wheels' clock that counts [s]: at 1 m/s and 1 rad/s, 5 cm and 3 deg."""
@@ -33,14 +34,11 @@ def find_clocks_apart(state: State, has_gyro: bool, has_lidar: bool) -> ClocksAp
     return ClocksApart(offset, "LiDAR" if has_lidar else "gyro", is_latency)
 
 
-def clock_warnings(apart: ClocksApart | None, has_gyro: bool, has_lidar: bool) -> list[str]:
+def clock_warnings(apart: ClocksApart | None, has_gyro: bool, has_lidar: bool) -> list[Message]:
     """Which clock is off, and the remedy. A driver's latency is corrected and no fault; two sensors whose offset it does not explain are
     reported by `sensor_checks.clocks`."""
     if apart is None or not apart.is_latency or abs(apart.late_s) < _MAX_LATENCY_S:
         return []
     others = "LiDAR" if not has_gyro else "gyro" if not has_lidar else "LiDAR or gyro"
     direction = "later" if apart.late_s > 0.0 else "earlier"
-    return [
-        f"the wheels' stamps are {abs(apart.late_s):.2f} s {direction} than those of {others}, whose clock the poses have. Synchronize"
-        " the clocks, or correct them by [clock] in the robot file: `skidloc diagnose` estimates each."
-    ]
+    return [message("wheel_clock.apart", seconds=abs(apart.late_s), direction=direction, others=others)]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from localization.events import Step
+from localization.messages import Message, message
 from motion_models.se2 import Cov3
 
 _OPEN_M2 = 1.0
@@ -66,13 +67,10 @@ class OpenWay:
         elif self._now is None and self._first_ns is not None:
             self._now = _Stretch((step.end_ns - self._first_ns) * 1e-9, 0.0, 0.0)
 
-    def warnings(self) -> list[str]:
+    def warnings(self) -> list[Message]:
         """The longest way by wheels alone."""
         longest = self._longest
         if longest is None or longest.way_m < _MIN_REPORTED_M:
             return []
-        return [
-            f"{longest.way_m:.0f} m along a corridor by wheels alone, from t = {longest.begin_s:.0f} s: scans show no way there, nor wheels"
-            f" that spin, nor a push. The covariance has {math.sqrt(longest.variance):.1f} m for them. Put objects along the wall every few"
-            " metres, or take a longer range (lidar.max_range_m)."
-        ]
+        sigma_m = math.sqrt(longest.variance)
+        return [message("corridor.by_wheels", way_m=longest.way_m, begin_s=longest.begin_s, sigma_m=sigma_m)]

@@ -1,0 +1,204 @@
+"""Every number that a drive publishes, against the truth, under exactly the noise that the robot file and the settings declare.
+
+python -m tests.studies.published [--drives 40] [--seed 0] [--only TEXT]
+
+Each drive draws what the priors are of (k of the motion model, wheel radius, bias and scale of the gyro, offset of the wheels' clock) from
+them, its slip and its ranges from the noise models, white as they have it, and a room. Nothing of it is told to the estimators. The table
+has the mean NEES a degree of freedom of each number over all times and drives (1 is expected), its band of 95 % for as many independent
+drives, and the shares of drives and times within one and two sigma.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from localization.core.motion import FilterConfig
+from localization.evaluation.consistency import mean_band, nees
+from localization.events import Event, ImuSample, Scan, WheelSample
+from localization.lidar import LidarConfig
+from localization.log_replay import Run, replay
+from localization.pipeline import Trial
+from motion_models import se2
+from motion_models.online_calibration import make_corrections
+from motion_models.registry import make_model
+from motion_models.robot import WheelNoise
+from motion_models.se2 import FloatArray
+from tests.helpers import rooms
+from tests.studies.honesty import TOUR, Noise, draw_slip, gyro_samples, make_rooms
+
+MODEL = "skid_steer"
+_NO_SLIP = WheelNoise(*[0.0] * 8)
+_STEP_S, _EVERY = 0.002, 500
+"""Step of the simulation [s], and from one time that is compared to the next."""
+_SETTLED_S = 2.0
+_BEAMS, _ROOMS = 381, 8
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A drive, and what was drawn for it."""
+
+    drive: rooms.Drive
+    twists: FloatArray
+    """(n, 3) of the robot, 500 a second."""
+    parameters: Mapping[str, float]
+    """By the name under which they are published."""
+
+
+def draw(seed: int, slip_s: float) -> Drawn:
+    """A drive of `TOUR` and back, all of it from ``seed``; slip is correlated over ``slip_s`` [s]."""
+    rng = np.random.default_rng([seed, 5])
+    model, robot = make_model(MODEL, rooms.ROBOT), rooms.ROBOT
+    corrections = make_corrections(model, "constant")
+    corrected = np.linalg.cholesky(corrections.cov) @ rng.normal(size=len(corrections.names))
+    params = model.nominal + corrections.directions @ corrected
+    radius, late_s = FilterConfig().wheel_radius_sigma * rng.normal(), FilterConfig().clock_sigma_s * rng.normal()
+    bias, scale = rng.normal(size=2) * [robot.gyro_noise.bias_sigma_rad_per_s, robot.gyro_noise.scale_sigma]
+    command, cg = np.vstack([TOUR, -TOUR[::-1]]), np.array(robot.geometry.cg_offset)
+    cgs = np.broadcast_to(cg, (len(command), 2))
+    rates = model.wheels(command[:, [0, 2]], cgs, model.nominal)
+    rolled = model.twist(rates, cgs, params).value * [1.0 + radius, 1.0 + radius, 1.0]
+    twists = rolled + draw_slip(rolled, Noise(slip_s=slip_s), rng)
+    room = make_rooms(_ROOMS)[seed % _ROOMS]
+    scanner = rooms.Beams(beams=_BEAMS, noise=LidarConfig().range_noise_m)
+    drive = rooms.drive_through(room.walls, twists, seed, room.start, scanner, _NO_SLIP, wheels=lambda t, _: _as_diff_drive(rates))
+    gyro = gyro_samples(drive, bias, scale, robot.gyro_noise.white_rad_per_sqrt_s, rng)
+    events = [_stamped_late(event, late_s) for event in (*drive.events, *gyro)]
+    found = {name: float(params[list(model.param_names).index(name)]) for name in corrections.names if name in model.param_names}
+    found |= {"gyro_bias_rad_per_s": bias, "gyro_scale": scale, "wheel_clock_offset_s": late_s, "wheel_radius_scale": radius}
+    return Drawn(replace(drive, events=sorted(events, key=lambda event: event.stamp_ns)), twists, found)
+
+
+def _as_diff_drive(rates: FloatArray) -> FloatArray:
+    """(n, 3) twists for which the wheels of `rooms.drive_through` turn with ``rates`` (n, 2)."""
+    g, driver = rooms.ROBOT.geometry, rooms.ROBOT.driver
+    ways = g.wheel_radius_m * rates
+    turn = (ways[:, 1] - ways[:, 0]) / (g.track_width_m * driver.wheel_separation_multiplier)
+    return np.column_stack([ways.mean(axis=1), np.zeros(len(rates)), turn])
+
+
+def _stamped_late(event: Event, late_s: float) -> Event:
+    return replace(event, stamp_ns=event.stamp_ns + round(late_s * 1e9)) if isinstance(event, WheelSample) else event
+
+
+def without(drawn: Drawn, *kinds: type) -> Drawn:
+    """The same without the sensors whose events are ``kinds``."""
+    return replace(drawn, drive=replace(drawn.drive, events=[e for e in drawn.drive.events if not isinstance(e, kinds)]))
+
+
+def truth_at(drawn: Drawn, stamps_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses (n, 3) from the first stamp on, and twists (n, 3), at ``stamps_ns`` (n,)."""
+    seconds = (stamps_ns - rooms.WALL_START_NS) * 1e-9
+    i = np.clip((seconds / _STEP_S).astype(int), 0, len(drawn.twists) - 1)
+    poses = se2.interpolate(drawn.drive.track[i], drawn.drive.track[i + 1], np.clip(seconds / _STEP_S - i, 0.0, 1.0))
+    mean = np.cumsum(np.vstack([np.zeros(3), drawn.twists]), axis=0)
+    a, b = np.maximum(i - _TWIST_STEPS, 0), np.minimum(i + _TWIST_STEPS, len(drawn.twists))
+    return se2.between(poses[0], poses), (mean[b] - mean[a]) / (b - a)[:, None]
+
+
+_TWIST_STEPS = 10
+"""White slip has no twist at a time; its mean over 40 ms has, which is a step of the filter."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """An estimator, and the sensors that it is given."""
+
+    name: str
+    estimator: str
+    missing: tuple[type, ...] = ()
+
+
+CONFIGS = (
+    Config("wheels, gyro, LiDAR: ekf", "ekf"),
+    Config("wheels, gyro, LiDAR: graph", "graph"),
+    Config("wheels, LiDAR: ekf", "ekf", (ImuSample,)),
+    Config("wheels, gyro: ekf", "ekf", (Scan,)),
+    Config("wheels: ekf", "ekf", (ImuSample, Scan)),
+    Config("wheels: odometry", "odometry", (ImuSample, Scan)),
+)
+
+
+def scores(drawn: Drawn, config: Config) -> dict[str, FloatArray]:
+    """NEES a degree of freedom by number: (n,) over the times of poses and twists, (1,) of a parameter."""
+    given = without(drawn, *config.missing)
+    trial, has_lidar = Trial(make_model(MODEL, rooms.ROBOT), config.estimator), Scan not in config.missing
+    (run,) = replay(given.drive.events, [trial], rooms.ROBOT, given.drive.mounts, has_lidar)
+    found = {**_of_path(drawn, run, "pose at the end of the log" if run.live is not None else "pose")}
+    if run.live is not None:
+        live = replace(run, trajectory=run.live)
+        found |= {"pose": _of_path(drawn, live, "pose")["pose"]}
+    if run.keyframes is not None:
+        found["keyframes of the map"] = _of_keyframes(drawn, run)
+    for name, (value, sigma) in run.parameters.items():
+        if name in drawn.parameters and sigma > 0.0:
+            found[name] = np.array([((value - drawn.parameters[name]) / sigma) ** 2])
+    return found
+
+
+def _times(run: Run) -> FloatArray:
+    stamps = run.trajectory.stamps_ns
+    settled = np.flatnonzero(stamps >= stamps[0] + _SETTLED_S * 1e9)
+    return settled[:: max(1, len(settled) // 60)]
+
+
+def _of_path(drawn: Drawn, run: Run, name: str) -> dict[str, FloatArray]:
+    i, t = _times(run), run.trajectory
+    poses, twists = truth_at(drawn, t.stamps_ns)
+    found = {}
+    if t.covariances is not None:
+        error = se2.log(se2.between(poses, se2.between(t.poses[0], t.poses)))[i]
+        found[name] = nees(error, t.covariances[i]) / 3.0
+        found[f"heading of the {name}"] = error[:, 2] ** 2 / t.covariances[i, 2, 2]
+    for k, axis in enumerate(("vx", "vy", "wz")):
+        variance = run.twist_covariances[i, k, k]
+        known = np.isfinite(variance) & (variance > 0.0)
+        if known.any():
+            found[f"twist {axis}"] = ((run.twists - twists)[i, k] ** 2)[known] / variance[known]
+    return found
+
+
+def _of_keyframes(drawn: Drawn, run: Run) -> FloatArray:
+    keys = run.keyframes
+    assert keys is not None
+    poses, _ = truth_at(drawn, keys.stamps_ns)
+    error = se2.log(se2.between(poses, se2.between(keys.poses[0], keys.poses)))[1:]
+    return np.asarray(nees(error, keys.covariances[1:]) / 3.0)
+
+
+def rows(drives: int, seed: int, only: str, slip_s: float) -> Iterator[str]:
+    """Lines of the table, as they are computed."""
+    band = mean_band(drives, 1.0)
+    yield f"| number ({drives} drives; band of a parameter {band[0]:.2f} to {band[1]:.2f}) | mean | median of drives | 1 sigma | 2 sigma |"
+    yield "|---|---|---|---|---|"
+    drawn = [draw(seed + k, slip_s) for k in range(drives)]
+    for config in CONFIGS:
+        if only not in config.name:
+            continue
+        found: dict[str, list[FloatArray]] = {}
+        for each in drawn:
+            for name, values in scores(each, config).items():
+                found.setdefault(name, []).append(values)
+        for name, values in found.items():
+            means, every = np.array([v.mean() for v in values]), np.concatenate(values)
+            within = [100.0 * float(np.mean(every < q)) for q in (1.0, 4.0)]
+            yield f"| {config.name}: {name} | {means.mean():.2f} | {np.median(means):.2f} | {within[0]:.0f} % | {within[1]:.0f} % |"
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--drives", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0, help="of the first drive")
+    parser.add_argument("--only", default="", help="estimators whose name has this in it")
+    parser.add_argument("--slip", type=float, default=0.5, help="time over which slip is correlated [s]; 0 is white")
+    options = parser.parse_args(words)
+    for line in rows(options.drives, options.seed, options.only, options.slip):
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
