@@ -265,9 +265,8 @@ def _filter_rows(log: Log, run: Run | None) -> list[CheckRow]:
     """k, track and clock by the filter, and what its sensor checks found."""
     if run is None:
         return [CheckRow("track and multiplier", "", "", "cannot be seen", f"record a gyro or LiDAR and {_TURN_AND_STRAIGHT}.")]
-    rows = [
-        CheckRow("sensors against each other", "", "", "contradiction", text) for text in warnings_of([run]) if text.startswith("at t = ")
-    ]
+    of_checks = [found for found in warnings_of([run]) if not found.source and found.at_s is not None]
+    rows = [CheckRow("sensors against each other", "", "", "contradiction", found) for found in of_checks]
     source = "LiDAR and gyro" if log.sources.lidar is not None and log.sources.imu is not None else "LiDAR" if log.sources.lidar else "gyro"
     if "k_0" in run.parameters and log.robot.drive != DIFF_DRIVE:
         rows.append(_scaling_row(log.robot, run, source))

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from localization.core.filter import Innovation, add_change, augment, clone, inflate, inflate_both, propagate, set_marginal, update, widen
+from localization.core.filter import (
+    Innovation,
+    Measurement,
+    add_change,
+    augment,
+    clone,
+    inflate,
+    inflate_both,
+    propagate,
+    set_marginal,
+    update,
+    widen,
+)
 from localization.core.measurements.scan import key_scan_transition, measure_scan
 from localization.core.measurements.standstill import measure_bias, measure_standstill
 from localization.core.measurements.turn import measure_turn
 from localization.core.motion import FilterConfig, NoiseModel, initial_state, wheel_transition
-from localization.core.policies.clock_offset import ClocksApart, clock_warnings, find_clocks_apart
+from localization.core.policies.clock_offset import ClocksApart, clock_warnings, find_clocks_apart, unmeasured_start
 from localization.core.policies.continuous_pose import ContinuousPose
 from localization.core.policies.excitation import Excitation
 from localization.core.policies.open_way import OpenWay
@@ -156,7 +168,7 @@ class EkfFusion(Estimator):
             state = inflate_both(state, ("start", "pose"), np.diag([0.0, 0.0, before]))
             state = inflate(state, "pose", np.diag([0.0, 0.0, of_step]))
         open_bias = {"gyro_bias"} if standstill.is_bias_open else set()
-        state, innovation = update(state, measure_turn(state, step.turn, standstill.since_rest_s), considered | open_bias)
+        state, innovation = _update(state, measure_turn(state, step.turn, standstill.since_rest_s), considered | open_bias)
         self._policies.wheel_noise.learn(innovation)
         if standstill.is_at_rest:
             state, _ = update(state, measure_standstill(state), considered)
@@ -187,7 +199,7 @@ class EkfFusion(Estimator):
         R = R * (1.0 + step.rested_s / _REPEATED_S) ** 4
         self.counts_by_name["matched"] += 1
         self._policies.open_way.add_scan(R, step)
-        state, innovation = update(state, measure_scan(state, match.measured, R), self._policies.excitation.considered_by_scan(state, R))
+        state, innovation = _update(state, measure_scan(state, match.measured, R), self._policies.excitation.considered_by_scan(state, R))
         self._policies.wheel_noise.learn(innovation)
         return state, innovation, missed
 
@@ -315,3 +327,10 @@ class EkfFusion(Estimator):
     def map_points(self) -> Points2:
         """(M, 2) points of the map in the world [m]; none without a LiDAR."""
         return NO_POINTS if self._sensor is None else self._sensor.map_points()
+
+
+def _update(state: State, measurement: Measurement, considered: Collection[str]) -> tuple[State, Innovation]:
+    """`update` by a sensor of the motion, of which late wheels may have missed the start."""
+    updated, innovation = update(state, measurement, considered)
+    missed = unmeasured_start(state, innovation)
+    return (updated, innovation) if missed is None else update(inflate(state, "pose", missed), measurement, considered)

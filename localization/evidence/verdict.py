@@ -245,14 +245,12 @@ def _ambiguity_warnings(
     for (p, _, _), rows in zip(kept, rest, strict=True):
         faults = " and ".join(row.text for row in rows) or phrase("set_up.nothing_more")
         ways.append(phrase("set_up.one_way", faults=faults, probability=p))
-    absent = [phrase(text) for kind, text in _DECIDERS.items() if all(source.kind != kind for source in sources)]
+    kinds = {source.kind for source in sources}
+    deciders = {"gyro": phrase("set_up.gyro"), "lidar": phrase("set_up.lidar")}
+    absent = [text for kind, text in deciders.items() if kind not in kinds]
     record = phrase("set_up.record", sensors=phrase("set_up.or").join(absent)) if absent else ""
     listed = ", ".join(ways[:-1]) + (f", or {ways[-1]}" if len(ways) > 1 else ways[-1])
     return [message("set_up.ambiguous", sources=" and ".join(source.name for source in sources), ways=listed, record=record)]
-
-
-_DECIDERS = {"gyro": "set_up.gyro", "lidar": "set_up.lidar"}
-"""Sensors that decide, as `phrase` has them."""
 
 
 def _topic(sources: Sequence[Source], row: Row) -> str:
@@ -265,7 +263,7 @@ def _topic(sources: Sequence[Source], row: Row) -> str:
 
 def _witnesses(sources: Sequence[Source], row: Row) -> str:
     topic = _topic(sources, row)
-    return " and ".join(source.name for source in sources if source.name != topic) or "its own messages"
+    return " and ".join(source.name for source in sources if source.name != topic) or phrase("set_up.own_messages")
 
 
 def changed_entries(before: Robot, after: Robot) -> dict[str, str]:

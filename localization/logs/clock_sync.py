@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from localization.logs.decode import MessageStats, Oddity
+from localization.messages import phrase
 
 _SECOND = 1_000_000_000
 _MAX_STEP_NS = _SECOND
@@ -430,7 +431,8 @@ class Merger:
         if first == second:
             self._stats.count(item.topic, Oddity.REPEATED)
         else:
-            self._stats.count(f"{item.topic}, frames '{min(first, second)}' and '{max(first, second)}'", Oddity.SECOND_FRAME)
+            frames = {"first": min(first, second), "second": max(first, second)}
+            self._stats.count(phrase("odd_messages.of_frames", topic=item.topic, **frames), Oddity.SECOND_FRAME)
 
 
 def merge(items: Iterable[Item], plan: ClockPlan, stats: MessageStats) -> Iterator[Any]:

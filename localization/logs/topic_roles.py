@@ -492,7 +492,7 @@ class _RoleChooser:
             self._warnings.append(message("topics.renamed_joints", topics=", ".join(topics), theirs=theirs, ours=ours))
         elif ways:
             ours = joints.left[0]
-            self._joint_note = f" {ours} may be {' or '.join(way[ours] for way in ways)}: those of several robots or axles."
+            self._joint_note = phrase("topics.several_ways", joint=ours, joints=" or ".join(way[ours] for way in ways))
         return len(ways) == 1
 
     def _wheels_in_parts(self, candidates: list[str]) -> TopicSource | None:
@@ -519,10 +519,13 @@ class _RoleChooser:
 
     def _odometry(self, joint_states: TopicSource | None, known: set[str], is_missing_joints: bool) -> TopicSource | None:
         """The odometry, where no joint states have the wheels."""
-        missing_joints = (
-            f"no joint states of {self._log} have the wheel joints: robot '{self._robot.name}' names"
-            f" {', '.join((*self._robot.joints.left, *self._robot.joints.right))}; joints in it: {', '.join(sorted(known)) or 'none'}"
-            f"{self._joint_note}"
+        missing_joints = phrase(
+            "topics.no_wheel_joints",
+            log=self._log,
+            robot=self._robot.name,
+            joints=", ".join((*self._robot.joints.left, *self._robot.joints.right)),
+            known=", ".join(sorted(known)) or phrase("topics.no_joints"),
+            note=self._joint_note,
         )
         if joint_states is not None and joint_states.chosen_by == "option":
             raise TopicError(f"{missing_joints}. Name them in the robot file's [joints].")

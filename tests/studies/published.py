@@ -170,6 +170,15 @@ def _of_keyframes(drawn: Drawn, run: Run) -> FloatArray:
     return np.asarray(nees(error, keys.covariances[1:]) / 3.0)
 
 
+def measure(drawn: Sequence[Drawn], config: Config) -> dict[str, list[FloatArray]]:
+    """NEES a degree of freedom of each number in each drive, as `scores` has them."""
+    found: dict[str, list[FloatArray]] = {}
+    for each in drawn:
+        for name, values in scores(each, config).items():
+            found.setdefault(name, []).append(values)
+    return found
+
+
 def rows(drives: int, seed: int, only: str, slip_s: float) -> Iterator[str]:
     """Lines of the table, as they are computed."""
     band = mean_band(drives, 1.0)
@@ -177,13 +186,7 @@ def rows(drives: int, seed: int, only: str, slip_s: float) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     drawn = [draw(seed + k, slip_s) for k in range(drives)]
     for config in CONFIGS:
-        if only not in config.name:
-            continue
-        found: dict[str, list[FloatArray]] = {}
-        for each in drawn:
-            for name, values in scores(each, config).items():
-                found.setdefault(name, []).append(values)
-        for name, values in found.items():
+        for name, values in measure(drawn, config).items() if only in config.name else ():
             means, every = np.array([v.mean() for v in values]), np.concatenate(values)
             within = [100.0 * float(np.mean(every < q)) for q in (1.0, 4.0)]
             yield f"| {config.name}: {name} | {means.mean():.2f} | {np.median(means):.2f} | {within[0]:.0f} % | {within[1]:.0f} % |"
