@@ -16,6 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from localization.calibration.calibrate import Cut, calibrated
+from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference
+from localization.calibration.windows import WindowConfig, cut
 from localization.core.motion import FilterConfig
 from localization.evaluation.consistency import mean_band, nees
 from localization.events import Event, ImuSample, Scan, WheelSample
@@ -86,8 +89,11 @@ def _stamped_late(event: Event, late_s: float) -> Event:
 
 
 def without(drawn: Drawn, *kinds: type) -> Drawn:
-    """The same without the sensors whose events are ``kinds``."""
-    return replace(drawn, drive=replace(drawn.drive, events=[e for e in drawn.drive.events if not isinstance(e, kinds)]))
+    """The same without the sensors whose events are ``kinds``. The clock of wheels alone is the only one, and right."""
+    events = [e for e in drawn.drive.events if not isinstance(e, kinds)]
+    if {ImuSample, Scan} <= set(kinds):
+        events = [_stamped_late(event, -drawn.parameters["wheel_clock_offset_s"]) for event in events]
+    return replace(drawn, drive=replace(drawn.drive, events=events))
 
 
 def truth_at(drawn: Drawn, stamps_ns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -140,6 +146,21 @@ def scores(drawn: Drawn, config: Config) -> dict[str, FloatArray]:
     return found
 
 
+def calibrated_by(drawn: Drawn, by: str) -> dict[str, FloatArray]:
+    """Squares of the errors of a calibration ``by`` gyro or LiDAR, over its variances, by parameter."""
+    config, robot, mounts = WindowConfig(), rooms.ROBOT, drawn.drive.mounts
+    reference: MotionReference = LidarMotionReference(mounts, config.window_s)
+    if by == "gyro":
+        reference = GyroMotionReference(robot.gyro_noise, mounts, config.window_s)
+    windows = cut(drawn.drive.events, reference, make_model("diff_drive", robot), robot, config, "drawn")
+    found = calibrated(make_model(MODEL, robot), [Cut("drawn", windows.maneuvers, by)], robot)
+    true = {**drawn.parameters, "wheel_time_offset": drawn.parameters["wheel_clock_offset_s"]}
+    if "wheel_radius_scale" in found.fit.names:  # of which a calibration has the turns as well
+        true["k_0"] /= 1.0 + true["wheel_radius_scale"]
+    values = zip(found.fit.names, found.fit.values, strict=True)
+    return {name: np.array([((value - true[name]) / found.sigmas[name]) ** 2]) for name, value in values if name in true}
+
+
 def _times(run: Run) -> FloatArray:
     stamps = run.trajectory.stamps_ns
     settled = np.flatnonzero(stamps >= stamps[0] + _SETTLED_S * 1e9)
@@ -172,9 +193,13 @@ def _of_keyframes(drawn: Drawn, run: Run) -> FloatArray:
 
 def measure(drawn: Sequence[Drawn], config: Config) -> dict[str, list[FloatArray]]:
     """NEES a degree of freedom of each number in each drive, as `scores` has them."""
+    return _by_name([scores(each, config) for each in drawn])
+
+
+def _by_name(scored: Sequence[Mapping[str, FloatArray]]) -> dict[str, list[FloatArray]]:
     found: dict[str, list[FloatArray]] = {}
-    for each in drawn:
-        for name, values in scores(each, config).items():
+    for each in scored:
+        for name, values in each.items():
             found.setdefault(name, []).append(values)
     return found
 
@@ -186,10 +211,18 @@ def rows(drives: int, seed: int, only: str, slip_s: float) -> Iterator[str]:
     yield "|---|---|---|---|---|"
     drawn = [draw(seed + k, slip_s) for k in range(drives)]
     for config in CONFIGS:
-        for name, values in measure(drawn, config).items() if only in config.name else ():
-            means, every = np.array([v.mean() for v in values]), np.concatenate(values)
-            within = [100.0 * float(np.mean(every < q)) for q in (1.0, 4.0)]
-            yield f"| {config.name}: {name} | {means.mean():.2f} | {np.median(means):.2f} | {within[0]:.0f} % | {within[1]:.0f} % |"
+        if only in config.name:
+            yield from _rows_of(config.name, measure(drawn, config))
+    for by in ("LiDAR", "gyro"):
+        if only in (name := f"calibrate by {by}"):
+            yield from _rows_of(name, _by_name([calibrated_by(each, by) for each in drawn]))
+
+
+def _rows_of(source: str, found: Mapping[str, Sequence[FloatArray]]) -> Iterator[str]:
+    for name, values in found.items():
+        means, every = np.array([v.mean() for v in values]), np.concatenate(values)
+        within = [100.0 * float(np.mean(every < q)) for q in (1.0, 4.0)]
+        yield f"| {source}: {name} | {means.mean():.2f} | {np.median(means):.2f} | {within[0]:.0f} % | {within[1]:.0f} % |"
 
 
 def main(words: Sequence[str] | None = None) -> None:
