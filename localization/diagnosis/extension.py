@@ -50,6 +50,9 @@ _FEWEST_OF_A_KIND = 4
 """Fewest windows of a kind of motion that is held out."""
 _MAX_RELATIVE_SIGMA = 0.5
 """Sigma of a coefficient over its size on the whole drive, up to which the other kinds of motion measure it."""
+_ACTING = 9.0
+"""Squares of what terms do in a kind of motion, over its noise, from which on it tests them: three sigma. Where they do nothing, before and
+after are equal."""
 _TURNING_SHARE = 0.35
 """Half the angle between (q_l + q_r, q_r - q_l) and its axis in which a motion is straight, or a turn in place [rad]: gentle arcs, of
 which the sides differ by a quarter, lie at its edge."""
@@ -204,7 +207,7 @@ def kinds_of_motion(predictor: DrivePredictor) -> IntArray:
 def _extrapolates_badly(predictor: DrivePredictor, search: Search) -> str:
     """Why terms do not hold in kinds of motion to which they were not fitted, as a clause; empty where they do.
 
-    Kinds are held out one by one, as far as the others measure each coefficient.
+    Kinds are held out one by one, as far as the others measure each coefficient and the terms act in them.
     """
     kinds, noise, columns = kinds_of_motion(predictor), search.state.noise, search.design.columns
     whole = search.design.problem(noise).fit(range(columns.shape[-1]))[0]
@@ -214,7 +217,8 @@ def _extrapolates_badly(predictor: DrivePredictor, search: Search) -> str:
         if part.sum() < _FEWEST_OF_A_KIND or (~part).sum() < _FEWEST_OF_A_KIND:
             continue
         cov = search.design.problem(noise, ~part).fit(range(columns.shape[-1]))[1]
-        if np.all(np.sqrt(np.diagonal(cov)) < _MAX_RELATIVE_SIGMA * np.abs(whole)):
+        acts = np.nansum((columns[part] @ whole / noise.sigmas[part]) ** 2) > _ACTING
+        if acts and np.all(np.sqrt(np.diagonal(cov)) < _MAX_RELATIVE_SIGMA * np.abs(whole)):
             parts.append(part)
     if not parts:
         return ""

@@ -27,6 +27,7 @@ from motion_models.terms import Term, parse_expression
 from tests.helpers.diagnosis_effects import hide
 from tests.helpers.diagnosis_windows import SIGMA, drive_of_windows, errors, windows
 from tests.helpers.extended import cases
+from tests.studies.unseen_effects import case_of, law_of, simulate
 
 ROBOTS = {"husky_a200": "skid_steer", "pioneer_3dx": "diff_drive"}
 """Each with its model."""
@@ -190,3 +191,18 @@ def test_find_terms_sigmas_are_those_of_their_errors() -> None:
     assert len(errors_over_sigma) >= 0.9 * _DRAWS
     low, high = np.sqrt(chi2.ppf([0.005, 0.995], len(errors_over_sigma)) / len(errors_over_sigma))
     assert low < np.sqrt(np.mean(np.square(errors_over_sigma))) < high
+
+
+@pytest.mark.extended
+def test_extend_kind_of_motion_in_which_a_law_does_nothing_is_no_evidence_against_it(tmp_path: Path) -> None:
+    """A law of the speed, sideways, in a drive with turns in place: before and after are equal there."""
+    case = case_of(49, 11)
+    plain = simulate(case, case.routes[0], {}, tmp_path)
+    law = law_of(case, 49, plain)
+    assert law.text == "v*exp(-t/15)"
+    drive, model = hide(plain, law), make_model("friction", plain.robot)
+    extended = extend(examine(drive, model), drive, model)
+    assert extended.extension is not None
+    assert extended.extension.refusal == ""
+    assert extended.robot is not None
+    assert {term.component for term in extended.robot.terms["friction"]} == {"vy"}
