@@ -1,13 +1,15 @@
-"""What an estimator gives: pose and twist of the body at one moment; and what it has learned of the gyro."""
+"""What an estimator gives: pose and twist of the body at one moment; and what it has learned of wheels and gyro."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
+
 from localization.events import Turn
 from localization.space_pose import Pose3
-from motion_models.se2 import Cov3, Pose2, Twist2
+from motion_models.se2 import Cov3, FloatArray, Pose2, Twist2
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,27 @@ class Estimate:
         if odometry is not None and odometry[1] is not None:
             odometry = odometry[0], odometry[1] + spread
         return replace(self, covariance=None if self.covariance is None else self.covariance + spread, odometry=odometry)
+
+
+class WheelCalibration(NamedTuple):
+    """Estimated parameters of the motion model and radius of the wheels."""
+
+    params: FloatArray
+    """(k,)"""
+    params_cov: FloatArray
+    """(k, k)"""
+    radius: float = 1.0
+    """Factor on all ways."""
+    radius_variance: float = 0.0
+
+    def correct(self, twists: FloatArray) -> FloatArray:
+        """Twists (..., 3) by the motion model with the radius that the wheels have."""
+        return np.asarray(twists * np.array([self.radius, self.radius, 1.0]))
+
+    def cov_of(self, moved: FloatArray, by_params: FloatArray) -> FloatArray:
+        """(3, 3) of a twist or motion ``moved`` (3,) by the errors of both; ``by_params`` (3, k): its derivative by the parameters."""
+        by_radius = np.array([moved[0], moved[1], 0.0])
+        return np.asarray(by_params @ self.params_cov @ by_params.T + self.radius_variance * np.outer(by_radius, by_radius))
 
 
 class GyroCalibration(NamedTuple):

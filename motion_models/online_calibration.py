@@ -20,6 +20,8 @@ from motion_models.se2 import FloatArray
 
 Form = str
 FORMS: tuple[Form, ...] = ("none", "constant", "cg_field")
+WHEEL_RADIUS_SIGMA = 0.03
+"""Prior sigma of the radius of all wheels, relative: wear, pressure, load of tyres."""
 PRIOR_RETURNS_AFTER_S = 3600.0
 """Time in which a correction's random walk grows to its prior standard deviation [s]: tyres and loads change within an hour."""
 _LAST = 99  # rank of what is held first

@@ -140,7 +140,7 @@ class Online:
 
     def _go_on_from(self, estimate: Estimate) -> None:
         estimator = self.pipeline.estimator
-        self._predictor.reset(estimate, estimator.params, estimator.clock_offset_s, estimator.gyro_calibration)
+        self._predictor.reset(estimate, estimator.wheel_calibration, estimator.clock_offset_s, estimator.gyro_calibration)
 
     def _begin(self) -> None:
         self.pipeline = Pipeline(self._trial, self.robot, self._mounts, self._has_lidar, self._config)

@@ -150,7 +150,7 @@ def test_online_drops_numbers_that_are_not_finite_and_names_them(messages: list[
     imu = next(as_mapping(message) for message in messages if "Imu" in message.__msgtype__)
     imu["angular_velocity"]["z"] = float("nan")
     assert node.process(imu, KINDS["/imu/data"]) == []
-    assert "sensor_msgs/Imu: 1 message dropped (NaN or inf)." in node.warnings
+    assert "sensor_msgs/Imu: 1 message dropped (NaN or inf)." in [found.statement for found in node.warnings]
 
 
 def test_node_of_ones_own_in_the_documents_runs(messages: list[Any], usual: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:

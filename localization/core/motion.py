@@ -21,7 +21,7 @@ from localization.events import Step
 from motion_models import se2
 from motion_models.groups import SE2, Group
 from motion_models.motion import Motion
-from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, Corrections
+from motion_models.online_calibration import PRIOR_RETURNS_AFTER_S, WHEEL_RADIUS_SIGMA, Corrections
 from motion_models.robot import GyroNoise, WheelNoise
 from motion_models.se2 import FloatArray
 
@@ -34,7 +34,7 @@ class FilterConfig(Settings):
     """Sigma of the offset between the clocks of the wheels and of LiDAR or gyro at first [s]; 0 takes them as one."""
     clock_walk_s_per_sqrt_s: float = 1e-4
     """Random walk of the clock offset."""
-    wheel_radius_sigma: float = 0.03
+    wheel_radius_sigma: float = WHEEL_RADIUS_SIGMA
     """Prior sigma of the radius of all wheels, relative: wear, pressure, load of tyres; 0: the robot file's. Only a LiDAR measures it."""
 
 

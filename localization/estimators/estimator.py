@@ -10,7 +10,7 @@ import numpy as np
 
 from localization.core.policies.clock_offset import ClocksApart
 from localization.core.policies.standstill import BiasChange
-from localization.estimate import Estimate, GyroCalibration
+from localization.estimate import Estimate, GyroCalibration, WheelCalibration
 from localization.events import PositionSample, Step
 from localization.lidar import LostScans
 from localization.lifting import Trajectory3
@@ -97,6 +97,11 @@ class Estimator(ABC):
     @property
     def params(self) -> FloatArray | None:
         """(k,) estimated parameters of the motion model, or None where nothing corrects them."""
+        return None
+
+    @property
+    def wheel_calibration(self) -> WheelCalibration | None:
+        """Parameters of the motion model and radius of the wheels; None where nothing corrects them."""
         return None
 
     @property

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 from localization.core.policies.clock_offset import ClocksApart
 from localization.core.policies.standstill import BiasChange
-from localization.estimate import GyroCalibration
+from localization.estimate import GyroCalibration, WheelCalibration
 from localization.estimators.estimator import Estimator, LearnedParameter, Residuals
 from localization.lidar import LostScans
 from motion_models.se2 import FloatArray
@@ -39,6 +39,11 @@ class FilteredOdometry(Estimator, Generic[Filter]):
     def params(self) -> FloatArray | None:
         """Parameters of the motion model with their corrections."""
         return self.odometry.params
+
+    @property
+    def wheel_calibration(self) -> WheelCalibration | None:
+        """See `Estimator.wheel_calibration`."""
+        return self.odometry.wheel_calibration
 
     @property
     def gyro_calibration(self) -> GyroCalibration | None:

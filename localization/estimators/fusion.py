@@ -35,7 +35,7 @@ from localization.core.policies.standstill import BIAS_CHANGE_COV, BiasChange, S
 from localization.core.policies.wheel_noise import WheelNoiseScale
 from localization.core.state import State, Vector
 from localization.core.twist import fuse_turn, mean_twist, slip_change_cov, twist_at_end, wheel_twist_cov
-from localization.estimate import Estimate, GyroCalibration
+from localization.estimate import Estimate, GyroCalibration, WheelCalibration
 from localization.estimators.estimator import NO_POINTS, Estimator, LearnedParameter, Residuals
 from localization.events import Step
 from localization.lidar import LostScans, ScanMatchingSensor
@@ -253,6 +253,13 @@ class EkfFusion(Estimator):
         return np.asarray(self.model.nominal + self.noise.corrections.directions @ self.state["corrections"])
 
     @property
+    def wheel_calibration(self) -> WheelCalibration:
+        """See `Estimator.wheel_calibration`."""
+        directions, state = self.noise.corrections.directions, self.state
+        params_cov = directions @ state.cov("corrections") @ directions.T
+        return WheelCalibration(self.params, params_cov, 1.0 + state.number("radius"), state.variance("radius"))
+
+    @property
     def scan_points(self) -> Points2:
         """(M, 2) the last scan in the body frame [m], or (0, 2)."""
         return NO_POINTS if self._sensor is None else self._sensor.scan_points()
@@ -330,7 +337,9 @@ class EkfFusion(Estimator):
 
 
 def _update(state: State, measurement: Measurement, considered: Collection[str]) -> tuple[State, Innovation]:
-    """`update` by a sensor of the motion, of which late wheels may have missed the start."""
+    """`update` by a sensor of the motion, of which late wheels may have missed the start; with the innovation as if they had not."""
     updated, innovation = update(state, measurement, considered)
     missed = unmeasured_start(state, innovation)
-    return (updated, innovation) if missed is None else update(inflate(state, "pose", missed), measurement, considered)
+    if missed is not None:
+        updated, _ = update(inflate(state, "pose", missed), measurement, considered)
+    return updated, innovation

@@ -84,6 +84,11 @@ class Message(str):
         """Whether there is something to do about it."""
         return bool(self.remedy)
 
+    @property
+    def statement(self) -> str:
+        """The sentence without its remedy."""
+        return self.removesuffix(f" {self.remedy}") if self.remedy else str(self)
+
     def of(self, source: str) -> Message:
         """The sentence about ``source``, which it names first."""
         return Message(self.id, self.body, self.remedy, self.values, source, self.at_s)

@@ -98,9 +98,11 @@ def page(head: ReportHead, results: Sequence[Result], reference: ReferenceTrack 
     """HTML of the whole page; unless it ``is_interactive``, without scripts."""
     runs = plotted_runs(results)
     sentences = verdict_sentences(results, reference)
+    warnings, notes = ([found for found in head.warnings if found.is_warning == is_warning] for is_warning in (True, False))
+    about = html.bullets([*warnings, *notes]) or [html.Paragraph("No problem was found in it.")]
     sections = [
         *(_sections(runs, reference, head, is_interactive) if runs else []),
-        html.Section("About the log", html.bullets(head.warnings) or [html.Paragraph("No problem was found in it.")]),
+        html.Section("About the log", about),
         html.glossary(_TERMS),
         html.Section("Sources and versions", [html.Definitions(_provenance(head, reference))]),
         html.Section("In short", [html.Paragraph(" ".join(sentences))]),

@@ -80,7 +80,7 @@ def _process(run: LiveRun, trial: Trial, pipeline: Pipeline, is_planar: bool) ->
     for event in synthetic_drive(is_planar):
         for estimate in pipeline.process(event):
             pipeline.run_deferred()
-            predictor.reset(estimate, pipeline.estimator.params, pipeline.estimator.clock_offset_s)
+            predictor.reset(estimate, pipeline.estimator.wheel_calibration, pipeline.estimator.clock_offset_s)
         predictor.predict(pipeline.synchronizer.wheels.buffer)
     pipeline.estimator.map_points()
     pipeline.estimator.occupancy()

@@ -122,7 +122,7 @@ class LiveOutputs:
             return
         before = self._newest(pipeline) if is_current and self._interim is None and self.publisher.are_predictions_read else None
         estimator = pipeline.estimator
-        self._predictor.reset(estimate, estimator.params, estimator.clock_offset_s, estimator.gyro_calibration)
+        self._predictor.reset(estimate, estimator.wheel_calibration, estimator.clock_offset_s, estimator.gyro_calibration)
         if before is not None:
             self.continuous.correct(before, self._newest(pipeline) or estimate)
         if is_current:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from localization.core.twist import CHANGE_SHARE, SLIP_LASTS_S, TWIST_FLOOR
-from localization.estimate import Estimate, GyroCalibration
+from localization.estimate import Estimate, GyroCalibration, WheelCalibration
 from localization.events import Turn
 from localization.inputs.step_config import StepConfig
 from localization.inputs.wheel_buffer import WheelBuffer
@@ -18,8 +18,9 @@ from motion_models.base import MotionModel
 from motion_models.compiled import kernel, subroutine
 from motion_models.linear_equations import assign
 from motion_models.motion import Motion
+from motion_models.online_calibration import WHEEL_RADIUS_SIGMA, make_corrections
 from motion_models.preintegration import integrate, noise_vector
-from motion_models.robot import Robot
+from motion_models.robot import Robot, WheelNoise
 from motion_models.se2 import (
     FloatArray,
     fill_inverse_adjoint,
@@ -53,9 +54,9 @@ class Predictor:
     def __init__(self, model: MotionModel, robot: Robot, config: StepConfig, max_rate_hz: float = math.inf) -> None:
         """``config``: for how long the rates of the last wheel sample hold, and the unknown velocity after that. ``max_rate_hz``: more
         predictions are not made [Hz]."""
-        self._model, self._noise, self._config = model, noise_vector(robot.wheel_noise), config
+        self._model, self._slip, self._noise, self._config = model, robot.wheel_noise, noise_vector(robot.wheel_noise), config
         self._period_ns, self._due_ns = 1.0 / (max_rate_hz * _NS), -math.inf
-        self._params = model.nominal
+        self._wheels = _prior(model)
         self.last: Estimate | None = None
         """What predictions begin at; None before the first estimate."""
         self._gyro: GyroCalibration | None = None
@@ -69,13 +70,15 @@ class Predictor:
         self._due_ns = (self._due_ns if stamp_ns - self._due_ns < self._period_ns else stamp_ns) + self._period_ns
         return True
 
-    def reset(self, estimate: Estimate, params: FloatArray | None, clock_offset_s: float, gyro: GyroCalibration | None = None) -> None:
-        """Predict from ``estimate`` on, with ``params`` (k,) of the motion model (None: the nominal ones).
+    def reset(
+        self, estimate: Estimate, wheels: WheelCalibration | None, clock_offset_s: float, gyro: GyroCalibration | None = None
+    ) -> None:
+        """Predict from ``estimate`` on, with ``wheels`` as they are calibrated (None: as before any drive).
 
         ``clock_offset_s``: the wheels' stamps are late by this much [s]. ``gyro``: None where it is not used.
         """
         self.last, self._gyro = estimate, gyro
-        self._params = self._model.nominal if params is None else params
+        self._wheels = _prior(self._model) if wheels is None else wheels
         self._clock_offset_ns = round(clock_offset_s / _NS)
 
     def begin(self, stamp_ns: int) -> None:
@@ -108,15 +111,20 @@ class Predictor:
         dt, rates, cg, _, missing = wheels.window(begin_ns, end_ns, self._config.max_hold_s)
         if not len(dt):
             return None
-        by_model = self._model.twist(rates, cg, self._params)
+        by_model, calibration = self._model.twist(rates, cg, self._wheels.params), self._wheels
+        twists = calibration.correct(by_model.value)
         turn = None if self._gyro is None or not rates.any() else measure_turn(self.last.stamp_ns, end_ns - self._clock_offset_ns)
         by_gyro = _NO_TURN
         if turn is not None and self._gyro is not None:
             by_gyro = [*self._gyro.correct_angle(turn), *_NO_TURN[2:]]
             if (rate := self._gyro.correct_rate(turn)) is not None:
-                change, variance = _change_of_rate(dt, by_model.value[:, 2], turn.rate_age_s)
-                by_gyro[2:] = rate[0] + change, rate[1] + variance
-        motion, twist, twist_cov = predicted_motion(dt, by_model.value, self._noise, np.array(by_gyro))
+                change, variance = _change_of_rate(dt, twists[:, 2], turn.rate_age_s)
+                by_gyro[2:] = rate[0] + change, rate[1] + variance + _slip_change(self._slip, twists[-1], turn.rate_age_s)
+        motion, twist, twist_cov = predicted_motion(dt, twists, self._noise, np.array(by_gyro))
+        is_open = np.array([1.0, 1.0, float(turn is None)])  # a turn by the gyro has no error of the wheels
+        by_params = np.einsum("t,tik->ik", dt, by_model.d_params)
+        motion = replace(motion, cov=motion.cov + is_open[:, None] * calibration.cov_of(motion.delta, by_params) * is_open)
+        twist_cov = twist_cov + is_open[:, None] * calibration.cov_of(twist, by_model.d_params[-1]) * is_open
         if missing:
             unknown = UnknownVelocity(self._config.unknown_sigma)
             unknown.measured = self.last.twist
@@ -125,6 +133,12 @@ class Predictor:
         if end_ns - begin_ns > _MAX_HORIZON_NS:
             self.advance(predicted)
         return predicted
+
+
+def _prior(model: MotionModel) -> WheelCalibration:
+    """The wheels before a drive has shown anything of them."""
+    found = make_corrections(model, "constant")
+    return WheelCalibration(model.nominal, found.directions @ found.cov @ found.directions.T, 1.0, WHEEL_RADIUS_SIGMA**2)
 
 
 def extrapolate(estimate: Estimate, stamp_ns: int) -> Estimate:
@@ -195,6 +209,13 @@ def _change_of_rate(dt: FloatArray, rates: FloatArray, age_s: float) -> tuple[fl
     change = float(rates[-1] - rates[-1 - at])
     scatter = float(np.mean(np.diff(rates, 2) ** 2)) / 3.0 if len(rates) > 2 else change**2
     return change, scatter + (CHANGE_SHARE * change) ** 2
+
+
+def _slip_change(noise: WheelNoise, twist: FloatArray, age_s: float) -> float:
+    """Variance by which the turn rate by slip has changed in ``age_s`` [s] at ``twist`` (3,) [rad^2/s^2]: of a Gauss-Markov process of
+    density q and time constant tau, q / tau (1 - exp(-age / tau))."""
+    density = noise.yaw_rad2_per_m * abs(twist[0]) + noise.yaw_rad2_per_rad * abs(twist[2]) + noise.floor_rad2_per_s
+    return float(-2.0 * density / SLIP_LASTS_S * math.expm1(-2.0 * max(age_s, 0.0) / SLIP_LASTS_S))
 
 
 def _propagated(last: Estimate, motion: Motion, twist: FloatArray, twist_cov: FloatArray, stamp_ns: int) -> Estimate:

@@ -14,7 +14,7 @@ from tests.studies.buildings import BUILDINGS
 ROOT = Path(__file__).parents[2]
 PACKAGES = tuple(str(ROOT / name) for name in ("localization", "motion_models"))
 STEPS, WARM_UP_STEPS = 60, 30
-LIMITS = {"functions": 108, "calls a step": 243, "lines of their files": 4_450}
+LIMITS = {"functions": 108, "calls a step": 243, "lines of their files": 4_460}
 
 
 def trace():

@@ -431,7 +431,7 @@ def test_clock_sync_scans_of_a_bad_log_are_ordered_and_notes_complete(tmp_path: 
     assert sum(isinstance(e, ImuSample) for e in events) == 300
     scans = [e.stamp_ns for e in events if isinstance(e, Scan)]
     assert scans == [START + i * S // 10 for i in range(300) if i not in (50, 60)]
-    assert [found.body.removesuffix(f" {found.remedy}") for found in log.warnings()] == [
+    assert [found.statement for found in log.warnings()] == [
         "/imu/data: 3 messages without a header stamp, placed by the time of recording.",
         "/scan: 1 message dropped (stamp repeated).",
         "/scan: 1 message dropped (stamp that fits neither its neighbours nor the time of recording).",

@@ -86,7 +86,7 @@ def test_references_invalid_poses_are_dropped_and_counted(tmp_path: Path) -> Non
     nothing.pose.orientation = type(q)(x=0.0, y=0.0, z=0.0, w=0.0)
     references, log = references_of(tmp_path, [bags.pose_stamped(START), nothing, bags.pose_stamped(START + 2 * S, np.nan)])
     assert len(references) == 1
-    assert log.warnings() == ["/ref: 2 messages dropped (NaN or inf)."]
+    assert [found.statement for found in log.warnings()] == ["/ref: 2 messages dropped (NaN or inf)."]
 
 
 def test_references_gps_fixes_are_metres_east_and_north_of_the_first(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from localization import sensor_checks
+from localization.logs.decode import Oddity
 from localization.messages import message, phrase, subject
 from localization.sensor_checks.faults import SensorFault
 from localization.sensor_checks.sensor_consistency import DIFFERENCES
@@ -52,9 +53,14 @@ def test_messages_of_the_code_are_in_a_table_with_the_fields_that_they_are_given
     for where, call in found:
         table = TEMPLATES if call.func.id == "message" else PHRASES
         name, given = call.args[0].value, {keyword.arg for keyword in call.keywords}
-        if name not in table or (None not in given and given != fields(table[name])):
+        named, has_more = given - {None}, None in given
+        if name not in table or not named <= fields(table[name]) or (not has_more and named != fields(table[name])):
             wrong.append((where, name))
     assert wrong == []
+
+
+def test_oddities_of_messages_have_the_fields_that_they_are_given():
+    assert {oddity.value: fields(TEMPLATES[oddity.value]) for oddity in Oddity} == {o.value: {"topic", "messages"} for o in Oddity}
 
 
 def test_messages_of_a_table_are_used():

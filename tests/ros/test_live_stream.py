@@ -77,7 +77,7 @@ def test_live_node_reports_clock_rates_that_hold_for_logs_alone():
     assert not notes_on_clocks(ROBOT.clock)
     _, reports = run_node(LogTransport(drive_log(scans_hz=6.25)), robot=robot)
     notes = [text for text in reports if "rate_error" in text]
-    assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it; synchronize the clocks."]
+    assert notes == ["clock.gyro_rate_error holds for logs alone, and the node does not use it. Synchronize the clocks."]
 
 
 def with_scans_ahead(seconds: int, until_s: float = math.inf):

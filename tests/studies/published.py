@@ -20,11 +20,14 @@ from localization.calibration.calibrate import Cut, calibrated
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference
 from localization.calibration.windows import WindowConfig, cut
 from localization.core.motion import FilterConfig
+from localization.estimate import Estimate
 from localization.evaluation.consistency import mean_band, nees
 from localization.events import Event, ImuSample, Scan, WheelSample
+from localization.inputs.step_config import StepConfig
 from localization.lidar import LidarConfig
 from localization.log_replay import Run, replay
-from localization.pipeline import Trial
+from localization.pipeline import Pipeline, Trial
+from localization.ros.predictor import Predictor
 from motion_models import se2
 from motion_models.online_calibration import make_corrections
 from motion_models.registry import make_model
@@ -128,6 +131,8 @@ CONFIGS = (
     Config("wheels: odometry", "odometry", (ImuSample, Scan)),
 )
 
+FILTERS = tuple(config for config in CONFIGS if config.estimator == "ekf")
+
 
 def scores(drawn: Drawn, config: Config) -> dict[str, FloatArray]:
     """NEES a degree of freedom by number: (n,) over the times of poses and twists, (1,) of a parameter."""
@@ -144,6 +149,30 @@ def scores(drawn: Drawn, config: Config) -> dict[str, FloatArray]:
         if name in drawn.parameters and sigma > 0.0:
             found[name] = np.array([((value - drawn.parameters[name]) / sigma) ** 2])
     return found
+
+
+def predicted(drawn: Drawn, config: Config) -> dict[str, FloatArray]:
+    """NEES a degree of freedom of the odometry between estimates, as a node publishes it at every sixth wheel sample."""
+    given, has_lidar = without(drawn, *config.missing), Scan not in config.missing
+    pipeline = Pipeline(Trial(make_model(MODEL, rooms.ROBOT), config.estimator), rooms.ROBOT, given.drive.mounts, has_lidar)
+    predictor, estimator, found = Predictor(make_model(MODEL, rooms.ROBOT), rooms.ROBOT, StepConfig()), pipeline.estimator, list[Estimate]()
+    samples = 0
+    for event in given.drive.events:
+        for estimate in pipeline.process(event):
+            found = found or [estimate]
+            predictor.reset(estimate, estimator.wheel_calibration, estimator.clock_offset_s, estimator.gyro_calibration)
+        samples += isinstance(event, WheelSample)
+        if isinstance(event, WheelSample) and samples % 6 == 0:
+            newest = predictor.predict(pipeline.synchronizer.wheels.buffer, pipeline.synchronizer.turn)
+            found += [] if newest is None else [newest]
+    stamps = np.array([estimate.stamp_ns for estimate in found])
+    poses, twists = truth_at(drawn, stamps)
+    settled = stamps >= stamps[0] + _SETTLED_S * 1e9
+    error = se2.log(se2.between(poses, se2.between(found[0].pose, np.array([estimate.pose for estimate in found]))))
+    scored = {"pose": nees(error[settled], np.array([estimate.covariance for estimate in found])[settled]) / 3.0}
+    off = np.array([estimate.twist for estimate in found]) - twists
+    variances = np.array([np.full(3, np.nan) if e.twist_covariance is None else np.diagonal(e.twist_covariance) for e in found])
+    return scored | {f"twist {axis}": (off[settled, k] ** 2 / variances[settled, k]) for k, axis in enumerate(("vx", "vy", "wz"))}
 
 
 def calibrated_by(drawn: Drawn, by: str) -> dict[str, FloatArray]:
@@ -213,6 +242,9 @@ def rows(drives: int, seed: int, only: str, slip_s: float) -> Iterator[str]:
     for config in CONFIGS:
         if only in config.name:
             yield from _rows_of(config.name, measure(drawn, config))
+    for config in FILTERS:
+        if only in (name := f"{config.name}, predicted"):
+            yield from _rows_of(name, _by_name([predicted(each, config) for each in drawn]))
     for by in ("LiDAR", "gyro"):
         if only in (name := f"calibrate by {by}"):
             yield from _rows_of(name, _by_name([calibrated_by(each, by) for each in drawn]))

@@ -10,7 +10,7 @@ from localization.log_replay import replay
 from localization.pipeline import Trial
 from motion_models.registry import make_model
 from tests.helpers import rooms
-from tests.studies.published import CONFIGS, MODEL, Config, draw, measure
+from tests.studies.published import CONFIGS, FILTERS, MODEL, Config, draw, measure, predicted
 
 DRIVES = 10
 _PARAMETERS = mean_band(DRIVES, 1.0, 0.9999)
@@ -30,6 +30,15 @@ def test_published_numbers_err_as_their_covariances_have_it(drawn, config: Confi
     assert {name: mean for name, mean in of_states.items() if not 0.1 < mean < 2.0} == {}
     others = {name: mean for name, mean in found.items() if name not in of_states}
     assert {name: mean for name, mean in others.items() if not _PARAMETERS[0] < mean < _PARAMETERS[1]} == {}
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("config", FILTERS, ids=lambda config: config.name)
+def test_predictions_err_as_their_covariances_have_it(drawn, config: Config):
+    """The twist has the errors of the motion model's parameters and of the radius, beside the slip."""
+    found = [predicted(each, config) for each in drawn]
+    means = {name: float(np.mean([each[name].mean() for each in found])) for name in found[0]}
+    assert {name: mean for name, mean in means.items() if not 0.1 < mean < 2.0} == {}
 
 
 @pytest.mark.parametrize("seed", [1006, 1022, 1028])  # wheels that are .21, .19 and .14 s late
