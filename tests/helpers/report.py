@@ -10,12 +10,21 @@ import numpy as np
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import score
 from localization.log_replay import Run
+from localization.messages import message
 from localization.report.replay_page import ReportHead
 from localization.trajectory import Trajectory
 from motion_models import se2
 
 SECOND = 10**9
-HEAD = ReportHead("corridor.mcap", "vaultbot", "2026-01-02 03:04:05 UTC", 200.0, ["3 scans were empty."], {"skidloc": "0.1.0"}, "c0ffee")
+HEAD = ReportHead(
+    "corridor.mcap",
+    "vaultbot",
+    "2026-01-02 03:04:05 UTC",
+    200.0,
+    [message("scans.empty", scans="3 scans")],
+    {"skidloc": "0.1.0"},
+    "c0ffee",
+)
 
 
 def drive(n=400, turns=2.0):
