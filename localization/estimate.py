@@ -61,8 +61,10 @@ class WheelCalibration(NamedTuple):
 
     def cov_of(self, moved: FloatArray, by_params: FloatArray) -> FloatArray:
         """(3, 3) of a twist or motion ``moved`` (3,) by the errors of both; ``by_params`` (3, k): its derivative by the parameters."""
-        by_radius = np.array([moved[0], moved[1], 0.0])
-        return np.asarray(by_params @ self.params_cov @ by_params.T + self.radius_variance * np.outer(by_radius, by_radius))
+        cov: FloatArray = by_params @ self.params_cov @ by_params.T
+        way = moved[:2]
+        cov[:2, :2] += self.radius_variance * way[:, None] * way
+        return cov
 
 
 class GyroCalibration(NamedTuple):

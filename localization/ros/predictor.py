@@ -121,10 +121,11 @@ class Predictor:
                 change, variance = _change_of_rate(dt, twists[:, 2], turn.rate_age_s)
                 by_gyro[2:] = rate[0] + change, rate[1] + variance + _slip_change(self._slip, twists[-1], turn.rate_age_s)
         motion, twist, twist_cov = predicted_motion(dt, twists, self._noise, np.array(by_gyro))
-        is_open = np.array([1.0, 1.0, float(turn is None)])  # a turn by the gyro has no error of the wheels
-        by_params = np.einsum("t,tik->ik", dt, by_model.d_params)
-        motion = replace(motion, cov=motion.cov + is_open[:, None] * calibration.cov_of(motion.delta, by_params) * is_open)
-        twist_cov = twist_cov + is_open[:, None] * calibration.cov_of(twist, by_model.d_params[-1]) * is_open
+        by_params = by_model.d_params[-1].copy()
+        if turn is not None:  # a turn by the gyro has no error of the wheels
+            by_params[2] = 0.0
+        of_wheels = calibration.cov_of(twist, by_params)
+        motion, twist_cov = replace(motion, cov=motion.cov + float(dt.sum()) ** 2 * of_wheels), twist_cov + of_wheels
         if missing:
             unknown = UnknownVelocity(self._config.unknown_sigma)
             unknown.measured = self.last.twist
