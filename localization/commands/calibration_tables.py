@@ -12,7 +12,7 @@ from rich.table import Table
 
 from localization.calibration.calibrate import Calibrated, Cut, TurningInPlace, describe_clocks, heading_error
 from localization.calibration.windows import driven
-from localization.commands.common import add_row, plain_table, print_line, print_table
+from localization.commands.common import add_row, plain_table, print_line, print_message, print_table
 from motion_models.base import MotionModel
 from motion_models.calibration.cross_validation import Interval, LearnedNoise, root_mean, root_mean_gain
 from motion_models.calibration.plan import CLOCK, text_of
@@ -48,7 +48,7 @@ def print_cuts(console: Console, robot: Robot, cuts: Sequence[Cut]) -> None:
             f"{each.source}: {seconds:.0f} s of motion, {metres:.1f} m and {radians:.1f} rad by the wheels, measured by {each.measured_by}",
         )
         for note in each.warnings:
-            print_line(console, f"  {note}")
+            print_message(console, note)
 
 
 def print_better_model(console: Console, found: Calibrated, cuts: Sequence[Cut], robot: Robot) -> None:

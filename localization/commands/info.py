@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from localization.calibration.robot_notes import robot_notes
-from localization.commands.common import print_table, print_warning, write_json
+from localization.commands.common import print_message, print_table, print_warning, write_json
 from localization.logs import LogInfo, TopicOverrides, inspect_log, open_log
 from localization.logs.topic_roles import CHOSEN_BY
 from localization.output import check_outputs
@@ -69,4 +69,4 @@ def _print(console: Console, info: LogInfo) -> None:
     for problem in info.problems:
         print_warning(console, problem)
     for note in info.warnings:
-        console.print(f"  {note}", markup=False, soft_wrap=True)
+        print_message(console, note)
