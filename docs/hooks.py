@@ -67,7 +67,7 @@ def warnings_page() -> str:
         lines += ["", f"## {table['title']}", ""]
         for name, entry in found.items():
             text = _FIELD.sub("…", f"{entry['text']} {entry.get('remedy', '')}".strip())
-            lines.append(f"- {'**!**' if 'remedy' in entry else '-'} `{subject}.{name}`: {escape(text, quote=False)}")
+            lines.append(f"- {'**!** ' if 'remedy' in entry else ''}`{subject}.{name}`: {escape(text, quote=False)}")
         lines += ["", f"**Cause.** {table['cause']}", "", f"**Cure.** {table['cure']}"]
     return "\n".join(lines) + "\n"
 
