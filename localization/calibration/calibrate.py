@@ -147,8 +147,7 @@ def cut_log(
         guess = estimate_antenna(windows.maneuvers, robot)[0]
         motion_reference = motion_reference.with_guess(guess)
         windows = cut(log.events(), motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
-    counts = {"count": len(windows.maneuvers), "standing": windows.standing, "unmeasured": windows.unmeasured}
-    left = message("measured_motion.windows", length_s=config.window_s, **counts)
+    left = message("measured_motion.windows", length_s=config.window_s, **windows.counts)
     found = Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
     if not isinstance(motion_reference, PositionMotionReference):
         return found

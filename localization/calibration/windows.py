@@ -59,6 +59,11 @@ class Windows:
     step_rad: float = 0.0
     """Step of the encoders [rad]; 0 where none was seen."""
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Windows, and those left out by reason, as messages have them."""
+        return {"count": len(self.maneuvers), "standing": self.standing, "unmeasured": self.unmeasured}
+
 
 def cut(
     events: Iterable[Event],

@@ -336,10 +336,9 @@ def _describe_gaps(gyro: GyroRecord) -> Message:
 
 def _describe_windows(windows: Windows, spans: IntArray, config: WindowConfig) -> Message:
     length_s = float(np.median(spans[:, 1] - spans[:, 0])) * _NS if len(spans) else config.window_s
-    counts = {"count": len(windows.maneuvers), "standing": windows.standing, "unmeasured": windows.unmeasured}
     if length_s > 1.3 * config.window_s and not any(m.middle for m in windows.maneuvers):
-        return message("measured_motion.sparse", length_s=length_s, window_s=config.window_s, **counts)
-    return message("measured_motion.windows", length_s=length_s, **counts)
+        return message("measured_motion.sparse", length_s=length_s, window_s=config.window_s, **windows.counts)
+    return message("measured_motion.windows", length_s=length_s, **windows.counts)
 
 
 def find_message_loss(stamps: IntArray) -> MessageLoss | None:

@@ -226,13 +226,11 @@ def _correction_warnings(
         after = robot if row.correct is None else row.correct(robot)
         entries = changed_entries(robot, after)
         written = "; ".join(f"{key} = {value}" for key, value in entries.items())
-        facts = {"topic": _topic(sources, row), "fault": row.text, "probability": probability, "witnesses": _witnesses(sources, row)}
+        about = {"topic": _topic(sources, row), "fault": row.text, "probability": probability, "others": _others(sources, row)}
         if written:
-            found.append(message("set_up.certain", correction=phrase("set_up.in_this_run"), entries=written, **facts))
-        elif row.remedy:
-            found.append(message("set_up.by_hand", remedy=row.remedy, **facts))
+            found.append(message("set_up.certain", correction=phrase("set_up.in_this_run"), entries=written, **about))
         else:
-            found.append(message("set_up.unknown", **facts))
+            found.append(message("set_up.by_hand", remedy=row.remedy or phrase("set_up.check"), **about))
     return found
 
 
@@ -261,7 +259,7 @@ def _topic(sources: Sequence[Source], row: Row) -> str:
     return next((source.name for source in sources if source.kind in kinds), kind)
 
 
-def _witnesses(sources: Sequence[Source], row: Row) -> str:
+def _others(sources: Sequence[Source], row: Row) -> str:
     topic = _topic(sources, row)
     return " and ".join(source.name for source in sources if source.name != topic) or phrase("set_up.own_messages")
 

@@ -52,7 +52,7 @@ class Message(str):
     body: str
     """The sentence without what it is about and when that began, which come first."""
     remedy: str
-    """The part that says what to do; empty for a note."""
+    """The part with what to do; empty for a note."""
     values: Mapping[str, Value]
     """The numbers and names in it, by field."""
     source: str

@@ -3,7 +3,7 @@
 python -m tests.studies.published [--drives 40] [--seed 0] [--only TEXT]
 
 Each drive draws what the priors are of (k of the motion model, wheel radius, bias and scale of the gyro, offset of the wheels' clock) from
-them, its slip and its ranges from the noise models, white as they have it, and a room. Nothing of it is told to the estimators. The table
+them, its slip and its ranges from the noise models, white as they have it, and a room. None of it is given to the estimators. The table
 has the mean NEES a degree of freedom of each number over all times and drives (1 is expected), its band of 95 % for as many independent
 drives, and the shares of drives and times within one and two sigma.
 """

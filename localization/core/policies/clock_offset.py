@@ -64,8 +64,10 @@ def unmeasured_start(state: State, innovation: Innovation) -> Cov3 | None:
     accelerations a, it is zero, and a start would move the clock by as much as it likes: with accelerations of `_ACCELERATIONS` at both
     ends, and E[e^4] = 3 s^4, the second has the variance 3/2 s^4 a^2. Bayes factor of two Gaussians, with prior odds.
     """
+    if 0.5 * innovation.nis + _START_LOG_ODDS <= 0.0:  # no wider covariance explains it by more than all of it
+        return None
     H, S, y = innovation.H[:, state.layout.rows["pose"]], innovation.S, innovation.residual
     missed = np.diag(1.5 * state.variance("clock") ** 2 * _ACCELERATIONS**2)
     wider = S + H @ missed @ H.T
-    gain = y @ np.linalg.solve(S, y) - y @ np.linalg.solve(wider, y) - math.log(np.linalg.det(wider) / np.linalg.det(S))
+    gain = innovation.nis - y @ np.linalg.solve(wider, y) - math.log(np.linalg.det(wider) / np.linalg.det(S))
     return missed if 0.5 * gain + _START_LOG_ODDS > 0.0 else None
