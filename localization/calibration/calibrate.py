@@ -18,7 +18,8 @@ from localization.errors import EvaluationError
 from localization.evaluation.reference_check import check_reference
 from localization.evaluation.reference_files import load_reference
 from localization.evaluation.references import ReferenceTrack
-from localization.evidence import open_log_as_declared
+from localization.evidence import open_log_to_fit
+from localization.evidence.verdict import changed_entries
 from localization.logs import Log, TopicOverrides
 from localization.messages import Message, message, phrase
 from localization.trajectory import BoolArray
@@ -57,6 +58,8 @@ class Cut:
     """Where in the body frame positions without headings were measured [m]."""
     is_antenna_known: bool = True
     """False where it is to be fitted."""
+    robot: Robot | None = None
+    """With what is certain of the log's set-up corrected; None for tables."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,8 @@ def cut_log(
     against it. Raises `CalibrationError` where nothing measures the motion, and what opening the log does.
     """
     config = config or WindowConfig()
-    log = open_log_as_declared(path, robot, topics.scored_against(reference))
+    log = open_log_to_fit(path, robot, topics.scored_against(reference))
+    robot = log.robot
     if log.sources.wheels is None and log.wheels_error is None:
         raise CalibrationError(
             f"{log.path.name} has {log.no_wheels or 'no wheels by these options.'} Name them with --topic.joint-states or --topic.odometry."
@@ -148,10 +152,26 @@ def cut_log(
         motion_reference = motion_reference.with_guess(guess)
         windows = cut(log.events(), motion_reference, make_model("diff_drive", robot), robot, config, log.path.name)
     left = message("measured_motion.windows", length_s=config.window_s, **windows.counts)
-    found = Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()))
+    found = Cut(log.path.name, windows.maneuvers, words, (left, *windows.warnings, *log.warnings()), robot=robot)
     if not isinstance(motion_reference, PositionMotionReference):
         return found
     return dataclasses.replace(found, antenna=motion_reference.antenna, is_antenna_known=motion_reference.is_antenna_known)
+
+
+def cut_alike(paths: Sequence[Path], robot: Robot, cut_one: Callable[[Path, Robot], Cut]) -> tuple[list[Cut], Robot]:
+    """The maneuvers of all logs, each cut by the set-up of the first, and the robot with that. Raises `CalibrationError` for a log of
+    another set-up, and what ``cut_one`` does."""
+    cuts: list[Cut] = []
+    for path in paths:
+        found = cut_one(path, robot)
+        new = found.robot or robot
+        if cuts and (entries := changed_entries(robot, new)):
+            written = "; ".join(f"{key} = {value}" for key, value in entries.items())
+            raise CalibrationError(
+                f"{found.source} has another set-up than {cuts[0].source} ({written}): name it first, or calibrate each by itself."
+            )
+        cuts, robot = [*cuts, found], new
+    return cuts, robot
 
 
 def make_motion_reference(

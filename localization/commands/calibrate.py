@@ -19,6 +19,7 @@ from localization.calibration.calibrate import (
     MotionReferenceName,
     TurningInPlace,
     calibrated,
+    cut_alike,
     cut_log,
     turning,
     with_clock,
@@ -35,9 +36,9 @@ from localization.commands.calibration_tables import (
     regression_numbers,
 )
 from localization.commands.common import in_radians, print_line, write_json
+from localization.evidence.verdict import as_written
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
-from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import read_windows, table_columns, windows_text, without_foreign_frames
 from motion_models.calibration.regressions import RotationTable, read_rotations, rotations_as_maneuvers, skid_steer_fit
 from motion_models.calibration.ros_export import diff_drive_controller_yaml, robot_localization_yaml
@@ -99,7 +100,7 @@ class Calibrate:
         """Run the command. Raises `SkidlocError` for input that cannot be used."""
         self._check()
         robot = load_robot(self.robot)
-        model = make_model(self.model, robot)
+        make_model(self.model, robot)  # an unknown model ends here, before logs are read
         kinds = {_kind(path) for path in self.source}
         if len(kinds) > 1:
             raise CalibrationError(f"logs, tables of windows and tables of rotations cannot be calibrated on together: {', '.join(kinds)}.")
@@ -109,7 +110,7 @@ class Calibrate:
                 raise CalibrationError("skid_steer on a table of rotations has no page: name --model friction, or leave --page out.")
             new, sigmas, numbers = self._regressions(console, robot)
         else:
-            new, sigmas, numbers = self._fit(console, robot, model, kind)
+            new, sigmas, numbers = self._fit(console, robot, kind)
         self._write(console, robot, new, sigmas, numbers)
 
     def _check(self) -> None:
@@ -129,10 +130,13 @@ class Calibrate:
         if self.out is not None and self.out.suffix != ".toml":
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
 
-    def _fit(self, console: Console, robot: Robot, model: MotionModel, kind: str) -> tuple[Robot, dict[str, float], dict[str, Any]]:
+    def _fit(self, console: Console, robot: Robot, kind: str) -> tuple[Robot, dict[str, float], dict[str, Any]]:
         of_rotations = kind == "rotations"
         with console.status("cutting into maneuvers"):
-            cuts = [self._cut(path, robot, kind) for path in self.source]
+            cuts, robot = cut_alike(self.source, robot, lambda path, known: self._cut(path, known, kind))
+        model = make_model(self.model, robot)
+        if self.out is not None:
+            cuts = [dataclasses.replace(each, warnings=as_written(each.warnings)) for each in cuts]
         free = [name.strip() for name in self.fit.split(",") if name.strip()]
         found = calibrated(model, cuts, robot, free, of_rotations)
         about = turning(found, robot)

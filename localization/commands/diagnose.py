@@ -38,7 +38,7 @@ from localization.diagnosis.linearization import default_model
 from localization.diagnosis.model_extension import EXTENSION_HEADS
 from localization.diagnosis.result import DiagnosisResult
 from localization.diagnosis.suited_model import examine_beside_suited
-from localization.evidence import open_log_as_declared
+from localization.evidence import open_log_to_fit
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -101,12 +101,14 @@ class Diagnose:
         check_outputs(self.out, self.json)
         self._check_others()
         robot = load_robot(self.robot)
-        model = make_model(self.model or default_model(robot), robot)
+        make_model(self.model or default_model(robot), robot)  # an unknown model ends here, before the log is read
         is_table = self.source.suffix.lower() == ".csv"
         reader = None if is_table else self._reader(self.source)
         others = [self._reader(path) for path in self.others]
         with console.status("reading"):
             drive = self._drive(robot, reader)
+        robot = drive.robot  # as the log has it
+        model = make_model(self.model or default_model(robot), robot)
         baseline = None
         if self.healthy is not None:
             with console.status("reading the healthy drive"):
@@ -127,6 +129,8 @@ class Diagnose:
                 found = _with_written_robot(found, reader, others)
         content = found.diagnosis.to_dict()
         if self.out is not None:
+            found = dataclasses.replace(found, diagnosis=found.diagnosis.with_set_up_written())
+            content = found.diagnosis.to_dict()
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
                 corrected, manual_steps = self._write_robot(folder, found, robot, extended)
@@ -179,7 +183,7 @@ class Diagnose:
         return Reader(lambda robot: self._open(path, robot), self._cut)
 
     def _open(self, path: Path, robot: Robot) -> Log:
-        return open_log_as_declared(path, robot, self.topic.scored_against(self.reference))
+        return open_log_to_fit(path, robot, self.topic.scored_against(self.reference))
 
     def _cut(self, log: Log) -> Drive:
         config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
@@ -209,7 +213,8 @@ class Diagnose:
         ):
             named = (f"{f.definition.label} {f.size:+.4g} +- {f.sigma:.2g} {f.definition.unit}".removesuffix(" 1") for f in findings)
             remarks += [f"{title}: {'; '.join(named)}."] if findings else []
-        remarks += ["Found: nothing."] if not d.findings else []
+        remarks += [] if d.findings or d.set_up else ["Found: nothing."]
+        remarks += d.set_up
         remarks += manual_steps
         if d.handover is not None:
             remarks.append(d.handover.describe())

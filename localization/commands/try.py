@@ -28,12 +28,11 @@ from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.handover import Reader
 from localization.evaluation.references import ReferenceTrack, Relations
 from localization.evaluation.scores import Result
-from localization.evidence import open_log_as_declared
+from localization.evidence import open_log_to_fit
 from localization.logs import Log, open_log
 from localization.output import check_outputs
 from localization.report.replay_page import ReportHead
 from localization.report.try_page import Part, Replayed, TryResult, summarize, write_try_page
-from motion_models.base import MotionModel
 from motion_models.diff_drive import DiffDrive
 from motion_models.errors import SkidlocError
 from motion_models.input_files import read_text
@@ -132,7 +131,7 @@ class Try:
     def _cut(self, robot: Robot) -> tuple[Log, Drive] | None:
         """The log and its windows, with what was measured in each; None where nothing was."""
         try:
-            log = open_log_as_declared(self.log, robot)
+            log = open_log_to_fit(self.log, robot)
             drive = drive_of_log(log)
         except SkidlocError:
             return None
@@ -164,8 +163,8 @@ class _CalibrateCut(Calibrate):
     def _cut(self, path: Path, robot: Robot, kind: str) -> Cut:
         return super()._cut(path, robot, kind) if self.cut is None else self.cut
 
-    def _fit(self, console: Console, robot: Robot, model: MotionModel, kind: str) -> tuple[Robot, dict[str, float], dict[str, Any]]:
-        found, sigmas, numbers = super()._fit(console, robot, model, kind)
+    def _fit(self, console: Console, robot: Robot, kind: str) -> tuple[Robot, dict[str, float], dict[str, Any]]:
+        found, sigmas, numbers = super()._fit(console, robot, kind)
         for path in self.others:
             fitted = load_robot(path).models.get(path.stem) if path.exists() else None
             found = found if fitted is None else replace(found, models={**found.models, path.stem: fitted})
@@ -203,7 +202,7 @@ class _DiagnoseDrive(Diagnose):
 
 def _cut_of(drive: Drive) -> Cut:
     """The windows of ``drive`` for a calibration."""
-    return Cut(drive.name, drive.maneuvers, drive.motion_reference, drive.warnings)
+    return Cut(drive.name, drive.maneuvers, drive.motion_reference, drive.warnings, robot=drive.robot)
 
 
 def _corrected_file(robot_file: str, checked: Path) -> str:

@@ -16,7 +16,7 @@ from localization.calibration.windows import WindowConfig
 from localization.commands.common import add_row, in_radians, new_folder, plain_table, print_line, print_table, write_json
 from localization.diagnosis.drive import Drive, drive_of_log, drive_of_table
 from localization.errors import SimulationError
-from localization.evidence import open_log_as_declared
+from localization.evidence import open_log_to_fit
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.twin_page import percent, slide, write_twin_page
@@ -123,7 +123,7 @@ class Twin:
     def _maneuvers(self, path: Path, robot: Robot) -> tuple[list[Maneuver], str]:
         """Maneuvers of one log or table, and a sentence on its commands."""
         if path.suffix.lower() != ".csv":
-            log = open_log_as_declared(path, robot, self.topic.scored_against(self.reference))
+            log = open_log_to_fit(path, robot, self.topic.scored_against(self.reference))
             config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
             return maneuvers_of(log, drive_of_log(log, self.motion_reference, self.reference, config, sigmas), self.commands)
         if "rotation_ratio" in table_columns(path):

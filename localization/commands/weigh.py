@@ -17,7 +17,7 @@ from localization.commands.common import in_radians, print_message, write_json
 from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import DrivenWeighing, weigh
-from localization.evidence import open_log_as_declared
+from localization.evidence import open_log_to_fit
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.weigh_page import weigh_rows, write_weigh_page
@@ -60,7 +60,7 @@ class Weigh:
             raise CalibrationError(f"--out {self.out}: a robot file must end in .toml, or --robot will not take it.")
         robot = load_robot(self.robot)
         with console.status("reading"):
-            log = open_log_as_declared(self.log, robot, self.topic.scored_against(self.reference))
+            log = open_log_to_fit(self.log, robot, self.topic.scored_against(self.reference))
             drive = drive_of_log(log, self.motion_reference, self.reference, reference_sigmas=in_radians(self.reference_sigma))
         if not drive.has_headings:
             raise CalibrationError(

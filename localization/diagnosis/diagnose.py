@@ -589,13 +589,19 @@ def _with_data_errors(d: Diagnosis, drive: Drive) -> Diagnosis:
     """``d`` with what was counted where the log was read as findings, and without a consistent verdict where
     measurements contradict each other."""
     verdict, findings = d.verdict, (*_counted_findings(d, drive), *d.findings)
-    verdict = "explained" if verdict == "consistent" and findings else verdict
+    verdict = "explained" if verdict == "consistent" and (findings or drive.set_up) else verdict
     contradictions = () if drive.standstill_turn is None else (describe_standstill_turn(drive.standstill_turn),)
     if contradictions and verdict == "consistent":
         verdict = "unexplained"
     suspected, next_drive = (d.suspected, d.next_drive) if verdict == d.verdict or d.suspected is None else (None, "")
     return dataclasses.replace(
-        d, verdict=verdict, findings=findings, contradictions=contradictions, suspected=suspected, next_drive=next_drive
+        d,
+        verdict=verdict,
+        findings=findings,
+        contradictions=contradictions,
+        suspected=suspected,
+        next_drive=next_drive,
+        set_up=drive.set_up,
     )
 
 

@@ -127,6 +127,8 @@ class Drive:
     """x and y in the body frame of the antenna, for positions without headings [m]."""
     encoder_step_rad: float = 0.0
     """Step of the wheels' encoders [rad]; 0 where it is not known."""
+    set_up: tuple[Message, ...] = ()
+    """How the log's sensors are set up otherwise than the robot file had it: `robot` has that corrected."""
     warnings: tuple[Message, ...] = ()
 
     @property
@@ -264,7 +266,10 @@ def drive_of_log(
         drive = dataclasses.replace(drive, warnings=(*drive.warnings, note))
     losses = tuple(EncoderLoss(f.joint, f.messages / max(drive.rolling_messages, f.messages), f.spells) for f in log.frozen_wheels())
     source: CgSource = "topic" if log.sources.center_of_gravity is not None else "arms" if log.sources.arms else "constant"
-    return dataclasses.replace(drive, encoder_losses=losses, cg_source=source, warnings=(*drive.warnings, *log.warnings()))
+    notes = log.warnings()
+    set_up = tuple(note for note in notes if note.id.startswith("set_up."))
+    rest = tuple(note for note in notes if note not in set_up)
+    return dataclasses.replace(drive, encoder_losses=losses, cg_source=source, set_up=set_up, warnings=(*drive.warnings, *rest))
 
 
 def drive_of_events(

@@ -15,6 +15,7 @@ from localization.diagnosis.causes.cause import Cause, DriveMotion, Hypothesis, 
 from localization.diagnosis.causes.floor import slip_stiffness_cause
 from localization.diagnosis.drive import Drive
 from localization.diagnosis.friction_response import TRACKED, ManeuverSamples, dynamic_twists, quasi_static_twists
+from localization.evidence.sensor_errors import GYRO_SCALE_SIGMA
 from motion_models import se2
 from motion_models.base import MotionModel
 from motion_models.calibration.maneuvers import Batch, IntArray, Maneuver, make_batch
@@ -102,7 +103,6 @@ def _like(a: float, b: float) -> bool:
 CHANNELS = ("x", "y", "yaw", "gyro", "force_x", "force_y")
 CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
-_GYRO_SCALE_SIGMA = 0.03  # sensitivity tolerance of MEMS gyros (see `causes`)
 _MAX_CACHED_TWISTS = 100
 _STAGES = get_args(Stage)
 _LEAST_MU = 0.05  # ice
@@ -238,7 +238,7 @@ class DrivePredictor:
             if known:
                 scale, bias = 0.0, sum(k[0] for k in known) / sum(k[2] for k in known)
                 if self.is_gyro_scaled:
-                    prior = (0.0, _GYRO_TURN_SIGMA_RAD / _GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
+                    prior = (0.0, _GYRO_TURN_SIGMA_RAD / GYRO_SCALE_SIGMA, 0.0)  # of the scale, where the robot hardly turns
                     off, *columns = np.array([*known, prior]).T
                     (scale, bias), *_ = np.linalg.lstsq(np.column_stack(columns), off, rcond=None)
                 starts = drive.spans_ns[:, 0]

@@ -18,6 +18,7 @@ from localization.diagnosis.drive_predictor import CHANNELS
 from localization.diagnosis.gate import HandoverCheck
 from localization.diagnosis.model_extension import Extension
 from localization.diagnosis.noise import Noise
+from localization.evidence.verdict import as_written
 from localization.messages import Message, message, phrase
 from motion_models.se2 import FloatArray
 
@@ -267,6 +268,8 @@ class Diagnosis:
     """Probability that a healthy robot has as much within tolerance as this drive shows, of all causes together."""
     handover: HandoverCheck | None = None
     """Gain of the corrected robot file on the second half of the drive."""
+    set_up: tuple[Message, ...] = ()
+    """How the sensors are set up otherwise than the robot file had it, which was corrected before anything was compared."""
     extension: Extension | None = None
     """Terms and bound effects that were searched beside the findings; None where none were searched, or none found."""
 
@@ -288,6 +291,10 @@ class Diagnosis:
         check = self.gain if self.handover is None else self.handover.gain
         return self.verdict != "unexplained" or (check is not None and check.low > 0.0)
 
+    def with_set_up_written(self) -> Diagnosis:
+        """The diagnosis whose sentence says that a robot file has the set-up."""
+        return dataclasses.replace(self, set_up=as_written(self.set_up))
+
     def to_dict(self) -> dict[str, Any]:
         """The format of `diagnose --json`, whose keys stay as they are."""
         left: dict[str, Any] = {"share": self.left_share, "shapes": [vars(s) for s in self.trends], "text": [s.text for s in self.trends]}
@@ -303,6 +310,7 @@ class Diagnosis:
             "suspected": None if self.suspected is None else self.suspected.to_dict(),
             "next_drive": self.next_drive,
             "sentence": self.sentence,
+            "set_up": [each.as_json() for each in self.set_up],
             "tolerances": dict(self.tolerances),
             "handover": None if self.handover is None else {**self.handover.to_dict(), "is_better": self.is_confirmed},
             "extension": None if self.extension is None else self.extension.to_dict(),
@@ -475,7 +483,12 @@ def confirmed_findings(d: Diagnosis) -> list[Finding]:
 
 
 def sentence(d: Diagnosis) -> str:
-    """What to do: corrections, terms and effects, what is not written and why, and what is left without a name."""
+    """What to do: the set-up, corrections, terms and effects, what is not written and why, and what is left without a name."""
+    return " ".join((*d.set_up, _of_motion(d)))
+
+
+def _of_motion(d: Diagnosis) -> str:
+    """The sentence without the set-up."""
     contradiction = f" {d.contradictions[0][0].upper()}{d.contradictions[0][1:]}" if d.contradictions else ""
     missing = [f"{f.description} ({f.evidence})" for f in d.findings if f.is_counted]
     if d.verdict == "undecidable":
@@ -483,7 +496,7 @@ def sentence(d: Diagnosis) -> str:
         found = "".join(f" {text[0].upper()}{text[1:]}." for text in missing)
         return f"{cannot}{found}{contradiction} {d.next_drive}"
     added = [] if d.extension is None else [text for text in (d.extension.describe(), d.extension.describe_refused()) if text]
-    if d.verdict == "consistent":
+    if d.verdict == "consistent" or (d.verdict == "explained" and d.set_up and not (d.findings or added)):
         text = f"{d.model} fits this drive: {d.windows} windows show no error beyond its tolerance"
         if d.joint_p < _JOINT_LEVEL:
             text = f"Each cause by itself is within its tolerance, and {_joint(d)}"
@@ -519,11 +532,11 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     """What to correct, strongest finding first, and what that gains on windows that did not correct it."""
     first = findings[0]
     text = f"Correct {first.definition.label} by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
-    whole = d.gain or first.gain
-    if d.handover is not None and d.handover.replays:
+    gain = (d.gain or first.gain).relative if d.handover is None else d.handover.gain.value
+    if d.handover is not None and any(each.after_m < each.before_m for each in d.handover.replays.values()):
         text += f"; {d.handover.describe_replays()}"
-    elif whole.relative >= _SHOWN_GAIN:
-        text += f"; held-out discrepancies fall by {100 * whole.relative:.0f} %"
+    elif gain >= _SHOWN_GAIN:
+        text += f"; held-out discrepancies fall by {100 * gain:.0f} %"
     if first.aliases:
         text += f". This drive cannot separate it from {describe_sizes(first.aliases)}"
     if len(findings) > 1:

@@ -35,6 +35,9 @@ _LEG = 5  # windows of a leg, at whose end the pose is compared: 10 s by default
 _DRAWS = 2000
 _LEAST_CHANGE = 1e-3
 """Change of a number over its noise below which a file does not change it: rounding."""
+_LEAST_SHARE = 0.05
+"""Change of a component over its noise (root mean square), over that of the most changed one, below which it is that of reading the log
+again: scans that are matched from another mount have other headings by 1e-5 rad."""
 _SHOWN_CHANGE = 0.01
 """Relative change of a component that is printed."""
 END = "end"
@@ -200,7 +203,8 @@ def compare_rows(before: HeldRows, after: HeldRows, sigmas: FloatArray, weights:
         before_rms[END], after_rms[END] = (math.sqrt(float(np.mean(e))) for e in ends)
         worse += [END] if _is_worse(ends[0], ends[1], np.ones(len(ends[0])), block=1) else []
     change = np.nan_to_num((before.rows - after.rows)[:, shown] / sigmas[:, shown])
-    is_moved = np.abs(change) > _LEAST_CHANGE
+    rms = np.sqrt(np.mean(change**2, axis=0))
+    is_moved = (np.abs(change) > _LEAST_CHANGE) & (rms > _LEAST_SHARE * rms.max())
     moved = np.flatnonzero(is_moved.any(axis=1))
     if not len(moved):
         return HandoverCheck(before_rms, after_rms, len(before.rows), Interval(0.0, 0.0, 0.0), is_changed=False)

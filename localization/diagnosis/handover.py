@@ -35,6 +35,8 @@ _LEAD_NS = 4_000_000_000
 _SAME_WINDOW_S = 0.3
 """Windows of two readings of a log that begin so close are one: clocks that are corrected move them by less."""
 _MIN_HALF_WINDOWS = 8
+_UNCHANGED_M = 1e-6
+"""Difference of two runs' poses that is rounding [m, rad]."""
 _SENSOR_FIELDS = (
     *("wheel_time_offset_s", "gyro_time_offset_s", "gyro_scale", "lidar_offset", "lidar_time_offset_s", "range_scale"),
     "range_bias_m",
@@ -261,13 +263,21 @@ def _reread(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, 
     squares: dict[str, tuple[FloatArray, FloatArray]] = {}
     if after.has_headings:  # chords between positions are no poses to compare with
         start_ns = int(before.spans_ns[candidate.held, 0].min()) - _LEAD_NS
-        errors = []
-        for robot, cut, windows in ((old, before, first), (new, after, second)):
-            turn_m = 0.5 * robot.geometry.track_width_m
-            errors.append({run.estimator: _window_error(run, cut, windows, turn_m) for run in reader.runs(robot, name, start_ns)})
-        squares = {estimator: (errors[0][estimator], errors[1][estimator]) for estimator in errors[0]}
+        runs = [{run.estimator: run for run in reader.runs(robot, name, start_ns)} for robot in (old, new)]
+        turns_m = [0.5 * robot.geometry.track_width_m for robot in (old, new)]
+        for estimator, by_old in runs[0].items():
+            by_new = runs[1][estimator]
+            if _is_changed(by_old, by_new):
+                squares[estimator] = _window_error(by_old, before, first, turns_m[0]), _window_error(by_new, after, second, turns_m[1])
     variances = _window_noise(noise, first, 0.5 * old.geometry.track_width_m)
     return _Reread(held[0], held[1], noise.sigmas[first], noise.weights[first], squares, variances)
+
+
+def _is_changed(one: Run, other: Run) -> bool:
+    """Whether the files move an estimator at all: odometry is as good or bad with any mount of the LiDAR, whose motion it is compared
+    with."""
+    a, b = one.trajectory, other.trajectory
+    return len(a) != len(b) or not np.allclose(a.poses, b.poses, rtol=0.0, atol=_UNCHANGED_M)
 
 
 def _compare_reread(drives: Sequence[_Reread]) -> HandoverCheck | None:
@@ -277,10 +287,10 @@ def _compare_reread(drives: Sequence[_Reread]) -> HandoverCheck | None:
     )
     weights, variances = np.concatenate([d.weights for d in drives]), np.concatenate([d.variances for d in drives])
     found = compare_rows(before, after, np.concatenate([d.sigmas for d in drives]), weights)
-    if found is None or not all(d.squares for d in drives):
-        return found
+    if found is None:
+        return None
     replays = {}
-    for estimator in drives[0].squares:
+    for estimator in (name for name in drives[0].squares if all(name in d.squares for d in drives)):
         old, new = (np.concatenate([d.squares[estimator][k] for d in drives]) for k in (0, 1))
         if (one := _compared(old, new, variances, weights)) is not None:
             replays[estimator] = one

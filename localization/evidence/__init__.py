@@ -5,7 +5,7 @@
 motion integrated out), `search`, `refine`, `verdict`, `entrance`. See docs/theory/set-up.md.
 """
 
-from localization.evidence.entrance import SetUpLog, infer_set_up, open_log_as_declared, open_log_with_set_up
+from localization.evidence.entrance import SetUpLog, infer_set_up, open_log_to_fit, open_log_with_set_up
 from localization.evidence.verdict import Hypothesis, SetUp
 
 __all__ = [
@@ -13,6 +13,6 @@ __all__ = [
     "SetUp",
     "SetUpLog",
     "infer_set_up",
-    "open_log_as_declared",
+    "open_log_to_fit",
     "open_log_with_set_up",
 ]

@@ -25,7 +25,6 @@ from localization.logs import Log, TopicOverrides, open_log
 from localization.logs.decode import MAX_RATE_RAD_S, JointReading, OdometryReading, imu_decoder
 from localization.logs.event_decoder import TopicDecoder, late_ns
 from localization.logs.wheel_messages import angle_period_rad, odometry_decoder, wheel_decoder
-from localization.messages import phrase
 from motion_models.errors import CalibrationError
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -73,13 +72,16 @@ def _question(path: Path, robot: Robot, topics: TopicOverrides) -> bytes:
     return pickle.dumps((str(path.resolve()), [(file.st_size, file.st_mtime_ns) for file in files], robot, topics))
 
 
-def open_log_as_declared(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008
-    """The log at ``path``, for what is written to a robot file. Raises what `open_log` does, and `CalibrationError` where the sensors
-    refute the robot file: a calibration of wrong signs or units fits nothing."""
+def open_log_to_fit(path: Path | str, robot: Robot, topics: TopicOverrides = TopicOverrides()) -> Log:  # noqa: B008
+    """The log at ``path`` for what is fitted to it, with what is certain of its set-up corrected, in `Log.robot` as well.
+
+    Raises what `open_log` does, and `CalibrationError` where several set-ups remain, or where a sensor other than the gyro, which is then
+    left out, is off in a way that no robot file corrects: nothing is fitted to sensors that contradict each other.
+    """
     found = open_log_with_set_up(path, robot, topics)
-    if found.set_up.sentences:
-        texts = " ".join(each.but(correction=phrase("set_up.write")) for each in found.set_up.sentences)
-        raise CalibrationError(f"{texts} Correct the robot file first; `skidloc check` writes it.")
+    set_up = found.set_up
+    if set_up.is_open or any(row.correct is None and row.source != "gyro" for row in set_up.faults):
+        raise CalibrationError(f"{' '.join(set_up.sentences)} Nothing is fitted to sensors that contradict each other.")
     return found.log
 
 

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.evidence.alternatives import MAKERS, Alternative, Row
-from localization.evidence.alternatives.alternative import size_of, unrelated_evidence
+from localization.evidence.alternatives.alternative import correction, size_of, unrelated_evidence
 from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
 from localization.evidence.likelihood import NOISE_LEVELS, Choice, Evidence, Levels, Stack, least_sizes, varied
+from localization.evidence.sensor_errors import CLOCK_ODDS, CLOCK_S, CLOCKS, clock_log_odds, describe_size
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -33,13 +34,9 @@ _CHANGED = 3
 _SEARCH_LEVELS = Levels(0.35, 0.35), Levels(0.35, 1.0), Levels(1.0, 1.0)
 """Levels of the noise at which set-ups are searched."""
 _MAX_BINS = 140
-_CLOCK_ODDS, _CLOCK_S = math.log(2e-4), 0.1
-"""Prior odds of a clock that is off by `_CLOCK_S`; of a longer delay x they fall as 1 / x^2, as many delays are tried (`delays`)."""
 _LATENCY_TAIL_S, _SYNCHRONIZED_S = 0.2, 0.02
 """Latency from a measurement to its recording, from where on longer ones are rarer as 1 / x^2 [s]: queues of scans reach 0.7 s. Nothing is
 recorded before it is measured, but for clocks of computers, which NTP synchronizes to 20 ms."""
-_LATENCY_SIGMA_S = 0.05
-"""Standard deviation of the latencies of drivers, which the filter estimates by itself [s]: they reach 0.1 s."""
 _UNRELATED_ODDS = math.log(1e-5)
 """Prior odds of a source that measures another motion, or none: another robot's, a frozen sensor, a fault that no row has."""
 
@@ -47,19 +44,13 @@ IntArray = NDArray[np.intp]
 
 
 def clock_row(source: Source, delay_s: float) -> Row:
-    """Stamps that are late by ``delay_s``: a driver's latency or a clock that is off, whichever is more probable of that delay."""
+    """Stamps that are late by ``delay_s``."""
     name = {"driver": "wheels"}.get(source.kind, source.kind)
-    key = {"wheels": "wheel", "driver": "wheel", "gyro": "gyro", "lidar": "lidar"}.get(source.kind)
-
-    def correct(robot: Robot) -> Robot:
-        field = f"{key}_time_offset_s"
-        return replace(robot, clock=replace(robot.clock, **{field: round(getattr(robot.clock, field) + delay_s, 3)}))
-
-    latency = -0.5 * (delay_s / _LATENCY_SIGMA_S) ** 2
-    clock = _CLOCK_ODDS - 2.0 * math.log(max(abs(delay_s), _CLOCK_S) / _CLOCK_S)
-    text = f"its stamps are {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'}"
-    is_fault = clock > latency
-    return Row(f"clock.{name}", text, max(clock, latency), value=delay_s, correct=correct if key and is_fault else None, is_fault=is_fault)
+    error, (odds, is_fault) = CLOCKS.get(source.kind), clock_log_odds(delay_s)
+    text = describe_size(("its stamps are {} late", "its stamps are {} early"), "s", delay_s) if error is None else error.describe(delay_s)
+    correct = correction(error, delay_s) if error is not None and is_fault else None
+    cause = "" if error is None else error.id
+    return Row(f"clock.{name}", text, odds, value=delay_s, correct=correct, is_fault=is_fault, cause=cause)
 
 
 def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> list[Stack]:
@@ -313,6 +304,6 @@ def _recording_evidence(stacks: Sequence[Stack], choice: Choice) -> float:
     for offset in (0.0, *latencies):
         late = latencies - offset
         scale = np.where(late > 0.0, _LATENCY_TAIL_S, _SYNCHRONIZED_S)
-        prior = _CLOCK_ODDS - 2.0 * math.log(max(abs(offset), _CLOCK_S) / _CLOCK_S) if offset else 0.0
+        prior = CLOCK_ODDS - 2.0 * math.log(max(abs(offset), CLOCK_S) / CLOCK_S) if offset else 0.0
         by_offset.append(prior - float(np.log1p((late / scale) ** 2).sum()))
     return max(by_offset)

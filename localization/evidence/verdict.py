@@ -74,6 +74,11 @@ class SetUp:
         return self.verdict == "ambiguous"
 
     @property
+    def is_open(self) -> bool:
+        """Whether several set-ups remain that read the log otherwise: of two clocks that are apart, either brings them together."""
+        return self.is_ambiguous and any(each.id == "set_up.ambiguous" for each in self.sentences)
+
+    @property
     def faults(self) -> tuple[Row, ...]:
         """Rows of the most probable set-up, where the robot file's is refuted."""
         return self.hypotheses[0].rows if self.verdict in ("certain", "ambiguous") else ()
@@ -249,6 +254,11 @@ def _ambiguity_warnings(
     record = phrase("set_up.record", sensors=phrase("set_up.or").join(absent)) if absent else ""
     listed = ", ".join(ways[:-1]) + (f", or {ways[-1]}" if len(ways) > 1 else ways[-1])
     return [message("set_up.ambiguous", sources=" and ".join(source.name for source in sources), ways=listed, record=record)]
+
+
+def as_written(messages: Sequence[Message]) -> tuple[Message, ...]:
+    """``messages``, of which those on the set-up say that its entries are in the robot file that is written."""
+    return tuple(each.but(correction=phrase("set_up.written")) if each.id.startswith("set_up.") else each for each in messages)
 
 
 def _topic(sources: Sequence[Source], row: Row) -> str:

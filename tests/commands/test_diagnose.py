@@ -309,3 +309,16 @@ def test_diagnose_lidar_beside_tf_static_is_corrected_in_the_robot_file(tmp_path
     off = [float(number) for number in re.findall(r"([0-9.e-]+) m off", first)]
     assert "The drive" in first
     assert off[1] < off[0]
+
+
+@pytest.mark.extended
+def test_diagnose_mount_is_not_refused_by_odometry_that_it_does_not_change(tmp_path: Path) -> None:
+    """The body turns later than its wheels, which odometry does not have: a LiDAR 20 mm too far back hides that at the ends of turns."""
+    log, out = bag(tmp_path / "drive.mcap", {"lidar_offset_x": 0.02}, 31, "husky_a200"), tmp_path / "out"
+    assert main(["diagnose", str(log), "--robot", "husky_a200", "--out", str(out)]) == 0
+    content = json.loads((out / "diagnosis.json").read_text())
+    assert "odometry" not in content["handover"]["replays"]
+    assert "ekf" in content["handover"]["replays"]
+    assert content["sentence"].startswith("Correct lidar_offset_x by +0.02")
+    mount = load_robot(out / "robot.toml").mounts["laser"]
+    assert mount.x == pytest.approx(open_log(log, load_robot("husky_a200")).mounts["laser"].x + 0.02, abs=0.004)

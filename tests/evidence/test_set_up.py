@@ -20,6 +20,7 @@ from localization.evidence import SetUp, entrance, infer_set_up, open_log_with_s
 from localization.evidence.alternatives.alternative import mount_correction
 from localization.evidence.entrance import infer
 from localization.logs import TopicOverrides, open_log
+from localization.messages import message
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers import bags, entrance_drives
@@ -301,12 +302,32 @@ def test_log_for_notebooks_has_the_corrected_robot() -> None:
     assert "the right side counts backwards" in " ".join(log.log.warnings())
 
 
-def test_calibrate_with_the_right_side_inverted_names_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--robot", str(ROBOT_TOML), "--model", "skid_steer", "--out", str(tmp_path / "r.toml")]
-    assert main(["calibrate", str(CASES / "H06-right-side-inverted" / "log.mcap"), *options]) == 2
-    error = capsys.readouterr().err
-    assert 'Write: joints.reversed = ["front_right_wheel", "rear_right_wheel"]' in error
-    assert "Corrected in this run" not in error
+@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+def test_what_is_fitted_has_the_set_up_corrected_and_writes_it(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / ("r.toml" if command == "calibrate" else "r")
+    options = ["--robot", str(ROBOT_TOML), "--model", "skid_steer", "--out", str(out)]
+    assert main([command, str(CASES / "H06-right-side-inverted" / "log.mcap"), *options]) == 0
+    printed = capsys.readouterr().out
+    assert 'Written to the robot file: joints.reversed = ["front_right_wheel", "rear_right_wheel"]' in printed
+    assert printed.count("the right side counts backwards") == 1
+    assert "Corrected in this run" not in printed
+    assert load_robot(str(out if command == "calibrate" else out / "robot.toml")).joints.reversed == RIGHT
+
+
+@pytest.mark.parametrize("command", ["calibrate", "diagnose"])
+def test_nothing_is_fitted_where_several_set_ups_remain(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Wheels and gyro alone turn to opposite sides: either may be the wrong one."""
+    log = CASES / "H06-right-side-inverted" / "log.mcap"
+    found = open_log_with_set_up(log, ROBOT)
+    open_set_up = replace(
+        found.set_up, verdict="ambiguous", sentences=(message("set_up.ambiguous", sources="A and B", ways="C", record=""),)
+    )
+    monkeypatch.setattr(entrance, "open_log_with_set_up", lambda *given: replace(found, set_up=open_set_up))
+    assert main([command, str(log), "--robot", str(ROBOT_TOML)]) == 2
+    assert "A and B contradict each other" in (error := capsys.readouterr().err)
+    assert "Nothing is fitted to sensors that contradict each other." in error
 
 
 @pytest.mark.extended

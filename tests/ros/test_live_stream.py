@@ -98,7 +98,7 @@ def with_scans_ahead(seconds: int, until_s: float = math.inf):
 @pytest.mark.extended
 def test_live_node_corrects_the_clock_of_a_lidar_once():
     found = with_scans_ahead(2)
-    assert [text for text in found if text.startswith("/scan: its stamps are 2.0") and "Corrected" in text]
+    assert [text for text in found if text.startswith("/scan: the LiDAR's stamps are 2.0 s late") and "Corrected" in text]
     assert not [text for text in found if "times of receiving" in text]  # they are right from there on
 
 

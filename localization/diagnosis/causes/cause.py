@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from localization.diagnosis.drive import Drive
+from localization.evidence.sensor_errors import SensorError, describe_size
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
 
@@ -200,8 +201,6 @@ class CorrectionDraft:
 
 _PRIOR_FACTOR = 4.0  # sigma of a size's prior, over the typical size, where no physical limit is given
 _PLAUSIBLE_SIGMAS = 4.0  # of the typical size, or of a physical prior: one robot of 16,000 has more
-_SHOWN_UNITS: Mapping[str, tuple[float, str]] = {"1": (100.0, "%"), "m": (1e3, "mm"), "rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms")}
-"""Factor and unit in sentences, by the SI unit of a size."""
 OTHER_REMEDY = "record this drive, and run `skidloc diagnose --out DIR`: robot.toml has the correction"
 
 
@@ -231,7 +230,7 @@ class Cause:
     correct: Callable[[CorrectionDraft, float], CorrectionDraft] | None = field(default=None, repr=False)
     """Writes a size into a robot file; None where only the models' coefficients hold it, which are matched to the motion."""
     remedy: str = OTHER_REMEDY
-    """Remedy in words; ``{g}`` is replaced by the corrected robot's geometry and ``{c}`` by its clock."""
+    """Remedy in words; ``{g}`` is replaced by the corrected robot's geometry, ``{c}`` by its clock and ``{r}`` by all of it."""
     applies: Callable[[Setting], bool] = field(default=_always, repr=False)
     """Whether a drive can show it."""
     by_skidding: bool = False
@@ -314,11 +313,7 @@ class Cause:
         >>> CAUSES["track_width"].describe(-0.012)
         'the left and right contacts are 12 mm closer together than the robot file has it'
         """
-        factor, unit = (1.0, self.unit) if self.is_coefficient else _SHOWN_UNITS.get(self.unit, (1.0, self.unit))
-        amount = abs(size) * factor
-        decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
-        spread = f" +- {sigma * factor:.{decimals}f}" if sigma else ""
-        return self.words[size < 0.0].format(f"{amount:.{decimals}f}{spread}" + ("" if unit == "1" else f" {unit}"))
+        return describe_size(self.words, "" if self.is_coefficient else self.unit, size, sigma)
 
     @property
     def is_coefficient(self) -> bool:
@@ -353,6 +348,14 @@ def in_spell(cause: Cause, spell: Spell, spell_95: tuple[tuple[float, float], tu
         spell=spell,
         spell_95=spell_95,
     )
+
+
+def cause_of(
+    error: SensorError, meaning: str, sizes: tuple[float, float], inject: Callable[[Hypothesis, float], Hypothesis], **more: Any
+) -> Cause:
+    """The cause that a sensor is off by an ``error``, with its typical and its negligible ``sizes``; ``more``: as of `Cause`."""
+    named = {"remedy": error.remedy, "reference_words": error.reference_words, "prior_sigma": error.sigma}
+    return Cause(error.id, error.unit, meaning, *sizes, inject, error.words, **{**named, **more})
 
 
 def with_sizes(sizes: Mapping[Cause, float]) -> Hypothesis:

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 
-from localization.diagnosis.causes.cause import Cause, CorrectionDraft, add
+from localization.diagnosis.causes.cause import Cause, CorrectionDraft, add, cause_of
+from localization.evidence import sensor_errors
+from motion_models.robot import Mount
 
 _GYRO_BIAS_SIGMA = 0.01
 """Zero-rate offset of MEMS gyros that robots carry, after the zeroing at switch-on that drivers do: 0.5 to 1 deg/s at most by the data
 sheets (BMI088: 1 deg/s; MPU-9250: 5 deg/s before zeroing; ADIS16470: 0.2 deg/s) [rad/s]."""
-_GYRO_SCALE_SIGMA = 0.03
-"""Sensitivity tolerance of the same gyros: 1 to 3 % [-]."""
-_RANGE_SCALE_SIGMA, _RANGE_BIAS_SIGMA_M = 0.015, 0.05
-"""Ranging errors of time-of-flight scanners: 0.03 to 0.05 m by data sheets (SICK LMS1xx, Velodyne VLP-16), 1 to 2 % for triangulation. A
-healthy scanner has the 0.03 m that are tolerated (SICK LMS1xx: systematic error 30 mm, 40 mm at most)."""
+_RANGE_BIAS_SIGMA_M = 0.05
+"""Ranging errors of time-of-flight scanners: 0.03 to 0.05 m by data sheets (SICK LMS1xx, Velodyne VLP-16). A healthy scanner has the 0.03 m
+that are tolerated (SICK LMS1xx: systematic error 30 mm, 40 mm at most)."""
 
 
 def _correct_gyro_scale(draft: CorrectionDraft, size: float) -> CorrectionDraft:
-    imu = draft.robot.imu
-    return draft.with_robot(imu=dataclasses.replace(imu, rate_unit_rad_s=imu.rate_unit_rad_s / (1.0 + size)))
+    return draft.with_robot(imu=sensor_errors.GYRO_SCALE.correct(draft.robot, "", Mount(), size).imu)
 
 
 def _correct_range_scale(draft: CorrectionDraft, size: float) -> CorrectionDraft:
-    lidar = draft.robot.lidar
-    return draft.with_robot(lidar=dataclasses.replace(lidar, range_scale=lidar.range_scale * (1.0 + size)))
+    return draft.with_robot(lidar=sensor_errors.RANGE_SCALE.correct(draft.robot, "", Mount(), size).lidar)
 
 
 def _correct_range_bias(draft: CorrectionDraft, size: float) -> CorrectionDraft:
@@ -41,24 +39,22 @@ GYRO_BIAS = Cause(
     is_shown_by_headings=True,
     prior_sigma=_GYRO_BIAS_SIGMA,
 )
-GYRO_SCALE = Cause(
-    "gyro_scale",
-    *("1", "the gyro's rates are larger than the truth by this share", 0.03, 0.005, add("gyro_scale")),
-    ("the gyro's rates are {} too large", "the gyro's rates are {} too small"),
+GYRO_SCALE = cause_of(
+    sensor_errors.GYRO_SCALE,
+    "the gyro's rates are larger than the truth by this share",
+    (0.03, 0.005),
+    add("gyro_scale"),
     correct=_correct_gyro_scale,
-    remedy="correct the scale of the gyro in its driver, or set rate_unit_rad_s = {r.imu.rate_unit_rad_s:.5g} in [imu]",
     applies=lambda s: s.has_gyro,
     is_shown_by_headings=True,
-    prior_sigma=_GYRO_SCALE_SIGMA,
 )
-RANGE_SCALE = Cause(
-    "range_scale",
-    *("1", "the LiDAR's ranges are longer than the truth by this share", 0.02, 0.003, add("range_scale")),
-    ("the LiDAR's ranges are {} too long", "the LiDAR's ranges are {} too short"),
+RANGE_SCALE = cause_of(
+    sensor_errors.RANGE_SCALE,
+    "the LiDAR's ranges are longer than the truth by this share",
+    (0.02, 0.003),
+    add("range_scale"),
     correct=_correct_range_scale,
-    remedy="correct the scale of the ranges in the LiDAR's driver, or set range_scale = {r.lidar.range_scale:.4f} in [lidar]",
     applies=lambda s: s.has_ranges,
-    prior_sigma=_RANGE_SCALE_SIGMA,
 )
 RANGE_BIAS = Cause(
     "range_bias",

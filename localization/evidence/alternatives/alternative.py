@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from localization.evidence.sensor_errors import SensorError, with_mount
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
 
@@ -64,6 +65,8 @@ class Row:
     until_s: float | None = None
     of: str = ""
     """Name of the source, where several are of one kind."""
+    cause: str = ""
+    """Id of the same error among the causes of a diagnosis (`SensorError.id`), which measures its size; empty where there is none."""
 
     @property
     def source(self) -> str:
@@ -161,14 +164,11 @@ def size_of(channel: FloatArray) -> float:
     return math.sqrt(float(np.mean(known**2)) + 1e-6) if len(known) else 1.0
 
 
-def _with_mount(frame: str, change: Callable[[Mount], Mount], mount: Mount, robot: Robot) -> Robot:
-    """``robot`` whose ``frame`` has the changed mount, before that of /tf_static: the one of the robot file where it overrides already, as
-    by another row, else ``mount``."""
-    mount = robot.mounts[frame] if frame in robot.tf.overridden and frame in robot.mounts else mount
-    overridden = tuple(dict.fromkeys((*robot.tf.overridden, frame)))
-    return replace(robot, mounts={**robot.mounts, frame: change(mount)}, tf=replace(robot.tf, overridden=overridden))
-
-
 def mount_correction(frame: str, mount: Mount, change: Callable[[Mount], Mount]) -> Correction:
     """Correction of the mount of ``frame``, which is ``mount`` now."""
-    return partial(_with_mount, frame, change, mount)
+    return partial(with_mount, frame=frame, mount=mount, change=change)
+
+
+def correction(error: SensorError, size: float, frame: str = "", mount: Mount = Mount()) -> Correction:  # noqa: B008
+    """Correction of an ``error`` of this ``size`` of the sensor in ``frame``, whose mount is ``mount`` now."""
+    return partial(error.correct, frame=frame, mount=mount, size=size)

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from localization.evidence.alternatives.alternative import Alternative, Row, mixture, mount_correction, size_of
+from localization.evidence.sensor_errors import GYRO_SCALE, with_gyro_scale
 from localization.evidence.signals import Source
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -43,11 +44,11 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         for sign, unit in ((1.0, 1.0), (-1.0, 1.0), (1.0, _DEG), (-1.0, _DEG)):
             more = []
             if sign < 0.0:
-                correct = partial(_scale, -1.0)
+                correct = partial(with_gyro_scale, factor=-1.0)
                 more.append(Row("gyro.reversed", "the gyro's rates have the opposite sign", _ODDS["sign"], correct=correct))
             if unit != 1.0:
-                correct = partial(_scale, _DEG)
-                more.append(Row("gyro.unit", "the gyro's rates are in deg/s", _ODDS["unit"], "deg/s", _DEG, correct))
+                correct = partial(with_gyro_scale, factor=_DEG)
+                more.append(Row("gyro.unit", "the gyro's rates are in deg/s", _ODDS["unit"], "deg/s", _DEG, correct, cause=GYRO_SCALE.id))
             found.append(Alternative((*rows, *more), None, sign * unit * (rates @ axis), (1.0, unit), own + _level_evidence(rates, axis)))
     return found
 
@@ -79,7 +80,3 @@ def _rotation_to_up(axis: FloatArray) -> tuple[float, float]:
 
 def _turned(turned: Mount, mount: Mount) -> Mount:
     return replace(mount, roll=turned.roll, pitch=turned.pitch)
-
-
-def _scale(factor: float, robot: Robot) -> Robot:
-    return replace(robot, imu=replace(robot.imu, rate_unit_rad_s=float(f"{factor * robot.imu.rate_unit_rad_s:.6g}")))

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from localization.evidence.alternatives.alternative import Alternative, Row, mount_correction
+from localization.evidence.alternatives.alternative import Alternative, Row, correction, mount_correction
 from localization.evidence.alternatives.places import PlacePrior, SideEvidence, side_evidence, usual_place
+from localization.evidence.sensor_errors import LIDAR_OFFSET_X, LIDAR_YAW, RANGE_SCALE, up_to_pi, with_range_scale
 from localization.evidence.signals import Source
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -41,7 +42,15 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:
             velocity, turn = velocity.conj(), -turn
-        in_unit = Row("lidar.unit", f"the LiDAR's ranges are in {unit}", _ODDS["unit"], unit, factor, partial(_set_range, 1.0 / factor))
+        in_unit = Row(
+            "lidar.unit",
+            f"the LiDAR's ranges are in {unit}",
+            _ODDS["unit"],
+            unit,
+            factor,
+            partial(with_range_scale, factor=1.0 / factor),
+            cause=RANGE_SCALE.id,
+        )
         for yaw, odds in yaws(velocity, turn, source.place, (usual, _WRONG_PLACE)):
             rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
             for place, is_elsewhere in places:
@@ -53,11 +62,18 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
 
 def _place_row(source: Source, ahead: float) -> Row:
     """A place that neither log nor robot file give is as likely as the body's origin, and no fault."""
-    of = "its mount" if source.is_mounted else "the body's origin"
-    text = f"the LiDAR is {abs(ahead):.2f} m {'ahead of' if ahead > 0 else 'behind'} {of}"
-    correct = mount_correction(source.frame, source.mount, partial(_moved, ahead)) if source.frame else None
-    odds = _ODDS["place"] if source.is_mounted else 0.0
-    return Row("lidar.place", text, odds, value=ahead, correct=correct, is_fault=source.is_mounted, is_reported=True)
+    ahead = round(ahead, 3)
+    anywhere = f"the LiDAR is {abs(ahead):.2f} m {'ahead of' if ahead > 0 else 'behind'} the body's origin"
+    return Row(
+        "lidar.place",
+        LIDAR_OFFSET_X.describe(ahead) if source.is_mounted else anywhere,
+        _ODDS["place"] if source.is_mounted else 0.0,
+        value=ahead,
+        correct=correction(LIDAR_OFFSET_X, ahead, source.frame, source.mount) if source.frame else None,
+        is_fault=source.is_mounted,
+        is_reported=True,
+        cause=LIDAR_OFFSET_X.id,
+    )
 
 
 def in_body(velocity: Velocity, turn: FloatArray, at: complex, yaw: float, place: PlacePrior) -> tuple[FloatArray, SideEvidence]:
@@ -94,7 +110,7 @@ def yaws(velocity: Velocity, turn: FloatArray, at: complex, places: tuple[PlaceP
         for angle in (math.remainder(yaw, math.tau), math.remainder(yaw + math.pi, math.tau)):
             quarter = round(angle / (0.5 * math.pi)) * 0.5 * math.pi
             is_quarter = abs(angle - quarter) < _QUARTER_RAD
-            angle, odds = (_up_to_pi(quarter), _ODDS["quarter"]) if is_quarter else (angle, _ODDS["yaw"])
+            angle, odds = (up_to_pi(quarter), _ODDS["quarter"]) if is_quarter else (angle, _ODDS["yaw"])
             if all(abs(math.remainder(angle - other, math.tau)) > 0.5 * _QUARTER_RAD for other, _ in found):
                 found.append((angle, odds))
     for quarter in (math.pi, 0.5 * math.pi, -0.5 * math.pi):
@@ -114,32 +130,16 @@ def _axis_of_travel(velocity: Velocity, turn: FloatArray, at: complex, place_sig
     return yaw + _small_yaw(velocity * np.exp(1j * yaw) - 1j * turn * at, turn, place_sigma_m)[0]
 
 
-def _up_to_pi(angle: float) -> float:
-    """``angle`` in (-pi, pi]."""
-    wrapped = math.remainder(angle, math.tau)
-    return math.pi if wrapped <= -math.pi + 1e-9 else wrapped
-
-
 def _mount_rows(frame: str, mount: Mount, is_flipped: bool, yaw: float, yaw_odds: float) -> list[Row]:
     """Rows of a mount that is upside down, turned, or both; the first corrects all of it."""
     rows = []
-    correct = mount_correction(frame, mount, partial(_set_mount, is_flipped, yaw)) if frame else None
     if is_flipped:
+        correct = mount_correction(frame, mount, partial(_flipped, yaw)) if frame else None
         rows.append(Row("lidar.upside_down", "the LiDAR is mounted upside down", _ODDS["flip"], correct=correct))
     if yaw_odds:
-        side = "left" if yaw > 0.0 else "right"
-        angle = f"{abs(math.degrees(yaw)):.0f} deg" + ("" if abs(abs(yaw) - math.pi) < 1e-6 else f" to the {side}")
-        rows.append(
-            Row(
-                "lidar.yaw",
-                f"the LiDAR is turned by {angle}",
-                yaw_odds,
-                sector(yaw),
-                yaw,
-                correct=None if is_flipped else correct,
-                may_change=True,
-            )
-        )
+        correct = correction(LIDAR_YAW, yaw, frame, mount) if frame and not is_flipped else None
+        text, cause = LIDAR_YAW.describe(yaw), LIDAR_YAW.id
+        rows.append(Row("lidar.yaw", text, yaw_odds, sector(yaw), yaw, correct=correct, may_change=True, cause=cause))
     return rows
 
 
@@ -148,16 +148,6 @@ def sector(yaw: float) -> str:
     return f"{30 * round(math.degrees(yaw) / 30.0) % 360} deg"
 
 
-def _set_mount(is_flipped: bool, yaw: float, mount: Mount) -> Mount:
-    """``mount`` turned by ``yaw`` in the body, about itself; and upside down."""
-    if not is_flipped:
-        return replace(mount, yaw=_up_to_pi(mount.yaw + yaw))
-    return replace(mount, roll=_up_to_pi(mount.roll + math.pi), yaw=_up_to_pi(yaw - mount.yaw))
-
-
-def _moved(ahead: float, mount: Mount) -> Mount:
-    return replace(mount, x=round(mount.x + ahead, 3))
-
-
-def _set_range(scale: float, robot: Robot) -> Robot:
-    return replace(robot, lidar=replace(robot.lidar, range_scale=scale * robot.lidar.range_scale))
+def _flipped(yaw: float, mount: Mount) -> Mount:
+    """``mount`` upside down, and turned by ``yaw`` in the body, about itself."""
+    return replace(mount, roll=up_to_pi(mount.roll + math.pi), yaw=up_to_pi(yaw - mount.yaw))

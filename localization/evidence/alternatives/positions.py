@@ -11,6 +11,7 @@ import numpy as np
 
 from localization.evidence.alternatives.alternative import TEMPER, Row
 from localization.evidence.paths import Fit, Path, Track, curve_price, fit, fit_curve, lags, wide_evidence, yaw_log_prior
+from localization.evidence.sensor_errors import LIDAR_CLOCK, clock_log_odds
 from motion_models.se2 import FloatArray
 
 _ODDS = {
@@ -20,21 +21,19 @@ _ODDS = {
     "factor": math.log(3e-4),
     "yaw": math.log(2e-3),
     "leap": math.log(5e-4),
-    "clock": math.log(2e-4),
     "rate": math.log(1e-4),
     "unrelated": math.log(1e-5),
     "even": math.log(0.03),
 }
-"""Prior odds by kind (`docs/theory/set-up.md`); of clocks, at `_CLOCK_S`."""
+"""Prior odds by kind (`docs/theory/set-up.md`)."""
 UNITS = {"millimetres": 1000.0, "centimetres": 100.0, "kilometres": 0.001, "feet": 1.0 / 0.3048, "inches": 1.0 / 0.0254}
 """Units per metre."""
 _LEAPS_S = {18.0: "GPS time is 18 s ahead of UTC", 37.0: "TAI is 37 s ahead of UTC"}
 _LEAP_SIGMA_S = 0.1
 _SCALE_SIGMA, _FACTOR_SIGMA = 0.08, 2.0
 """Sigma of the logarithm of the scale of ways by the radius of tyres and slip, and of a factor that no unit explains."""
-_LATENCY_SIGMA_S, _CLOCK_S = 0.07, 0.1
-"""Standard deviation of the latencies of GPS receivers and mocap bridges, which reach 0.2 s [s]. A clock that is off by a longer delay x is
-rarer as 1 / x^2, as many delays are tried."""
+_LATENCY_SIGMA_S = 0.07
+"""Standard deviation of the latencies of GPS receivers and mocap bridges, which reach 0.2 s [s]."""
 _RATE_SIGMA = 0.01
 """Standard deviation of the rates of clocks that are wrong: stamps of simulators that lag, and of counters of a wrong period."""
 _COARSE_S, _FINE_S = 0.25, 0.02
@@ -153,17 +152,16 @@ def _clock_rows(delay_s: float, has_times: bool) -> tuple[Row, ...]:
     """Stamps that are ahead by ``delay_s``: a latency, a leap of time scales, or a clock that is off, whichever is most probable."""
     if not delay_s:
         return ()
-    latency = -0.5 * (delay_s / _LATENCY_SIGMA_S) ** 2
     if not has_times:  # its times were spread over the log's: any delay is one's of the spreading
-        return (Row("clock.reference", "", latency, value=delay_s, is_fault=False),)
+        return (Row("clock.reference", "", -0.5 * (delay_s / _LATENCY_SIGMA_S) ** 2, value=delay_s, is_fault=False),)
+    odds, is_clock = clock_log_odds(delay_s, _LATENCY_SIGMA_S)
     leap = min(_LEAPS_S, key=lambda each: abs(abs(delay_s) - each))
     of_leap = _ODDS["leap"] - 0.5 * ((abs(delay_s) - leap) / _LEAP_SIGMA_S) ** 2
-    clock = _ODDS["clock"] - 2.0 * math.log(max(abs(delay_s), _CLOCK_S) / _CLOCK_S)
-    words = f" ({_LEAPS_S[leap]})" if of_leap > clock else ""
+    words = f" ({_LEAPS_S[leap]})" if of_leap > odds else ""
     text = f"its clock is {abs(delay_s):.1f} s {'ahead of' if delay_s > 0.0 else 'behind'} that of the sensors{words}"
     undo = f"{'Subtract' if delay_s > 0.0 else 'Add'} {abs(delay_s):.1f} s {'from' if delay_s > 0.0 else 'to'} its stamps."
-    is_fault = max(clock, of_leap) > latency
-    return (Row("clock.reference", text, max(clock, of_leap, latency), value=delay_s, remedy=undo, is_fault=is_fault),)
+    is_fault = is_clock or of_leap > odds
+    return (Row("clock.reference", text, max(odds, of_leap), value=delay_s, remedy=undo, is_fault=is_fault, cause=LIDAR_CLOCK.id),)
 
 
 def _rate_rows(rate: float, duration_s: float) -> tuple[Row, ...]:
