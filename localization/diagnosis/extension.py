@@ -33,7 +33,7 @@ from localization.diagnosis.gate import (
     reason,
 )
 from localization.diagnosis.handover import CandidateRobot, Reader, check_written
-from localization.diagnosis.missing_terms import SEARCHED, Search, extended_model, find_terms, fit_on, merge_terms
+from localization.diagnosis.missing_terms import SEARCHED, Search, extended_model, find_terms, fit_on, merge_terms, terms_of
 from localization.diagnosis.model_extension import Extension, FoundTerm
 from localization.diagnosis.result import DiagnosisResult
 from localization.events import Turn
@@ -104,7 +104,7 @@ def extend(
     if not extension.is_better:
         return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
     left = _without(drive, predictor, search.removed) if search.effects else drive
-    again = examine(left, extended_model(predictor, [t.term for t in search.terms]), config, predictor.baseline, found.names)
+    again = examine(left, extended_model(predictor, terms_of([t.law for t in search.terms])), config, predictor.baseline, found.names)
     return ExtendedResult(_with_extension(again, extension, found), extension, whole.robot)
 
 
@@ -140,7 +140,7 @@ def _predicted(predictor: DrivePredictor, search: Search, held: Sequence[NDArray
         if columns.shape[-1]:
             sizes = search.design.problem(search.state.noise, ~part).fit(range(columns.shape[-1]))[0]
             rows[part] -= columns[part] @ sizes
-    return HeldRows(rows, predictor.batch.measured)
+    return HeldRows(rows, predictor.batch.measured, search.tolerated)
 
 
 def _check(predictor: DrivePredictor, search: Search, reader: Reader | None, others: Sequence[Reader]) -> HandoverCheck | None:
@@ -154,13 +154,13 @@ def _check(predictor: DrivePredictor, search: Search, reader: Reader | None, oth
 
     def relative_sigma(used: NDArray[np.bool_]) -> float:
         """Sigma of the term that these windows measure worst, over its size on the whole drive."""
-        measured = fit_on(predictor, search, used[predictor.batch.owner]).terms
-        return max(t.sigma / abs(whole.term.value) for t, whole in zip(measured, search.terms, strict=True))
+        measured = fit_on(predictor, search, used[predictor.batch.owner]).laws
+        return max(law.sigma / abs(whole.law.value) for law, whole in zip(measured, search.terms, strict=True))
 
     first, second = interleaved_halves(len(predictor.drive.maneuvers))
     used, held = min((first, second), (second, first), key=lambda pair: relative_sigma(pair[0]))
     by_half, sizes = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), bool) if others else used[predictor.batch.owner])
-    return check_written(predictor, search.state.noise, CandidateRobot(by_half, sizes, held), reader, others)
+    return check_written(predictor, search.state, CandidateRobot(by_half, sizes, held), reader, others)
 
 
 _PARTS = 4
@@ -186,7 +186,7 @@ def _refusal(predictor: DrivePredictor, search: Search, whole: CandidateRobot) -
     if why := _extrapolates_badly(predictor, search):
         return why
     part = np.arange(len(whole.held)) * _PARTS // len(whole.held)
-    checks = [check_written(predictor, search.state.noise, dataclasses.replace(whole, held=part == k), None) for k in range(_PARTS)]
+    checks = [check_written(predictor, search.state, dataclasses.replace(whole, held=part == k), None) for k in range(_PARTS)]
     if _differ_between_parts([check for check in checks if check is not None]):
         return "its size differs from part to part of the drive by more than a half"
     return ""
@@ -223,9 +223,8 @@ def _extrapolates_badly(predictor: DrivePredictor, search: Search) -> str:
     if not parts:
         return ""
     held = np.any(parts, axis=0)
-    before, after = HeldRows(search.state.linear, predictor.batch.measured), _predicted(predictor, search, parts)
-    old, new = (HeldRows(h.rows[held], h.measured[held]) for h in (before, after))
-    check = compare_rows(old, new, noise.sigmas[held], noise.weights[held])
+    before = HeldRows(search.state.linear, predictor.batch.measured, search.tolerated)
+    check = compare_rows(before.part(held), _predicted(predictor, search, parts).part(held), noise.sigmas[held], noise.weights[held])
     if check is None or (not check.worse and check.gain.high > 0.0):
         return ""
     changed = ", ".join(f"{c} {check.before[c]:.3g} -> {check.after[c]:.3g}" for c in check.worse or check.before)
@@ -235,7 +234,7 @@ def _extrapolates_badly(predictor: DrivePredictor, search: Search) -> str:
 def _differ_between_parts(checks: Sequence[HandoverCheck]) -> bool:
     """Whether a part of the drive clearly shows another size of the terms than all ``checks`` of parts together, by what matters to the
     mean part."""
-    shares, sigmas = np.array([check.shown for check in checks]).reshape(-1, 2).T
+    shares, sigmas = np.array([check.shown_beside for check in checks]).reshape(-1, 2).T
     squares = sigmas**-2.0  # of what the terms change
     size = float(np.average(shares, weights=squares))
     off = np.abs(shares - size)
@@ -317,9 +316,9 @@ def _with_terms_in_rows(rows: Mapping[str, Component], before: Mapping[str, Comp
             continue
         share = 1.0 - min((row.rms / max(old.rms, 1e-12)) ** 2, 1.0)
         is_turned = name != "yaw" and old.status != "noise"  # what acts sideways acts along the end of an arc as well
-        own = [t for t in terms if _CHANNEL_OF[t.term.component] == name] or [t for t in terms if is_turned]
+        own = [t for t in terms if name in {_CHANNEL_OF[part.component] for part in t.law.parts}] or [t for t in terms if is_turned]
         row = dataclasses.replace(row, rms=old.rms, p_value=old.p_value)
-        parts = tuple(Attribution(t.term.name, t.term.value, share / len(own), True) for t in own)
+        parts = tuple(Attribution(t.law.name, t.law.value, share / len(own), True) for t in own)
         status = row.status if row.status == "unexplained" or not own else "attributed"
         found[name] = row.with_status(status, (*parts, *row.attributions))
     return found
@@ -328,7 +327,7 @@ def _with_terms_in_rows(rows: Mapping[str, Component], before: Mapping[str, Comp
 def _robot_by(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> tuple[CorrectedRobot, dict[Cause, float]]:
     """The robot with terms and kept causes as the windows ``used`` (M,) alone have them, and the sizes of these causes."""
     fit, old, name = fit_on(predictor, search, used), predictor.drive.robot.terms, predictor.model.name
-    terms, sizes = fit.terms, {search.state.causes[i]: float(size) for i, size in zip(fit.kept, fit.sizes, strict=True)}
+    terms, sizes = terms_of(fit.laws), {search.state.causes[i]: float(size) for i, size in zip(fit.kept, fit.sizes, strict=True)}
     corrected = correct_robot(predictor, sizes)
     robot = dataclasses.replace(corrected.robot, terms={**old, name: merge_terms(old.get(name, ()), terms)})
     return dataclasses.replace(corrected, robot=robot), sizes

@@ -1,15 +1,19 @@
 """The gate of everything that a diagnosis writes or explains a drive with: windows that were held out, before and after.
 
 One rule for causes, terms and bound effects. In the numbers that a correction changes, errors over their noise have to shrink by more than
-their scatter and by a tenth; no row of what is held out may grow significantly, and each finding has to improve it beside all others.
-Before and after are the same windows, without and with the correction.
+their scatter, and by a tenth, as they are or beside all that is tolerated; no row of what is held out may grow significantly, and each
+finding has to improve it beside all others. Before and after are the same windows, without and with the correction.
+
+A robot is off its file by what files are accurate to, and such errors may hide a right law, or cancel it in one row. With tolerated sizes
+x ~ N(0, I) of columns B over the noise, the discrepancies have the covariance C = I + B B^T, and r^T C^-1 r are their squares beside all
+that is tolerated (generalized least squares, Aitken 1936).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -76,6 +80,10 @@ class HandoverCheck:
     shown: tuple[float, float] = (0.0, math.inf)
     """How much of what the file changes the half held out shows, as a factor of the change, and its sigma by the drive's noise: errors
     shrink where it is more than 1/2."""
+    shown_beside: tuple[float, float] = (0.0, math.inf)
+    """Such a factor and its sigma beside all that is tolerated: alike in each part of a drive where the file is right."""
+    gain_beside: float = 0.0
+    """Share by which these errors shrink beside all that is tolerated."""
     worse: tuple[str, ...] = ()
     """Rows that grow by more than 2 % and beyond their scatter over the windows."""
     is_changed: bool = True
@@ -120,8 +128,9 @@ class HandoverCheck:
             return self.defect
         if growing := [f"{name} {one.before_m:.3g} -> {one.after_m:.3g} m" for name, one in self.replays.items() if one.is_worse]:
             return f"replayed with it, {', '.join(growing)} a window gets worse"
-        if self.gain.value < MIN_GAIN:
-            return f"held-out errors shrink by {100.0 * self.gain.value:.1f} %, less than the {100.0 * MIN_GAIN:.0f} % that a file is worth"
+        worth = max(self.gain.value, self.gain_beside)
+        if worth < MIN_GAIN:
+            return f"held-out errors shrink by {100.0 * worth:.1f} %, less than the {100.0 * MIN_GAIN:.0f} % that a file is worth"
         return ""
 
     @property
@@ -182,44 +191,93 @@ class HeldRows(NamedTuple):
     """(m, 6) measured minus predicted, as `CHANNELS`."""
     measured: FloatArray
     """(m, 3) measured motions, for the poses at the end of legs; NaN where nothing was measured."""
+    beside: FloatArray | None = None
+    """(m, 6, b) what all that is tolerated changes, times its prior sigma; None for nothing."""
+
+    def part(self, windows: NDArray[Any]) -> HeldRows:
+        """Those of ``windows``."""
+        return HeldRows(self.rows[windows], self.measured[windows], None if self.beside is None else self.beside[windows])
 
 
 def compare_rows(before: HeldRows, after: HeldRows, sigmas: FloatArray, weights: FloatArray) -> HandoverCheck | None:
     """Discrepancies ``before`` and ``after`` of the same held-out windows; None where nothing was measured in both.
 
     The gain is the share by which errors over their noise ``sigmas`` (m, 6) shrink in the numbers that the file changes: the scatter of the
-    others would hide it. Windows count by the ``weights`` (m,) of the noise, as in the fit: one in which the reference jumps is as far off
-    by any file, and would decide alone.
+    others would hide it. A row is worse if it grows, and grows beside all that is tolerated. Windows count by the ``weights`` (m,) of the
+    noise, as in the fit: one in which the reference jumps is as far off by any file, and would decide alone.
     """
     shown = [c for c in range(4) if all(np.isfinite(r.rows[:, c]).any() for r in (before, after))]
     if not shown:
         return None
-    names = [CHANNELS[c] for c in shown]
-    squares = [{CHANNELS[c]: r.rows[:, c] ** 2 for c in shown} for r in (before, after)]
-    before_rms, after_rms = ({name: _root_mean(s[name], weights) for name in names} for s in squares)
-    worse = [n for n in names if _is_worse(squares[0][n], squares[1][n], weights)]
-    ends = [_ends_of_legs(r, weights) for r in (before, after)]
-    if len(ends[0]) and len(ends[0]) == len(ends[1]):
-        before_rms[END], after_rms[END] = (math.sqrt(float(np.mean(e))) for e in ends)
-        worse += [END] if _is_worse(ends[0], ends[1], np.ones(len(ends[0])), block=1) else []
-    change = np.nan_to_num((before.rows - after.rows)[:, shown] / sigmas[:, shown])
+    pair = before, after
+    of_rows = _Rows.of(pair, shown, weights)
+    beside = [held._replace(rows=_beside(held, sigmas, weights)) for held in pair]
+    of_rest = _Rows.of(beside, shown, weights)
+    worse = tuple(name for name in of_rows.worse if name in of_rest.worse)
+    over_noise = weights[:, None] / sigmas[:, shown]
+    change = np.nan_to_num((before.rows - after.rows)[:, shown] * over_noise)
     rms = np.sqrt(np.mean(change**2, axis=0))
     is_moved = (np.abs(change) > _LEAST_CHANGE) & (rms > _LEAST_SHARE * rms.max())
     moved = np.flatnonzero(is_moved.any(axis=1))
     if not len(moved):
-        return HandoverCheck(before_rms, after_rms, len(before.rows), Interval(0.0, 0.0, 0.0), is_changed=False)
-    scale = (is_moved * weights[:, None])[moved]
-    old, new = (np.nan_to_num(r.rows[:, shown] / sigmas[:, shown])[moved] * scale for r in (before, after))
-    sums = [np.sum(part**2, axis=1) for part in (old, new)]
-    first, second = (s / max(float(sums[0].mean()), 1e-12) for s in sums)
+        return HandoverCheck(of_rows.before, of_rows.after, len(before.rows), Interval(0.0, 0.0, 0.0), is_changed=False)
+    whitened = [np.nan_to_num(held.rows[:, shown] * over_noise) for held in (*pair, *beside)]
+    first, second, *rest = (np.sum((one * is_moved)[moved] ** 2, axis=1) for one in whitened)
     blocks = np.unique(moved // _BLOCK, return_inverse=True)[1]
-    gain = root_mean_gain(first, second, blocks, np.random.default_rng(0))
+    scale = max(float(first.mean()), 1e-12)
+    gain = root_mean_gain(first / scale, second / scale, blocks, np.random.default_rng(0))
     if blocks.max() + 1 < _FEWEST_BLOCKS:
         gain = Interval(gain.value, -math.inf, math.inf)
-    part = change[moved] * scale
-    whole = max(float(np.sum(part**2)), 1e-12)
-    known = float(np.sum(part * old)) / whole, whole**-0.5
-    return HandoverCheck(before_rms, after_rms, len(before.rows), gain, shown=known, worse=tuple(worse))
+    gain_beside = 1.0 - math.sqrt(float(rest[1].sum()) / max(float(rest[0].sum()), 1e-12))
+    shown_by = [
+        _shown(weighed, change, whitened[0]) for weighed in (change * is_moved, _without_tolerated(change, before, over_noise, shown))
+    ]
+    found = HandoverCheck(of_rows.before, of_rows.after, len(before.rows), gain, worse=worse, gain_beside=gain_beside)
+    return replace(found, shown=shown_by[0], shown_beside=shown_by[1])
+
+
+def _shown(weighed: FloatArray, change: FloatArray, old: FloatArray) -> tuple[float, float]:
+    """Least-squares factor of the ``change`` (m, c) in the numbers ``old``, both over their noise, and its sigma; ``weighed`` is the change
+    times the inverse covariance."""
+    whole = max(float(np.sum(weighed * change)), 1e-12)
+    return float(np.sum(weighed * old)) / whole, whole**-0.5
+
+
+class _Rows(NamedTuple):
+    """Root mean squares by row, of components and of poses at the end of legs, before and after; and the rows that grow."""
+
+    before: dict[str, float]
+    after: dict[str, float]
+    worse: tuple[str, ...]
+
+    @staticmethod
+    def of(pair: Sequence[HeldRows], shown: Sequence[int], weights: FloatArray) -> _Rows:
+        """Those of the components ``shown``."""
+        squares = [{CHANNELS[c]: held.rows[:, c] ** 2 for c in shown} for held in pair]
+        before, after = ({name: _root_mean(values, weights) for name, values in s.items()} for s in squares)
+        worse = [name for name in squares[0] if _is_worse(squares[0][name], squares[1][name], weights)]
+        ends = [_ends_of_legs(held, weights) for held in pair]
+        if len(ends[0]) and len(ends[0]) == len(ends[1]):
+            before[END], after[END] = (math.sqrt(float(np.mean(e))) for e in ends)
+            worse += [END] if _is_worse(ends[0], ends[1], np.ones(len(ends[0])), block=1) else []
+        return _Rows(before, after, tuple(worse))
+
+
+def _beside(held: HeldRows, sigmas: FloatArray, weights: FloatArray) -> FloatArray:
+    """(m, 6) rows without what tolerated sizes explain of them, by the mean of their posterior."""
+    over_noise = weights[:, None] / sigmas
+    left = _without_tolerated(np.nan_to_num(held.rows * over_noise), held, over_noise, list(range(held.rows.shape[1])))
+    return np.asarray(np.where(np.isfinite(held.rows), left / over_noise, np.nan))
+
+
+def _without_tolerated(whitened: FloatArray, held: HeldRows, over_noise: FloatArray, shown: Sequence[int]) -> FloatArray:
+    """C^-1 times ``whitened`` numbers (m, c) of the components ``shown``, C = I + B B^T by the columns B of what is tolerated."""
+    if held.beside is None:
+        return whitened
+    known = np.isfinite(held.rows[:, shown])
+    B = (np.nan_to_num(held.beside[:, shown]) * np.where(known, over_noise, 0.0)[..., None]).reshape(whitened.size, -1)
+    y = np.where(known, whitened, 0.0).ravel()
+    return np.asarray(y - B @ np.linalg.solve(B.T @ B + np.eye(B.shape[1]), B.T @ y)).reshape(whitened.shape)
 
 
 def _root_mean(squares: FloatArray, weights: FloatArray) -> float:

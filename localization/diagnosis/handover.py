@@ -123,12 +123,13 @@ def check_findings(
         return None
     held = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
     rows: dict[tuple[str, ...], HeldRows] = {}
+    tolerated = linearization.tolerated([cause for cause in linearization.causes if cause.key in named])
 
     def check(fewer: tuple[str, ...], more: tuple[str, ...]) -> HandoverCheck | None:
         for keys in (fewer, more):
             if keys not in rows:
                 try:
-                    rows[keys] = _cross_predicted(predictor, linearization, keys)
+                    rows[keys] = _cross_predicted(predictor, linearization, keys)._replace(beside=tolerated)
                 except (CgError, ModelError):  # no robot has the sizes of these windows
                     return None
         return compare_rows(rows[fewer], rows[more], linearization.noise.sigmas, linearization.noise.weights)
@@ -143,7 +144,7 @@ def check_findings(
     except (CgError, ModelError) as error:  # no robot has the sizes of this half
         found = check((), tried)
         return None if found is None else dataclasses.replace(found, refused={**why, **dict.fromkeys(tried, str(error))}, harmful=harmful)
-    found = check_written(predictor, linearization.noise, candidate, reader, others)
+    found = check_written(predictor, linearization, candidate, reader, others)
     if found is None and refused:
         found = check((), tried)
     if found is None:
@@ -167,7 +168,7 @@ def _cross_predicted(predictor: DrivePredictor, linearization: Linearization, na
 
 
 def check_written(
-    predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader | None, others: Sequence[Reader] = ()
+    predictor: DrivePredictor, state: Linearization, candidate: CandidateRobot, reader: Reader | None, others: Sequence[Reader] = ()
 ) -> HandoverCheck | None:
     """Write the robot file of the ``candidate``, read it again, and predict and replay the windows that are held out with it.
 
@@ -187,18 +188,19 @@ def check_written(
         if others:
             return _check_on_others(predictor, candidate, others)
         if reader is None:
-            return _check_predicted(predictor, noise, candidate)
-        return _check_replayed(predictor, noise, candidate, reader)
+            return _check_predicted(predictor, state, candidate)
+        return _check_replayed(predictor, state, candidate, reader)
 
 
-def _check_predicted(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot) -> HandoverCheck | None:
+def _check_predicted(predictor: DrivePredictor, state: Linearization, candidate: CandidateRobot) -> HandoverCheck | None:
     """Windows held out, as the file predicts them."""
     drive, hypothesis = predictor.drive, with_sizes(candidate.sizes)
     after = predictor_after(predictor, candidate.corrected, predictor.model.name)
     held = candidate.held[predictor.batch.owner]
     rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
-    measured = predictor.batch.measured[held]
-    found = compare_rows(HeldRows(rows[0][held], measured), HeldRows(rows[1][held], measured), noise.sigmas[held], noise.weights[held])
+    noise, tolerated = state.noise, state.tolerated(candidate.sizes)
+    old, new = (HeldRows(row, predictor.batch.measured, tolerated).part(held) for row in rows)
+    found = compare_rows(old, new, noise.sigmas[held], noise.weights[held])
     if found is None or drive.kind == "log":
         return found
     weight = np.array([1.0, 1.0, 0.5 * drive.robot.geometry.track_width_m])
@@ -220,9 +222,9 @@ class _Reread(NamedTuple):
     """(W,) of the drive's noise in them [m^2]."""
 
 
-def _check_replayed(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader) -> HandoverCheck | None:
+def _check_replayed(predictor: DrivePredictor, state: Linearization, candidate: CandidateRobot, reader: Reader) -> HandoverCheck | None:
     """Windows held out, of the log as it is read and replayed with the file."""
-    reread = _reread(predictor, noise, candidate, reader)
+    reread = _reread(predictor, state, candidate, reader)
     return None if reread is None else _compare_reread([reread])
 
 
@@ -236,7 +238,7 @@ def _check_on_others(predictor: DrivePredictor, candidate: CandidateRobot, other
         other = make_predictor(drive, predictor.model, predictor.baseline)
         state = linearize(other, candidate_causes(other, 0), {}, TOLERANCE)
         held = dataclasses.replace(candidate, held=np.ones(len(drive.maneuvers), dtype=bool))
-        reread = _reread(other, state.noise, held, reader)
+        reread = _reread(other, state, held, reader)
         if reread is not None:
             found.append(reread)
             names.append(drive.name)
@@ -244,7 +246,7 @@ def _check_on_others(predictor: DrivePredictor, candidate: CandidateRobot, other
     return None if checked is None else dataclasses.replace(checked, other_drives=tuple(names))
 
 
-def _reread(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, reader: Reader) -> _Reread | None:
+def _reread(predictor: DrivePredictor, state: Linearization, candidate: CandidateRobot, reader: Reader) -> _Reread | None:
     """The held-out windows of a drive, whose log is read and replayed with the old and the new file; None where nothing is measured."""
     old, new, name = predictor.drive.robot, candidate.corrected.robot, predictor.model.name
     before, after = reader.drive(old), reader.drive(new)
@@ -256,8 +258,9 @@ def _reread(predictor: DrivePredictor, noise: Noise, candidate: CandidateRobot, 
     ]
     of_marker = _of_reference(with_sizes(candidate.sizes), after.is_lidar_reference)
     first, second = _paired(before, after, candidate.held)
+    noise, tolerated = state.noise, state.tolerated(candidate.sizes)[first]
     held = [
-        HeldRows(p.discrepancies(of_marker)[windows], p.batch.measured[windows])
+        HeldRows(p.discrepancies(of_marker)[windows], p.batch.measured[windows], tolerated)
         for p, windows in zip(predictors, (first, second), strict=True)
     ]
     squares: dict[str, tuple[FloatArray, FloatArray]] = {}
@@ -282,9 +285,7 @@ def _is_changed(one: Run, other: Run) -> bool:
 
 def _compare_reread(drives: Sequence[_Reread]) -> HandoverCheck | None:
     """`compare_rows` and replays of all windows of all ``drives``."""
-    before, after = (
-        HeldRows(*(np.concatenate(parts) for parts in zip(*held, strict=True))) for held in zip(*(d[:2] for d in drives), strict=True)
-    )
+    before, after = _joined([d.before for d in drives]), _joined([d.after for d in drives])
     weights, variances = np.concatenate([d.weights for d in drives]), np.concatenate([d.variances for d in drives])
     found = compare_rows(before, after, np.concatenate([d.sigmas for d in drives]), weights)
     if found is None:
@@ -295,6 +296,15 @@ def _compare_reread(drives: Sequence[_Reread]) -> HandoverCheck | None:
         if (one := _compared(old, new, variances, weights)) is not None:
             replays[estimator] = one
     return dataclasses.replace(found, replays=replays)
+
+
+def _joined(drives: Sequence[HeldRows]) -> HeldRows:
+    """All windows of ``drives``, each with what is tolerated of its own."""
+    columns = [d.beside for d in drives if d.beside is not None]
+    ends = np.cumsum([c.shape[-1] for c in columns]).tolist()
+    padded = [np.pad(c, ((0, 0), (0, 0), (end - c.shape[-1], ends[-1] - end))) for c, end in zip(columns, ends, strict=True)]
+    beside = np.concatenate(padded) if len(padded) == len(drives) else None
+    return HeldRows(np.concatenate([d.rows for d in drives]), np.concatenate([d.measured for d in drives]), beside)
 
 
 def _sizes_on(linearization: Linearization, named: Sequence[str], used: NDArray[np.bool_]) -> dict[Cause, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -228,6 +228,12 @@ class Linearization:
     tolerance: float
     """Sigma of causes that are not named, over what is negligible."""
     problem: Regression
+
+    def tolerated(self, named: Collection[Cause] = ()) -> FloatArray:
+        """(M, 6, b) signatures of causes within tolerance, without those ``named``, and of nuisances, each times its prior sigma."""
+        is_tolerated = np.array([cause not in named for cause in self.causes], dtype=bool)
+        S = np.nan_to_num(self.signatures) * (self.problem.scale * self.problem.tolerance)
+        return np.concatenate([S[..., is_tolerated], np.nan_to_num(self.nuisances) * FLAT], axis=-1)
 
 
 def is_skid_steer(robot: Robot) -> bool:

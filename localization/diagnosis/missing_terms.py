@@ -28,7 +28,8 @@ from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
 from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
 from localization.diagnosis.model_extension import FoundEffect, FoundTerm
-from localization.diagnosis.noise import FLAT, Noise, reference_noise
+from localization.diagnosis.noise import Noise, reference_noise
+from localization.diagnosis.parameter_laws import Law, parameter_laws
 from localization.diagnosis.placebos import LEVEL, Candidates, free, joint_statistic, modulated, placebo_p, placebo_statistics
 from localization.diagnosis.result import DiagnosisResult
 from motion_models.calibration.prediction import series_of
@@ -75,6 +76,8 @@ _PROFILED = (1.5, 1.25, 1.25, 1.12, 1.12, 1.06, 1.06)
 _LEAST_PLAY = 0.01
 """Rate below which a hysteresis is noise [m/s, rad/s]."""
 _CG_MOVES_M = 0.005
+_TURNS_RAD2_S2 = 0.01**2
+"""Mean square of the yaw rate from where on a robot turns: noise of counts is less."""
 _COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
 _ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
 """Price of a term that a robot with equal sides does not have; two in three robots have such sides."""
@@ -103,11 +106,10 @@ _LEAST_SHARE = 0.02
 
 
 @dataclass(frozen=True)
-class CandidateTerm:
-    """A term without its coefficient, and its price in twice the log-odds."""
+class Candidate:
+    """A law of the library, and its price in twice the log-odds."""
 
-    component: str
-    expression: Expression
+    law: Law
     price: float
 
 
@@ -190,10 +192,15 @@ class Search(NamedTuple):
         return np.asarray(self.effect_columns @ np.array([e.value for e in self.effects]))
 
     @property
+    def tolerated(self) -> FloatArray:
+        """(M, 6, b) what is tolerated beside the kept causes, times its prior sigma."""
+        return self.state.tolerated([self.state.causes[i] for i in self.kept])
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Name of each column of the `design`."""
         causes = (self.state.causes[i].key for i in self.kept)
-        return (*causes, *(t.term.name for t in self.terms), *(e.shape.name for e in self.effects))
+        return (*causes, *(t.law.name for t in self.terms), *(e.shape.name for e in self.effects))
 
     def only(self, names: Collection[str], refused: Mapping[str, str]) -> Search:
         """With the causes, terms and effects of these ``names`` alone; the others are ``refused``, with the reason."""
@@ -210,7 +217,7 @@ class Search(NamedTuple):
         )
 
 
-def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[CandidateTerm, ...]:
+def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> tuple[Candidate, ...]:
     """Candidates for a drive in which ``count`` numbers were measured, beside so many ``others``; CG products only where the CG moves."""
     powers = list(itertools.product(_POWERS, _POWERS))[1:]
     powers += [pair for x, y in itertools.product(_ONE_SIDED, _POWERS) for pair in ((x, y), (y, x))]
@@ -227,9 +234,18 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
             expression = parse_expression(text)
             if _degree(expression) <= _MAX_DEGREE:
                 found.setdefault((component, expression))
-    base = 2.0 * math.log(len(found) + others) + math.log(max(count, 2))
-    more = {(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
-    return tuple(CandidateTerm(c, e, base + _complexity(Term(c, e, 0.0)) + more.get((c, e), 0.0)) for c, e in found)
+    laws = [Law(component, expression) for component, expression in found]
+    laws += parameter_laws(effective_track(predictor), has_cg)
+    base = 2.0 * math.log(len(laws) + others) + math.log(max(count, 2))
+    more = {Law(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
+    return tuple(Candidate(law, base + _complexity(law.term) + more.get(law, 0.0)) for law in laws)
+
+
+def effective_track(predictor: DrivePredictor) -> float:
+    """Difference of both sides' speeds over the yaw rate, by the model on this drive [m]; the robot's track where it does not turn."""
+    geometry, wz = predictor.drive.robot.geometry, predictor.corrected_twist(Hypothesis())[:, 2]
+    apart = geometry.wheel_radius_m * (predictor.batch.wheels[:, 1] - predictor.batch.wheels[:, 0])
+    return float(apart @ wz / (wz @ wz)) if wz @ wz > _TURNS_RAD2_S2 * len(wz) else geometry.track_width_m
 
 
 def _with_memory(predictor: DrivePredictor) -> list[str]:
@@ -244,9 +260,9 @@ def _with_memory(predictor: DrivePredictor) -> list[str]:
     return found
 
 
-def _fading_pairs(candidates: Sequence[CandidateTerm]) -> list[tuple[int, int]]:
+def _fading_pairs(candidates: Sequence[Candidate]) -> list[tuple[int, int]]:
     """Indices of terms that make what fades, c exp(-t/T) = c - c rise(t,T), of a motion c: neither is an improvement by itself."""
-    index = {(c.component, str(c.expression)): i for i, c in enumerate(candidates)}
+    index = {(c.law.component, str(c.law.expression)): i for i, c in enumerate(candidates) if not c.law.tied}
     texts = ((component, motion, text) for component, text in index for motion in _WARMING[component] if text.startswith(f"{motion}*rise("))
     return [(index[component, motion], index[component, text]) for component, motion, text in texts]
 
@@ -261,10 +277,8 @@ def _complexity(term: Term) -> float:
     return _COMPLEXITY_PRICE * (factors - 1) + (0.0 if term.is_symmetric else _ASYMMETRIC_PRICE)
 
 
-def term_columns(
-    predictor: DrivePredictor, hypothesis: Hypothesis, candidates: Sequence[CandidateTerm], path: FloatArray | None = None
-) -> FloatArray:
-    """(M, 6, K) change of the discrepancies per unit of each candidate's coefficient, with the sign of what the term removes, about the
+def term_columns(predictor: DrivePredictor, hypothesis: Hypothesis, laws: Sequence[Law], path: FloatArray | None = None) -> FloatArray:
+    """(M, 6, K) change of the discrepancies per unit of each law's coefficient, with the sign of what the term removes, about the
     motion of the twists ``path`` (N, 3), by default the predicted ones."""
     batch, twist = predictor.batch, predictor.corrected_twist(hypothesis)
     path = twist if path is None else path
@@ -273,15 +287,15 @@ def term_columns(
     v, wz = twist[:, 0], twist[:, 2]
     values = {"v": v, "wz": wz, "cg_x": batch.cg[:, 0], "cg_y": batch.cg[:, 1], "t": series.t}
     values |= {"dv": np.diff(v, prepend=v[:1]) * rate, "dwz": np.diff(wz, prepend=wz[:1]) * rate}
-    expressions = list(dict.fromkeys(c.expression for c in candidates))
+    expressions = {e: i for i, e in enumerate(dict.fromkeys(part.expression for law in laws for part in law.parts))}
     values = with_memory(expressions, values, series)
     shapes = np.column_stack([e.evaluate(values)[0] for e in expressions])
     moved = np.zeros((len(batch.ends), 3, 3, len(expressions)))
     for i, inside in enumerate(batch.intervals()):
         moved[i] = moved_by(path[inside], batch.dt[inside], shapes[inside] * batch.dt[inside, None])
-    columns = np.full((len(batch.ends), len(CHANNELS), len(candidates)), 0.0)
-    for k, candidate in enumerate(candidates):
-        columns[:, :3, k] = moved[:, :, COMPONENTS.index(candidate.component), expressions.index(candidate.expression)]
+    columns = np.full((len(batch.ends), len(CHANNELS), len(laws)), 0.0)
+    for k, law in enumerate(laws):
+        columns[:, :3, k] = sum(p.factor * moved[:, :, COMPONENTS.index(p.component), expressions[p.expression]] for p in law.parts)
     return columns
 
 
@@ -364,7 +378,7 @@ def find_terms(found: DiagnosisResult, rng: np.random.Generator) -> Search | Non
     chosen, stability = _supported(design, noise, chosen, f, rng)
     searched = _searched_candidates(design, noise, prices, f, bound.motions)
     chosen, placebos = _beyond_placebos(design, noise, (chosen, f), searched, rng)
-    names = [*(Term(c.component, c.expression, 0.0).name for c in candidates), *(s.name for s in shapes)]
+    names = [*(c.law.name for c in candidates), *(s.name for s in shapes)]
     refused = {names[i - f]: why for i, why in placebos.items()}
     has_sides = not _has_mirrored_rival(design.problem(noise), prices, limits, chosen, dict(enumerate(candidates, f)))
     return _describe(predictor, design, state, noise, chosen, (candidates, shapes), stability)._replace(
@@ -377,16 +391,16 @@ def _profiled(
     hypothesis: Hypothesis,
     design: Design,
     noise: Noise,
-    known: tuple[Sequence[CandidateTerm], int],
+    known: tuple[Sequence[Candidate], int],
     chosen: tuple[int, ...],
-) -> tuple[Design, tuple[CandidateTerm, ...]]:
+) -> tuple[Design, tuple[Candidate, ...]]:
     """``design`` and the ``known`` candidates, from a first column on: those of the ``chosen`` columns that have a memory have the
     constants by which they gain most beside the others, by steps that become smaller."""
     found, f, columns = list(known[0]), known[1], design.columns.copy()
-    remembering = [i for i in chosen if f <= i < f + len(found) and any(x.has_memory for x in found[i - f].expression.factors)]
+    remembering = [i for i in chosen if f <= i < f + len(found) and any(x.has_memory for x in found[i - f].law.expression.factors)]
     for ratio, i in itertools.product(_PROFILED, remembering):
         near, others = _near(found[i - f], ratio), [j for j in chosen if j != i]
-        tried = np.concatenate([columns[..., [i]], term_columns(predictor, hypothesis, near)], axis=-1)
+        tried = np.concatenate([columns[..., [i]], term_columns(predictor, hypothesis, [c.law for c in near])], axis=-1)
         problem = design._replace(columns=np.concatenate([columns[..., others], tried], axis=-1)).problem(noise)
         best = int(np.argmax(problem.gains_beside(range(len(others)))[len(others) :]))
         if best:
@@ -394,15 +408,15 @@ def _profiled(
     return design._replace(columns=columns), tuple(found)
 
 
-def _near(candidate: CandidateTerm, ratio: float) -> list[CandidateTerm]:
+def _near(candidate: Candidate, ratio: float) -> list[Candidate]:
     """``candidate`` with one constant of a memory larger or smaller by this ``ratio``."""
-    factors, found = candidate.expression.factors, []
+    factors, found = candidate.law.expression.factors, []
     for n, factor in enumerate(factors):
         for k, (low, high) in enumerate(CONSTANTS.get(factor.form, ())):
             for constant in (factor.constants[k] * ratio, factor.constants[k] / ratio):
                 constants = (*factor.constants[:k], float(f"{min(max(constant, low), high):.3g}"), *factor.constants[k + 1 :])
                 changed = Expression((*factors[:n], factor._replace(constants=constants), *factors[n + 1 :]))
-                found.append(dataclasses.replace(candidate, expression=changed))
+                found.append(dataclasses.replace(candidate, law=Law(candidate.law.component, changed)))
     return found
 
 
@@ -449,14 +463,14 @@ def _inseparable(problem: Regressor, chosen: Sequence[int]) -> list[tuple[int, .
 
 
 def _with_clock_for_gains(
-    problem: Regressor, causes: Sequence[Cause], candidates: Sequence[CandidateTerm], chosen: tuple[int, ...]
+    problem: Regressor, causes: Sequence[Cause], candidates: Sequence[Candidate], chosen: tuple[int, ...]
 ) -> tuple[int, ...]:
     """``chosen`` with the wheels' clock, which is named, in the place of gains in speed and in turning rate that are alike: to first order
     late stamps are vx = c dv and wz = c dwz.
 
     On MIT-CSAIL, whose positions and headings give clocks of -217 and -152 ms, the two terms explain the drive better, by -183 and -164 ms.
     """
-    names = {Term(c.component, c.expression, 0.0).name: len(causes) + n for n, c in enumerate(candidates)}
+    names = {c.law.name: len(causes) + n for n, c in enumerate(candidates)}
     gains = [names[name] for name in ("vx[dv]", "wz[dwz]") if names.get(name) in chosen]
     clock = next((i for i, cause in enumerate(causes) if cause.id == "wheel_time_offset"), None)
     if len(gains) < 2 or clock is None:
@@ -496,7 +510,7 @@ def _twice_log_determinant(noise: Noise) -> float:
 
 
 def _has_mirrored_rival(
-    problem: Regressor, prices: FloatArray, limits: FloatArray, chosen: tuple[int, ...], candidates: Mapping[int, CandidateTerm]
+    problem: Regressor, prices: FloatArray, limits: FloatArray, chosen: tuple[int, ...], candidates: Mapping[int, Candidate]
 ) -> bool:
     """Whether for a component whose ``chosen`` terms have one mirror symmetry, as many terms with the other one explain the drive as well.
 
@@ -505,9 +519,9 @@ def _has_mirrored_rival(
     are a symmetric one.
     """
     symmetry = {
-        i: (c.component, Term(c.component, c.expression, 0.0).is_symmetric)
+        i: (c.law.component, c.law.term.is_symmetric)
         for i, c in candidates.items()
-        if i in chosen or c.expression.mirror
+        if i in chosen or (c.law.expression.mirror and not c.law.tied)
     }
     found = {symmetry[i] for i in chosen if i in symmetry}
     least = min(c.price for c in candidates.values())
@@ -558,13 +572,13 @@ def _describe(
     state: Linearization,
     noise: Noise,
     chosen: tuple[int, ...],
-    known: tuple[Sequence[CandidateTerm], Sequence[BoundShape]],
+    known: tuple[Sequence[Candidate], Sequence[BoundShape]],
     stability: Mapping[int, float],
 ) -> Search:
     """The ``chosen`` columns of causes, then candidates, then bound shapes, with sizes by Gauss-Newton steps."""
     problem, (candidates, shapes) = design.problem(noise), known
     f, g = len(state.causes), len(state.causes) + len(candidates)
-    names = [*(Term(c.component, c.expression, 0.0).name for c in candidates), *(s.name for s in shapes)]
+    names = [*(c.law.name for c in candidates), *(s.name for s in shapes)]
     start, cov = problem.fit(chosen)
     gains = {i: problem.gain(chosen) - problem.gain(tuple(j for j in chosen if j != i)) for i in chosen}
     effects = [
@@ -573,15 +587,15 @@ def _describe(
         if i >= g
     ]
     kept, terms = tuple(i for i in chosen if i < f), [i for i in chosen if f <= i < g]
-    plain = tuple(Term(candidates[i - f].component, candidates[i - f].expression, float(start[chosen.index(i)])) for i in terms)
+    plain = tuple(candidates[i - f].law.with_value(float(start[chosen.index(i)])) for i in terms)
     sizes = np.array([start[n] for n, i in enumerate(chosen) if i < f])
     last = dataclasses.replace(state, noise=noise)
     of_effects = [i for i in chosen if i >= g]
     fit = Fit(kept, sizes, plain, np.array([e.value for e in effects]))
     fit = refine(predictor, last, fit, design.columns[..., of_effects])
     found = [
-        FoundTerm(term, stability[i], gains[i], _alike(problem, i, tuple(j for j in chosen if j != i), names, f))
-        for i, term in zip(terms, fit.terms, strict=True)
+        FoundTerm(law, stability[i], gains[i], _alike(problem, i, tuple(j for j in chosen if j != i), names, f))
+        for i, law in zip(terms, fit.laws, strict=True)
     ]
     effects = [e._replace(value=float(value)) for e, value in zip(effects, fit.effects, strict=True)]
     order = sorted(range(len(found)), key=lambda n: -found[n].gain), sorted(range(len(effects)), key=lambda n: -effects[n].gain)
@@ -602,19 +616,13 @@ def _make_design(
     state: Linearization,
     hypothesis: Hypothesis,
     causes: Sequence[int],
-    candidates: Sequence[CandidateTerm],
+    candidates: Sequence[Candidate],
     bound: FloatArray,
 ) -> Design:
     """Rows, what is tolerated, and columns of ``causes``, of ``candidates`` about ``hypothesis``, and the ``bound`` ones (M, 6, k)."""
-    T = term_columns(predictor, hypothesis, candidates)
+    T = term_columns(predictor, hypothesis, [c.law for c in candidates])
     S = np.nan_to_num(state.signatures)
-    return Design(state.linear, _tolerated(state), np.concatenate([S[..., list(causes)], T, bound], axis=-1))
-
-
-def _tolerated(state: Linearization) -> FloatArray:
-    """(M, 6, b) signatures of causes within tolerance, and nuisances, each times its prior sigma."""
-    S = np.nan_to_num(state.signatures) * (state.problem.scale * state.problem.tolerance)
-    return np.concatenate([S, np.nan_to_num(state.nuisances) * FLAT], axis=-1)
+    return Design(state.linear, state.tolerated(), np.concatenate([S[..., list(causes)], T, bound], axis=-1))
 
 
 class Fit(NamedTuple):
@@ -624,7 +632,7 @@ class Fit(NamedTuple):
     """Indices of the causes."""
     sizes: FloatArray
     """(k,) of the causes."""
-    terms: tuple[Term, ...]
+    laws: tuple[Law, ...]
     effects: FloatArray
     """(e,) of the bound effects."""
 
@@ -637,26 +645,29 @@ def refine(
     Gauss-Newton: discrepancies by the model with the terms, and columns about the motion that it predicts. First-order columns are off by
     sigmas where a term turns the robot by much: 95 % intervals held 90 % of coefficients, and hold 95 % after two steps.
     """
-    kept, sizes, terms, effects = start
-    causes, k, n = [state.causes[i] for i in kept], len(kept), len(kept) + len(terms)
-    if not terms and not len(effects):
+    kept, sizes, laws, effects = start
+    causes, k, n = [state.causes[i] for i in kept], len(kept), len(kept) + len(laws)
+    if not laws and not len(effects):
         return start
-    candidates = [CandidateTerm(t.component, t.expression, 0.0) for t in terms]
     for _ in range(_NEWTON_STEPS):
         hypothesis = with_sizes({cause: float(s) for cause, s in zip(causes, sizes, strict=True)})
-        extended = dataclasses.replace(predictor, model=extended_model(predictor, terms)) if terms else predictor
+        extended = dataclasses.replace(predictor, model=extended_model(predictor, terms_of(laws))) if laws else predictor
         rows = extended.discrepancies(hypothesis)
         S = np.stack([extended.signature(hypothesis, c) for c in causes], axis=-1) if causes else np.zeros((*rows.shape, 0))
         T = np.zeros((*rows.shape, 0))
-        if terms:
-            T = term_columns(predictor, hypothesis, candidates, extended.corrected_twist(hypothesis))
+        if laws:
+            T = term_columns(predictor, hypothesis, laws, extended.corrected_twist(hypothesis))
         columns = np.concatenate([np.nan_to_num(S), T, effect_columns], -1)
-        linear = rows + columns[..., :n] @ np.r_[sizes, [t.value for t in terms]]
-        values, cov = Design(linear, _tolerated(state), columns).problem(state.noise, used).fit(range(columns.shape[-1]))
+        linear = rows + columns[..., :n] @ np.r_[sizes, [law.value for law in laws]]
+        values, cov = Design(linear, state.tolerated(), columns).problem(state.noise, used).fit(range(columns.shape[-1]))
         sigmas, sizes, effects = np.sqrt(np.diagonal(cov))[k:n], values[:k], values[n:]
-        new = zip(terms, values[k:n], sigmas, strict=True)
-        terms = tuple(dataclasses.replace(t, value=float(value), sigma=float(sigma)) for t, value, sigma in new)
-    return Fit(kept, sizes, terms, effects)
+        laws = tuple(law.with_value(float(v), float(sigma)) for law, v, sigma in zip(laws, values[k:n], sigmas, strict=True))
+    return Fit(kept, sizes, laws, effects)
+
+
+def terms_of(laws: Sequence[Law]) -> tuple[Term, ...]:
+    """All terms of ``laws``; coefficients of the same term are summed."""
+    return merge_terms((), [term for law in laws for term in law.terms])
 
 
 def _alike(problem: Regressor, i: int, others: tuple[int, ...], names: list[str], f: int) -> tuple[str, ...]:
@@ -705,5 +716,5 @@ def merge_terms(own: Sequence[Term], added: Sequence[Term]) -> tuple[Term, ...]:
 
 def fit_on(predictor: DrivePredictor, search: Search, used: NDArray[np.bool_]) -> Fit:
     """Sizes of everything found as the windows ``used`` (M,) alone have them."""
-    start = Fit(search.kept, search.sizes, tuple(t.term for t in search.terms), np.array([e.value for e in search.effects]))
+    start = Fit(search.kept, search.sizes, tuple(t.law for t in search.terms), np.array([e.value for e in search.effects]))
     return refine(predictor, search.state, start, search.effect_columns, used)

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from localization.diagnosis.bound_effects import BoundShape
 from localization.diagnosis.gate import HandoverCheck
-from localization.diagnosis.term_words import describe_memory, describe_parameter
+from localization.diagnosis.parameter_laws import Law
+from localization.diagnosis.term_words import describe_memory
 from motion_models.terms import Term
 
 _TWO_SIDED_95 = 1.96
@@ -36,15 +37,20 @@ class FoundEffect(NamedTuple):
 
 @dataclass(frozen=True)
 class FoundTerm:
-    """A term of the drive, with what supports it."""
+    """A law of the drive, with what supports it."""
 
-    term: Term
+    law: Law
     stability: float
     """Share of random halves of the drive in which it, or one that this drive does not separate from it, is among the best."""
     gain: float
     """Twice the log-likelihood that it gains beside the others."""
     alike: tuple[str, ...] = ()
     """Candidates that the drive hardly separates from it, best first."""
+
+    @property
+    def term(self) -> Term:
+        """The first of its terms, which has the law's coefficient."""
+        return self.law.term
 
 
 @dataclass(frozen=True)
@@ -79,8 +85,8 @@ class Extension:
 
     def describe_terms(self) -> str:
         """The terms and their gain, as a sentence without a stop."""
-        parts = [describe_term(t.term) for t in self.terms]
-        known = [] if all(describe_parameter(t.term) for t in self.terms) else ["no physical cause known"]
+        parts = [describe_law(t.law) for t in self.terms]
+        known = [] if all(t.law.words for t in self.terms) else ["no physical cause known"]
         if self.replaced:
             known.append(f"it explains the drive better than {' and '.join(self.replaced)}")
         if any("t" in t.term.expression.variables for t in self.terms):
@@ -124,17 +130,19 @@ class Extension:
         """For `diagnose --json`: sizes in SI units with their 95 % intervals."""
         terms = [
             {
-                "component": t.term.component,
-                "expression": str(t.term.expression),
-                "value": t.term.value,
-                "sigma": t.term.sigma,
-                "interval": [t.term.value - _TWO_SIDED_95 * t.term.sigma, t.term.value + _TWO_SIDED_95 * t.term.sigma],
-                "unit": t.term.unit,
+                "component": term.component,
+                "expression": str(term.expression),
+                "value": term.value,
+                "sigma": term.sigma,
+                "interval": [term.value - _TWO_SIDED_95 * term.sigma, term.value + _TWO_SIDED_95 * term.sigma],
+                "unit": term.unit,
+                "parameter": t.law.parameter,
                 "stability": t.stability,
                 "log_likelihood": 0.5 * t.gain,
                 "alike": list(t.alike),
             }
             for t in self.terms
+            for term in t.law.terms
         ]
         effects = [
             {
@@ -172,11 +180,13 @@ def _rounded(values: Sequence[float], sigma: float) -> list[str]:
     return [f"{value:+.{decimals}f}" for value in values]
 
 
-def describe_term(term: Term) -> str:
-    """A term as an addition to its component, as ``vy is -0.12 (+- 0.01) m s x wz*abs(wz)``, with what it is in words."""
-    unit = "" if term.unit == "1" else f" {term.unit}"
-    words = describe_parameter(term) or describe_memory(term.expression.factors)
-    return f"{term.component} is {term.value:+.3g} (+- {term.sigma:.1g}){unit} x {term.expression}{f' ({words})' if words else ''}"
+def describe_law(law: Law) -> str:
+    """A law as an addition to its component, as ``vy is -0.12 (+- 0.01) m s x wz*abs(wz)``, with what it is in words."""
+    unit = "" if law.term.unit == "1" else f" {law.term.unit}"
+    words = law.words or describe_memory(law.expression.factors)
+    more = "".join(f", {t.component} by {t.value:+.2g}{'' if t.unit == '1' else f' {t.unit}'} x {t.expression}" for t in law.terms[1:])
+    text = f"{law.component} is {law.value:+.3g} (+- {law.sigma:.1g}){unit} x {law.expression}{f', with it{more[1:]}' if more else ''}"
+    return f"{text}{f' ({words})' if words else ''}"
 
 
 def describe_effect(effect: FoundEffect) -> str:

@@ -18,7 +18,7 @@ _PARAMETERS: Mapping[tuple[str, str], str] = {
 }
 """What a term of a motion alone changes, by component and motion."""
 _SPEED, _TURNING = "the speed", "the turning rate"
-_MODULATORS: Mapping[tuple[str, str], str] = {
+MODULATORS: Mapping[tuple[str, str], str] = {
     ("cg_x", ""): "the CG's x",
     ("cg_y", ""): "the CG's y",
     ("t", ""): "the time",
@@ -60,7 +60,7 @@ def describe_parameter(term: Term) -> str:
         rest = [f for k, f in enumerate(term.expression.factors) if k != n]
         if factor.power > 1:
             rest.insert(0, Factor(factor.variable, "abs" if factor.power % 2 else "", factor.power - 1))
-        follows = ["how long the drive lasts" if f.form == "rise" else _MODULATORS.get((f.variable, f.form), "") for f in rest]
+        follows = ["how long the drive lasts" if f.form == "rise" else MODULATORS.get((f.variable, f.form), "") for f in rest]
         if follows and all(follows):
             return f"{subject} follows {' and '.join(dict.fromkeys(follows))}"
     return ""

@@ -102,5 +102,55 @@ def test_correction_of_every_cause_acts_where_it_is_written(name: str) -> None:
         corrected = correct_robot(predictor, {cause: cause.typical}, ("friction",))
         state = linearize(predictor, (cause,), {}, TOLERANCE)
         every = CandidateRobot(corrected, {cause: cause.typical}, np.ones(len(drive.maneuvers), dtype=bool))
-        found = check_written(predictor, state.noise, every, None)
+        found = check_written(predictor, state, every, None)
         assert found is None or found.is_changed
+
+
+def test_compare_rows_what_is_tolerated_hides_no_right_law() -> None:
+    """A law of one sigma, on a robot whose LiDAR is off by five sigma of the noise, within tolerance: as they are, errors fall by 2 %."""
+    law, mount = np.sin(np.arange(_WINDOWS)), np.cos(2.0 * np.arange(_WINDOWS))
+    before, after = noise(), noise()
+    for rows, size in ((before, 1.0), (after, 0.0)):
+        rows[:, 0] += 0.01 * (size * law + 5.0 * mount)
+    plain = compare(before, after)
+    assert 0.0 < plain.gain.value < 0.05
+    assert "less than the 10 %" in plain.refusal
+    beside = np.zeros((_WINDOWS, 6, 1))
+    beside[:, 0, 0] = 0.05 * mount
+    found = compare_rows(held(before)._replace(beside=beside), held(after)._replace(beside=beside), _SIGMAS, np.ones(_WINDOWS))
+    assert found is not None
+    assert found.gain.value == plain.gain.value
+    assert found.gain_beside > 0.1
+    assert not found.refusal
+
+
+def test_compare_rows_a_row_that_a_tolerated_error_cancels_does_not_refuse() -> None:
+    """A right law that grows one row, where a tolerated error was of the opposite sign, and shrinks another by more."""
+    law = np.sin(np.arange(_WINDOWS))
+    before, after = noise(), noise()
+    before[:, 2] += 0.05 * law
+    after[:, 0] += 0.03 * law  # before, the law hid it
+    assert compare(before, after).worse == ("x",)
+    beside = np.zeros((_WINDOWS, 6, 1))
+    beside[:, 0, 0] = 0.05 * law
+    found = compare_rows(held(before)._replace(beside=beside), held(after)._replace(beside=beside), _SIGMAS, np.ones(_WINDOWS))
+    assert found is not None
+    assert found.worse == ()
+
+
+def test_compare_rows_the_size_of_a_law_beside_what_is_tolerated() -> None:
+    """Half of a law's column is a tolerated error of three times its size: as it is, the factor is far off; beside it, it is 1."""
+    other = np.cos(np.arange(_WINDOWS))
+    law = np.sin(np.arange(_WINDOWS)) + other
+    before = noise()
+    before[:, 0] += 0.02 * law - 0.06 * other
+    after = before.copy()
+    after[:, 0] -= 0.02 * law
+    beside = np.zeros((_WINDOWS, 6, 1))
+    beside[:, 0, 0] = 0.05 * other
+    found = compare_rows(held(before)._replace(beside=beside), held(after)._replace(beside=beside), _SIGMAS, np.ones(_WINDOWS))
+    assert found is not None
+    assert abs(found.shown[0] - 1.0) > 1.0
+    share, sigma = found.shown_beside
+    assert share == pytest.approx(1.0, abs=3.0 * sigma)
+    assert sigma < 0.2

@@ -15,8 +15,9 @@ from localization.diagnosis.drive import Drive
 from localization.diagnosis.extension import ExtendedResult, extend
 from localization.diagnosis.findings import confirmed_findings
 from localization.diagnosis.linearization import make_predictor
-from localization.diagnosis.missing_terms import CandidateTerm, candidate_terms, term_columns
+from localization.diagnosis.missing_terms import Candidate, candidate_terms, term_columns
 from localization.diagnosis.model_extension import Extension, FoundTerm
+from localization.diagnosis.parameter_laws import Law
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.terms import Term, parse_expression
@@ -48,7 +49,7 @@ def names(result: ExtendedResult) -> list[str]:
 @pytest.mark.parametrize(("count", "longest"), [(40, "rise(t,80)"), (150, "rise(t,300)")])
 def test_candidate_terms_warm_up_as_long_as_the_drive(count: int, longest: str) -> None:
     """A time constant of hundreds of seconds is written so that it is read again."""
-    texts = {str(c.expression) for c in candidate_terms(make_predictor(drive_with(count, 0), MODEL), 4 * count)}
+    texts = {str(c.law.expression) for c in candidate_terms(make_predictor(drive_with(count, 0), MODEL), 4 * count)}
     assert f"v*{longest}" in texts
     assert "v*t" not in texts
 
@@ -58,22 +59,19 @@ def test_candidate_terms_have_at_most_four_powers_of_motions() -> None:
     predictor = make_predictor(drive_with(16, 0), MODEL)
     candidates = candidate_terms(predictor, 64)
     twist = predictor.nominal_twist
-    assert {"v*abs(v)*wz", "v*wz*abs(wz)"} <= {str(c.expression) for c in candidates}
+    assert {"v*abs(v)*wz", "v*wz*abs(wz)"} <= {str(c.law.expression) for c in candidates}
     values = {"cg_x": np.zeros(len(twist)), "cg_y": np.zeros(len(twist)), "t": np.ones(len(twist))}
     motions = {"v": twist[:, 0], "wz": twist[:, 2], "dv": twist[:, 0], "dwz": twist[:, 2]}
-    for candidate in (c for c in candidates if not any(f.form == "play" for f in c.expression.factors)):  # it is 0 for small motions
-        small, large = (candidate.expression.evaluate(values | {n: s * m for n, m in motions.items()})[0] for s in (1.0, 10.0))
-        assert np.all(np.abs(large) <= 1e4 * (1.0 + 1e-9) * np.abs(small)), str(candidate.expression)
+    for candidate in (c for c in candidates if not any(f.form == "play" for f in c.law.expression.factors)):  # it is 0 for small motions
+        small, large = (candidate.law.expression.evaluate(values | {n: s * m for n, m in motions.items()})[0] for s in (1.0, 10.0))
+        assert np.all(np.abs(large) <= 1e4 * (1.0 + 1e-9) * np.abs(small)), str(candidate.law.expression)
 
 
 def test_term_columns_of_a_rise_equal_those_of_its_limit() -> None:
     """With a time constant of a millisecond nothing is left to rise."""
     predictor = make_predictor(drive_with(16, 0), MODEL)
     plain, risen = (term("vx", text, 1.0) for text in ("v", "v*rise(t,0.1)"))
-    candidate = candidate_terms(predictor, 64)[0]
-    columns = term_columns(
-        predictor, Hypothesis(), [dataclasses.replace(candidate, component="vx", expression=t.expression) for t in (plain, risen)]
-    )
+    columns = term_columns(predictor, Hypothesis(), [Law(t.component, t.expression) for t in (plain, risen)])
     late = predictor.window_times_s[0] > 2.0
     assert columns[late, :, 1] == pytest.approx(columns[late, :, 0], abs=1e-6)
 
@@ -170,7 +168,7 @@ def test_diagnosis_orders_no_cause_in_the_place_of_a_law(hidden: Term, count: in
 
 
 def test_table_of_an_extension_has_two_digits_of_the_sigma() -> None:
-    found = FoundTerm(Term("wz", parse_expression("max(wz,0)"), -0.149842, 0.00013), 1.0, 900.0)
+    found = FoundTerm(Law("wz", parse_expression("max(wz,0)"), -0.149842, 0.00013), 1.0, 900.0)
     (row,) = Extension("skid_steer", (found,), (), None).table()
     assert row == ("wz", "max(wz,0)", "-0.14984", "-0.15010 to -0.14959", "1", "100 %", "+450")
 
@@ -182,7 +180,7 @@ def test_gains_in_speed_and_in_turning_rate_that_are_alike_are_a_clock(turning: 
     columns = np.random.default_rng(0).normal(size=(200, 4))
     problem = missing_terms.Regressor(columns @ np.array([0.0, 0.02, -0.18, turning]), np.zeros((200, 1)), columns)
     causes = CAUSES["wheel_time_offset"], CAUSES["lidar_yaw"]
-    candidates = [CandidateTerm(c, parse_expression(text), 0.0) for c, text in (("vx", "dv"), ("wz", "dwz"))]
+    candidates = [Candidate(Law(c, parse_expression(text)), 0.0) for c, text in (("vx", "dv"), ("wz", "dwz"))]
     assert missing_terms._with_clock_for_gains(problem, causes, candidates, (1, 2, 3)) == expected
 
 

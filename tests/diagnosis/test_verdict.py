@@ -34,6 +34,7 @@ from localization.diagnosis.gate import HandoverCheck
 from localization.diagnosis.linearization import Linearization, candidate_causes, linearize, make_predictor, make_regression
 from localization.diagnosis.model_extension import Extension, FoundEffect, FoundTerm
 from localization.diagnosis.noise import given_noise
+from localization.diagnosis.parameter_laws import Law
 from localization.diagnosis.verdict import (
     _information_apart,
     attribute_rows,
@@ -51,7 +52,7 @@ from motion_models.calibration.regressions import read_rotation_table, rotations
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
-from motion_models.terms import Term, parse_expression
+from motion_models.terms import parse_expression
 from tests.helpers.law_drives import law_drive
 
 pytestmark = pytest.mark.xdist_group("verdict")
@@ -365,7 +366,7 @@ def test_noise_of_a_few_windows_is_more_than_the_references() -> None:
 
 
 _SHAPE = BoundShape("wz", "turning in the floor's patch", "place", "1")
-_TERM = FoundTerm(Term("vy", parse_expression("wz*abs(wz)"), -0.12, 0.01), 1.0, 90.0)
+_TERM = FoundTerm(Law("vy", parse_expression("wz*abs(wz)"), -0.12, 0.01), 1.0, 90.0)
 
 
 @pytest.mark.parametrize("verdict_row", ["attributed", "unexplained", "noise"])

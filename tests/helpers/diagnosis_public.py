@@ -228,7 +228,7 @@ def answer_of(found: DiagnosisResult, result: ExtendedResult) -> Answer:
     extension = result.extension
     named: list[tuple[str, float]] = []
     if extension is not None:
-        named += [(t.term.name, t.term.value) for t in extension.terms if result.robot is not None]
+        named += [(term.name, term.value) for t in extension.terms for term in t.law.terms if result.robot is not None]
         named += [(e.shape.name, e.value) for e in extension.effects]
     named += [(name, size) for f in findings for name, size in ((f.cause, f.size), *f.aliases)]
     robot = result.robot
@@ -253,10 +253,10 @@ def _columns(measured: Drive, baseline: Baseline | None) -> _Columns:
     predictor = make_predictor(measured, make_model(default_model(measured.robot), measured.robot), baseline)
     causes = candidate_causes(predictor, 0)
     state = linearize(predictor, causes, {}, TOLERANCE)
-    candidates = candidate_terms(predictor, state.problem.count)
-    columns = np.concatenate([np.nan_to_num(state.signatures), term_columns(predictor, Hypothesis(), candidates)], axis=-1)
+    laws = [c.law for c in candidate_terms(predictor, state.problem.count) if not c.law.tied]
+    columns = np.concatenate([np.nan_to_num(state.signatures), term_columns(predictor, Hypothesis(), laws)], axis=-1)
     y, a = state.noise.whiten(state.linear).ravel(), state.noise.whiten(columns)
-    terms = [Term(c.component, c.expression, 0.0) for c in candidates]
+    terms = [law.term for law in laws]
     return _Columns(predictor, causes, terms, y, a.reshape(len(y), -1))
 
 

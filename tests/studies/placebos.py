@@ -31,7 +31,7 @@ def p_values(robot: str, windows: int, draws: int, correlation: float, seed: int
     predictor = DrivePredictor(drive, make_model("friction", drive.robot), has_inertia=False)
     state = linearize(predictor, candidate_causes(predictor, 0), {}, TOLERANCE)
     candidates, bound = candidate_terms(predictor, state.problem.count), bound_columns(predictor, Hypothesis())
-    columns = np.concatenate([term_columns(predictor, Hypothesis(), candidates), bound.columns], axis=-1)
+    columns = np.concatenate([term_columns(predictor, Hypothesis(), [c.law for c in candidates]), bound.columns], axis=-1)
     motions = np.concatenate([np.zeros((*columns.shape[:2], len(candidates))), bound.motions], axis=-1)
     least = min(c.price for c in candidates)
     prices = np.array([*(c.price for c in candidates), *(least + s.price for s in bound.shapes)])
