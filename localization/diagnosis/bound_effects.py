@@ -1,8 +1,8 @@
-"""Effects that are bound to a time, a place, a wheel's angle, a tilt or a sensor: shapes of what a drive leaves that no robot file holds.
+"""Effects that are bound to a time, a place, a wheel's angle, a tilt, a torque, a temperature or a sensor, which no robot file holds.
 
 They compete with causes and terms (`missing_terms.py`), so that a floor that is slippery in one corner, an eccentric wheel or a gyro
-that feels accelerations is named as such. Columns are those of a twist that is added to the predicted one, integrated along each window, or
-of what a sensor measured beside the motion.
+that feels accelerations is named as such. Each is a motion of the robot, as the way of its left wheels, times what modulates it. Columns
+are those of a twist that is added to the predicted one, integrated along each window, or of what a sensor measured beside the motion.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Hypothesis
-from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, effective_track, moved_by
 from motion_models import se2
 from motion_models.calibration.prediction import series_of
 from motion_models.se2 import FloatArray
@@ -28,6 +28,9 @@ _MIN_TURNS = 3.0
 """Turns of a wheel in a drive from which on effects of its angle can be separated from those of time."""
 _MIN_TILT_M_S2 = 0.05
 """Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
+_SIDES = ("left", "right")
+_SIGNS = {"left": np.array([1.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 1.0])}
+"""Signs of vx, vy and wz by the way ahead of one side's wheels."""
 _PRICE = 3.0
 """Price of an effect that holds in this drive alone, in twice the log-odds beside terms."""
 
@@ -36,18 +39,25 @@ class BoundShape(NamedTuple):
     """A shape of unit size."""
 
     component: str
-    """vx, vy, wz, gyro, force_x or force_y."""
+    """vx, vy, wz, gyro, force_x or force_y: the one that it changes most."""
     along: str
     """What it follows, in words."""
     kind: str
-    """time, place, wheel angle, tilt or sensor."""
+    """time, place, wheel angle, tilt, torque, temperature or sensor."""
     unit: str
     price: float = _PRICE
+    moves: str = ""
+    """The motion that it changes, where that is in several components; else that is ``component``."""
 
     @property
     def name(self) -> str:
         """Component and what it follows, for tables: ``yaw[time]``."""
         return f"{self.component}[{self.along}]"
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """All components that it changes."""
+        return ("vx", "wz") if self.moves else (self.component,)
 
 
 class BoundColumns(NamedTuple):
@@ -74,29 +84,47 @@ def bound_columns(predictor: DrivePredictor, hypothesis: Hypothesis) -> BoundCol
 def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[tuple[FloatArray, FloatArray], list[BoundShape]]:
     """Columns of additions to the twist and of the motions that these modulate, and what each of them is bound to."""
     batch = predictor.batch
-    densities = [*_of_time(predictor, twist), *_of_place(predictor, twist), *_of_wheel_angle(predictor), *_of_tilt(predictor, twist)]
-    none = np.zeros((len(twist), 0))
-    table, motions = (np.column_stack([one[k] for one in densities]) if densities else none for k in (1, 2))
-    columns = np.zeros((2, len(batch.ends), len(CHANNELS), len(densities)))
-    axes = [("vx", "vy", "wz").index(shape.component) for shape, _, _ in densities]
+    bound = [*_of_time(predictor, twist), *_of_place(predictor, twist), *_of_wheel_angle(predictor), *_of_tilt(predictor, twist)]
+    bound += _of_signals(predictor, twist)
+    table = np.array([one.motion * one.values[:, None] for one in bound]).reshape(-1, len(twist), 3)
+    motions = np.array([one.motion for one in bound]).reshape(-1, len(twist), 3)
+    columns = np.zeros((2, len(batch.ends), len(CHANNELS), len(bound)))
     for i, inside in enumerate(batch.intervals()):
-        for found, values in zip(columns, (table, motions), strict=True):
-            moved = moved_by(twist[inside], batch.dt[inside], values[inside] * batch.dt[inside, None])
-            found[i, :3] = moved[:, axes, np.arange(len(densities))]
-    return (columns[0], columns[1]), [shape for shape, _, _ in densities]
+        for found, densities in zip(columns, (table, motions), strict=True):
+            for axis in range(3):
+                steps = densities[:, inside, axis].T * batch.dt[inside, None]
+                found[i, :3] += moved_by(twist[inside], batch.dt[inside], steps)[:, axis]
+    return (columns[0], columns[1]), [one.shape for one in bound]
 
 
-Densities = list[tuple[BoundShape, FloatArray, FloatArray]]
-"""Each shape with its density (N,) in every interval, in the unit of its component, and that of the motion alone."""
+class _Bound(NamedTuple):
+    """A motion times what modulates it, in every interval of a drive."""
+
+    shape: BoundShape
+    motion: FloatArray
+    """(N, 3) twist."""
+    values: FloatArray
+    """(N,)"""
 
 
-def _of_time(predictor: DrivePredictor, twist: FloatArray) -> Densities:
+def _part_of(twist: FloatArray, *axes: int) -> FloatArray:
+    """(N, 3) ``twist`` of these components alone."""
+    return np.asarray(twist * np.isin(np.arange(3), axes))
+
+
+def _of_side(predictor: DrivePredictor, side: int) -> FloatArray:
+    """(N, 3) the twist by the way of one side's wheels alone: a left wheel that rolls farther turns the robot to the right."""
+    speed = predictor.drive.robot.geometry.wheel_radius_m * predictor.batch.wheels[:, side]
+    return np.column_stack([0.5 * speed, np.zeros_like(speed), (2 * side - 1) * speed / effective_track(predictor)])
+
+
+def _of_time(predictor: DrivePredictor, twist: FloatArray) -> list[_Bound]:
     """What wears with the distance; what warms up is a term."""
     if predictor.drive.kind != "log":
         return []
     way = np.cumsum(np.abs(twist[:, 0]) * predictor.batch.dt)
     return [
-        (BoundShape(component, f"{name} times the way driven", "time", "1/m"), twist[:, i] * way, twist[:, i])
+        _Bound(BoundShape(component, f"{name} times the way driven", "time", "1/m"), _part_of(twist, i), way)
         for name, component, i in (("distance", "vx", 0), ("turning", "wz", 2))
     ]
 
@@ -118,7 +146,7 @@ def _places(predictor: DrivePredictor, twist: FloatArray) -> FloatArray:
     return found
 
 
-def _of_place(predictor: DrivePredictor, twist: FloatArray) -> Densities:
+def _of_place(predictor: DrivePredictor, twist: FloatArray) -> list[_Bound]:
     """Slip in patches of the area that was driven: a grid of cells, and its rows and columns."""
     if predictor.drive.kind != "log" or not predictor.drive.has_positions or not predictor.drive.has_headings:
         return []
@@ -128,9 +156,9 @@ def _of_place(predictor: DrivePredictor, twist: FloatArray) -> Densities:
         return []
     patches = [patch for cells in _CELLS for patch in _patches(at, low, high, cells)]
     return [
-        (BoundShape(component, f"{name} in the floor's patch {text}", "place", "1"), motion * inside, motion)
+        _Bound(BoundShape(component, f"{name} in the floor's patch {text}", "place", "1"), _part_of(twist, i), inside.astype(float))
         for text, inside in patches
-        for name, component, motion in (("distance", "vx", twist[:, 0]), ("turning", "wz", twist[:, 2]))
+        for name, component, i in (("distance", "vx", 0), ("turning", "wz", 2))
     ]
 
 
@@ -147,14 +175,13 @@ def _patches(at: FloatArray, low: FloatArray, high: FloatArray, cells: int) -> l
     return found + [(f"{words(0, i)} and {words(1, j)}", (cell[:, 0] == i) & (cell[:, 1] == j)) for i, j in both]
 
 
-def _of_wheel_angle(predictor: DrivePredictor) -> Densities:
-    """An eccentric wheel: its radius varies by e cos(angle - phase), and the speed of its side with it."""
+def _of_wheel_angle(predictor: DrivePredictor) -> list[_Bound]:
+    """An eccentric wheel: its radius varies by e cos(angle - phase), and the way of its side with it."""
     batch, drive = predictor.batch, predictor.drive
     if drive.kind != "log":
         return []
-    r, track = drive.robot.geometry.wheel_radius_m, drive.robot.geometry.track_width_m
-    found: Densities = []
-    for k, side in ((0, "left"), (1, "right")):
+    found = []
+    for k, side in enumerate(_SIDES):
         angles, total = np.zeros(len(batch.dt)), 0.0
         for w in range(len(drive.maneuvers)):
             inside = slice(batch.first[w] + batch.lead[w], batch.first[w + 1])
@@ -163,16 +190,13 @@ def _of_wheel_angle(predictor: DrivePredictor) -> Densities:
             total += float(steps[: int(drive.maneuvers[w].ends[-1])].sum())
         if np.abs(np.diff(angles)).sum() < 2.0 * math.pi * _MIN_TURNS:
             continue
-        speed = 0.5 * r * batch.wheels[:, k]
         for name, wave in (("cosine", np.cos(angles)), ("sine", np.sin(angles))):
-            along = f"the {side} wheels' angle ({name})"
-            turning = (2 * k - 1) * 2.0 / track * speed
-            found.append((BoundShape("vx", along, "wheel angle", "1"), speed * wave, speed))
-            found.append((BoundShape("wz", along, "wheel angle", "1"), turning * wave, turning))
+            shape = BoundShape("wz", f"the {side} wheels' angle ({name})", "wheel angle", "1", moves=f"the {side} wheels' way")
+            found.append(_Bound(shape, _of_side(predictor, k), wave))
     return found
 
 
-def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> Densities:
+def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> list[_Bound]:
     """Slip that follows how far the floor tilts the robot, by the accelerometers."""
     drive, batch = predictor.drive, predictor.batch
     if drive.forces is None or drive.kind != "log":
@@ -180,12 +204,31 @@ def _of_tilt(predictor: DrivePredictor, twist: FloatArray) -> Densities:
     left = (drive.forces - predictor.kinematic_forces) / GRAVITY
     left = left - np.median(left, axis=0)
     owner = np.repeat(np.arange(len(batch.first) - 1), np.diff(batch.first))
-    found: Densities = []
+    found = []
     speed = np.hypot(twist[:, 0], 0.5 * drive.robot.geometry.track_width_m * twist[:, 2])
     for k, axis in ((0, "pitch"), (1, "roll")):
         if GRAVITY * left[:, k].std() < _MIN_TILT_M_S2:
             continue
-        found.append((BoundShape(("vx", "vy")[k], f"speed times {axis}", "tilt", "1/rad"), speed * left[owner, k], speed))
+        motion = np.outer(speed, np.arange(3) == k)
+        found.append(_Bound(BoundShape(("vx", "vy")[k], f"speed times {axis}", "tilt", "1/rad"), motion, left[owner, k]))
+    return found
+
+
+def _of_signals(predictor: DrivePredictor, twist: FloatArray) -> list[_Bound]:
+    """Wheels that slip with their torque, and radii and turns that follow a temperature."""
+    drive = predictor.drive
+    if drive.kind != "log" or not drive.signals or not len(drive.spans_ns):
+        return []
+    times = drive.spans_ns[0, 0] + np.round(1e9 * (predictor.times_s + 0.5 * predictor.batch.dt)).astype(np.int64)
+    found = []
+    for signal in drive.signals:
+        values, unit = signal.at(times), f"1/({signal.unit})" if " " in signal.unit else f"1/{signal.unit}"
+        if signal.side:
+            shape = BoundShape("wz", signal.name, signal.kind, unit, moves=f"the {signal.side} wheels' way, of either direction,")
+            found.append(_Bound(shape, np.abs(_of_side(predictor, _SIDES.index(signal.side))) * _SIGNS[signal.side], values))
+            continue
+        for name, component, i in (("distance", "vx", 0), ("turning", "wz", 2)):
+            found.append(_Bound(BoundShape(component, f"{name} times {signal.name}", signal.kind, unit), _part_of(twist, i), values))
     return found
 
 
@@ -211,6 +254,11 @@ def _sensor_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[Float
         append("gyro", "time times time (bias by temperature)", "rad/s^2", seconds * drive.starts_s[batch.owner])
         append("gyro", "turning either way (scales of two sides)", "1", means["|wz|"] * seconds)
         append("gyro", "wz |wz| (scale by rate)", "s", means["wz|wz|"] * seconds)
+        middles = drive.spans_ns.mean(axis=1).astype(np.int64)
+        for signal in (one for one in drive.signals if one.kind == "temperature"):
+            values = signal.at(middles)[batch.owner]
+            append("gyro", f"time times {signal.name} (bias)", "rad/s per K", seconds * values)
+            append("gyro", f"turning times {signal.name} (scale)", "1/K", turn * values)
     if drive.forces is not None:
         append("force_x", "wz^2 (IMU ahead of the robot's middle)", "m", -means["wz^2"])
         append("force_y", "wz^2 (IMU left of the robot's middle)", "m", -means["wz^2"])

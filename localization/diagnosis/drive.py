@@ -20,6 +20,7 @@ from localization.calibration.calibrate import MotionReferenceName, estimate_ant
 from localization.calibration.motion_references import GyroMotionReference, LidarMotionReference, MotionReference, Span, Wheels
 from localization.calibration.position_reference import PositionMotionReference
 from localization.calibration.windows import WindowConfig, Windows, cut
+from localization.diagnosis.recorded_signals import Signal, read_signals
 from localization.events import Event, ImuSample, Scan, WheelSample
 from localization.inputs.gyro import GyroRecord, is_gravity
 from localization.logs.reader import Log
@@ -127,6 +128,8 @@ class Drive:
     """x and y in the body frame of the antenna, for positions without headings [m]."""
     encoder_step_rad: float = 0.0
     """Step of the wheels' encoders [rad]; 0 where it is not known."""
+    signals: tuple[Signal, ...] = ()
+    """What else the log has along time, and parameters may follow."""
     set_up: tuple[Message, ...] = ()
     """How the log's sensors are set up otherwise than the robot file had it: `robot` has that corrected."""
     warnings: tuple[Message, ...] = ()
@@ -269,7 +272,8 @@ def drive_of_log(
     notes = log.warnings()
     set_up = tuple(note for note in notes if note.id.startswith("set_up."))
     rest = tuple(note for note in notes if note not in set_up)
-    return dataclasses.replace(drive, encoder_losses=losses, cg_source=source, set_up=set_up, warnings=(*drive.warnings, *rest))
+    drive = dataclasses.replace(drive, signals=read_signals(log), set_up=set_up, warnings=(*drive.warnings, *rest))
+    return dataclasses.replace(drive, encoder_losses=losses, cg_source=source)
 
 
 def drive_of_events(

@@ -105,6 +105,7 @@ CHANNEL_UNITS = ("m", "m", "rad", "rad", "m/s^2", "m/s^2")
 _GYRO_TURN_SIGMA_RAD = 1e-3  # of a window's turn by the gyro against the motion reference
 _MAX_CACHED_TWISTS = 100
 _STAGES = get_args(Stage)
+_TURNS_RAD2_S2 = 0.01**2  # mean square of the yaw rate from where on a robot turns: noise of counts is less
 _LEAST_MU = 0.05  # ice
 _MAX_CONTACT_LAW = 1.3  # share of the other contact law; beyond 1 for the search only
 _NO_COLUMNS: IntArray = np.empty(0, dtype=np.int64)
@@ -406,6 +407,13 @@ class DrivePredictor:
         step = 0.1 * cause.typical
         ahead = self.discrepancies(cause.inject(hypothesis, step))
         return np.asarray(((self.discrepancies(hypothesis) if base is None else base) - ahead) / step)
+
+
+def effective_track(predictor: DrivePredictor) -> float:
+    """Difference of both sides' speeds over the yaw rate, by the model on this drive [m]; the robot's track where it does not turn."""
+    geometry, wz = predictor.drive.robot.geometry, predictor.corrected_twist(Hypothesis())[:, 2]
+    apart = geometry.wheel_radius_m * (predictor.batch.wheels[:, 1] - predictor.batch.wheels[:, 0])
+    return float(apart @ wz / (wz @ wz)) if wz @ wz > _TURNS_RAD2_S2 * len(wz) else geometry.track_width_m
 
 
 def moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:

@@ -127,8 +127,8 @@ def _with_supported(predictor: DrivePredictor, search: Search) -> Search:
     if effects:
         rest = tuple(name for name in kept if name not in effects)
         gate = check(rest, kept)
-        if gate is not None and gate.refusal:
-            why, kept = {**why, **dict.fromkeys(effects, gate.refusal)}, rest
+        if gate is not None and gate.objection:
+            why, kept = {**why, **dict.fromkeys(effects, gate.objection)}, rest
     return search.only(kept, why)
 
 
@@ -251,8 +251,8 @@ def _with_effects(
     again = examine(_without(drive, found.predictor, removed), model, config, found.predictor.baseline, found.names)
     d = again.diagnosis
     rows = dict(d.discrepancy)
-    for effect in extension.effects:
-        name = _CHANNEL_OF.get(effect.shape.component, effect.shape.component)
+    for effect, component in ((each, name) for each in extension.effects for name in each.shape.components):
+        name = _CHANNEL_OF.get(component, component)
         if name in rows and name in before.discrepancy:
             old, row = before.discrepancy[name], dataclasses.replace(rows[name], rms=before.discrepancy[name].rms)
             share = 1.0 - min((rows[name].rms / max(old.rms, 1e-12)) ** 2, 1.0)

@@ -103,35 +103,45 @@ class HandoverCheck:
 
         What acts in few windows, as a slip in left turns, scatters over the windows by as much as it gains.
         """
-        share, sigma = self.shown
-        return self.gain.low > 0.0 or share - CLEAR_SIGMAS * sigma > 0.5
+        return self.gain.low > 0.0 or _is_clear(*self.shown)
 
     @property
     def defect(self) -> str:
-        """Why a finding is none beside others, as a clause: what is held out does not show it; empty where it does."""
+        """Why a finding is none beside others, as a clause: what is held out does not show it, as it is or beside all that is tolerated;
+        empty where it does."""
         if self.failure:
             return self.failure
         if not self.is_changed:
             return "it changes no held-out number to the digit: what it writes acts nowhere on this drive, an error of the correction"
         if self.worse:
             return f"held-out windows get worse: {self._rows(self.worse)}"
-        if not self.is_beyond_scatter:
-            spread = f" ({100.0 * self.gain.low:.1f} to {100.0 * self.gain.high:.1f})" if math.isfinite(self.gain.low) else ""
-            percents = f"{100.0 * self.gain.value:.1f} %{spread}"
-            return f"held-out errors shrink by {percents}, which is within their scatter"
-        return ""
+        return "" if self.is_beyond_scatter or _is_clear(*self.shown_beside) else self._of_scatter()
+
+    def _of_scatter(self) -> str:
+        spread = f" ({100.0 * self.gain.low:.1f} to {100.0 * self.gain.high:.1f})" if math.isfinite(self.gain.low) else ""
+        return f"held-out errors shrink by {100.0 * self.gain.value:.1f} %{spread}, which is within their scatter"
 
     @property
     def refusal(self) -> str:
         """Why the file is not written, as a clause; empty where it is."""
         if self.defect:
             return self.defect
+        if not self.is_beyond_scatter:  # a tolerated error cancels it on this robot
+            return self._of_scatter()
         if growing := [f"{name} {one.before_m:.3g} -> {one.after_m:.3g} m" for name, one in self.replays.items() if one.is_worse]:
             return f"replayed with it, {', '.join(growing)} a window gets worse"
+        return self._worth()
+
+    @property
+    def objection(self) -> str:
+        """Why what no file holds explains nothing, as a clause: a tolerated error of this robot may cancel it; empty where it does."""
+        return self.defect or self._worth()
+
+    def _worth(self) -> str:
         worth = max(self.gain.value, self.gain_beside)
-        if worth < MIN_GAIN:
-            return f"held-out errors shrink by {100.0 * worth:.1f} %, less than the {100.0 * MIN_GAIN:.0f} % that a file is worth"
-        return ""
+        if worth >= MIN_GAIN:
+            return ""
+        return f"held-out errors shrink by {100.0 * worth:.1f} %, less than the {100.0 * MIN_GAIN:.0f} % that a file is worth"
 
     @property
     def is_better(self) -> bool:
@@ -169,6 +179,11 @@ class HandoverCheck:
             "replays": replays,
             **more,
         }
+
+
+def _is_clear(share: float, sigma: float) -> bool:
+    """Whether more than half of a change is shown, by `CLEAR_SIGMAS`."""
+    return share - CLEAR_SIGMAS * sigma > 0.5
 
 
 def folds(windows: int) -> list[NDArray[np.bool_]]:

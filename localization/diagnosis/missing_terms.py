@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
-from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, effective_track, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
 from localization.diagnosis.model_extension import FoundEffect, FoundTerm
 from localization.diagnosis.noise import Noise, reference_noise
@@ -76,8 +76,6 @@ _PROFILED = (1.5, 1.25, 1.25, 1.12, 1.12, 1.06, 1.06)
 _LEAST_PLAY = 0.01
 """Rate below which a hysteresis is noise [m/s, rad/s]."""
 _CG_MOVES_M = 0.005
-_TURNS_RAD2_S2 = 0.01**2
-"""Mean square of the yaw rate from where on a robot turns: noise of counts is less."""
 _COLLINEAR = 0.02  # least share of a column's squares that those already chosen leave
 _ASYMMETRIC_PRICE = 2.0 * math.log(3.0)
 """Price of a term that a robot with equal sides does not have; two in three robots have such sides."""
@@ -239,13 +237,6 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
     base = 2.0 * math.log(len(laws) + others) + math.log(max(count, 2))
     more = {Law(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
     return tuple(Candidate(law, base + _complexity(law.term) + more.get(law, 0.0)) for law in laws)
-
-
-def effective_track(predictor: DrivePredictor) -> float:
-    """Difference of both sides' speeds over the yaw rate, by the model on this drive [m]; the robot's track where it does not turn."""
-    geometry, wz = predictor.drive.robot.geometry, predictor.corrected_twist(Hypothesis())[:, 2]
-    apart = geometry.wheel_radius_m * (predictor.batch.wheels[:, 1] - predictor.batch.wheels[:, 0])
-    return float(apart @ wz / (wz @ wz)) if wz @ wz > _TURNS_RAD2_S2 * len(wz) else geometry.track_width_m
 
 
 def _with_memory(predictor: DrivePredictor) -> list[str]:

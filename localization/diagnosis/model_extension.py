@@ -19,6 +19,8 @@ _NOT_WRITTEN = {
     "place": "a robot file has no map",
     "wheel angle": "the angle at the start differs from drive to drive",
     "tilt": "models have no tilt as an input",
+    "torque": "models have no torque as an input",
+    "temperature": "models have no temperature as an input",
     "sensor": "it does not move the robot",
 }
 """Why a robot file does not hold an effect, by what it is bound to."""
@@ -194,4 +196,4 @@ def describe_effect(effect: FoundEffect) -> str:
     unit = "" if effect.shape.unit == "1" else f" {effect.shape.unit}"
     size = f"{effect.value:+.3g} (+- {effect.sigma:.1g}){unit}"
     why = f"bound to a {effect.shape.kind} and not written: {_NOT_WRITTEN[effect.shape.kind]}"
-    return f"{effect.shape.component} is {size} x {effect.shape.along} off, {why}"
+    return f"{effect.shape.moves or effect.shape.component} is {size} x {effect.shape.along} off, {why}"

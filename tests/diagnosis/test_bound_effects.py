@@ -13,12 +13,13 @@ from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import Drive, drive_of_log
 from localization.diagnosis.extension import ExtendedResult, extend
 from localization.diagnosis.model_extension import Extension
+from localization.diagnosis.recorded_signals import Side, Signal
 from localization.logs import open_log
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
 from motion_models.se2 import FloatArray
 from tests.helpers.diagnosis_drives import bag, drive
-from tests.helpers.diagnosis_effects import ChangedLog, Effect, hide
+from tests.helpers.diagnosis_effects import ChangedLog, Effect, Motion, hide
 from tests.helpers.diagnosis_windows import drive_of_windows, windows
 from tests.helpers.extended import cases
 
@@ -26,6 +27,8 @@ pytestmark = pytest.mark.xdist_group("bound_effects")
 
 MODEL = "diff_drive"
 _TILT_RAD = 0.06
+_PERIODS: tuple[tuple[Side, float], ...] = (("left", 3.0), ("right", 5.3))
+"""Sides, and the time in which the torque of each turns by a radian [s]."""
 FOREIGN: dict[str, tuple[Effect, str, float]] = {
     "slip when accelerating": (lambda m: (-0.12 * m.dv, 0.0, 0.0), "vx[dv]", -0.12),
     "encoder scale that grows with speed": (lambda m: (-0.12 * m.v * abs(m.v), 0.0, 0.0), "vx[v*abs(v)]", -0.12),
@@ -42,6 +45,13 @@ FOREIGN: dict[str, tuple[Effect, str, float]] = {
 def nominal(seed: int, count: int = 48) -> Drive:
     robot = load_robot("pioneer_3dx")
     return drive_of_windows(robot, windows([robot] * count, MODEL, seed))
+
+
+def stamped(measured: Drive) -> Drive:
+    """The windows of ``measured`` with stamps, as those of a log have them."""
+    lengths = [m.dt[m.lead :].sum() for m in measured.maneuvers]
+    spans = np.stack([measured.starts_s, measured.starts_s + lengths], axis=1)
+    return dataclasses.replace(measured, spans_ns=np.round(1e9 * spans).astype(np.int64))
 
 
 def extended(measured: Drive, model: str = MODEL) -> ExtendedResult:
@@ -80,9 +90,53 @@ def test_extend_slip_in_a_part_of_the_floor_is_bound_to_the_place() -> None:
 
 @pytest.mark.extended
 def test_extend_eccentric_wheel_is_bound_to_its_angle() -> None:
-    found = extension_of(hide(nominal(3, 96), lambda m: (0.0, 0.0, 0.25 * m.v * np.cos(m.angles[:, 0]))))
-    assert found.effects[0].shape.kind == "wheel angle"
-    assert "left" in found.effects[0].shape.along
+    """A left wheel whose axle is off its middle by 8 % of the radius moves the robot ahead as well."""
+    measured, track_m = nominal(3, 96), load_robot("pioneer_3dx").geometry.track_width_m
+
+    def eccentric(m: Motion) -> tuple[FloatArray, float, FloatArray]:
+        farther = 0.08 * (m.v - 0.5 * track_m * m.wz) * np.cos(m.angles[:, 0])
+        return 0.5 * farther, 0.0, -farther / track_m
+
+    found = extension_of(hide(measured, eccentric))
+    assert found.effects[0].shape.along == "the left wheels' angle (cosine)"
+    assert found.effects[0].value == pytest.approx(0.08, abs=3.0 * found.effects[0].sigma)
+    assert "The left wheels' way is +0.0" in found.describe()
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_extend_slip_by_traction_is_bound_to_the_torque(side: Side) -> None:
+    """Wheels of one side that slip by 1 % of their way for each newton metre; the other side's torque is another."""
+    measured, track_m = stamped(nominal(5, 96)), load_robot("pioneer_3dx").geometry.track_width_m
+    times = np.arange(0.0, 1.0 + 2.0 * len(measured.maneuvers), 0.1)
+    stamps = np.round(1e9 * times).astype(np.int64)
+    torques = {name: Signal(f"the {name} wheels' torque", "torque", "N m", stamps, 3.0 * np.sin(times / k), name) for name, k in _PERIODS}
+    sign = -1.0 if side == "left" else 1.0
+
+    def slips(m: Motion) -> tuple[FloatArray, float, FloatArray]:
+        lost = -0.01 * torques[side].at(np.round(1e9 * m.t).astype(np.int64)) * np.abs(m.v + sign * 0.5 * track_m * m.wz)
+        return 0.5 * lost, 0.0, sign * lost / track_m
+
+    found = extension_of(dataclasses.replace(hide(measured, slips), signals=tuple(torques.values())))
+    (effect,) = found.effects
+    assert effect.shape.along == f"the {side} wheels' torque"
+    assert effect.value == pytest.approx(-0.01, abs=4.0 * effect.sigma)
+    assert "models have no torque as an input" in found.describe()
+
+
+@pytest.mark.extended
+def test_extend_radius_that_follows_a_temperature_is_bound_to_it() -> None:
+    measured = stamped(nominal(6, 96))
+    stamps = 1_000_000_000 * np.arange(2 * len(measured.maneuvers) + 1)
+    kelvin = 10.0 * np.sin(np.arange(len(stamps)) / 15.0)
+    warm = Signal("the temperature of /tyres", "temperature", "K", stamps, 300.0 + kelvin)
+
+    def grows(m: Motion) -> tuple[FloatArray, float, float]:
+        return 0.01 * m.v * warm.at(np.round(1e9 * m.t).astype(np.int64)), 0.0, 0.0
+
+    (effect,) = extension_of(dataclasses.replace(hide(measured, grows), signals=(warm,))).effects
+    assert effect.shape.along == "distance times the temperature of /tyres"
+    assert effect.value == pytest.approx(0.01, abs=4.0 * effect.sigma)
 
 
 @pytest.mark.extended

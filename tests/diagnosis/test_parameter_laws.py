@@ -9,9 +9,10 @@ import pytest
 
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.diagnose import examine
+from localization.diagnosis.drive_predictor import effective_track
 from localization.diagnosis.extension import extend
 from localization.diagnosis.linearization import make_predictor
-from localization.diagnosis.missing_terms import effective_track, term_columns
+from localization.diagnosis.missing_terms import term_columns
 from localization.diagnosis.parameter_laws import PARAMETERS, Law, parameter_laws
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
