@@ -377,7 +377,12 @@ def _without(maneuver: Maneuver, components: Sequence[int]) -> Maneuver:
 def describe_clocks(offset_s: float, sigma_s: float, maneuvers: Sequence[Maneuver], robot: Robot) -> Message | None:
     """The wheels' clock as found beside those by headings and by positions alone, None where they agree."""
     others = estimate_clocks(maneuvers, robot)
-    if all(abs(each.offset_s - offset_s) <= 2.0 * math.hypot(each.sigma_s, sigma_s) for each in others):
+    log_odds = _JITTER_LOG_ODDS
+    for each in others:
+        variance = each.sigma_s**2 + sigma_s**2
+        share = variance / (variance + _JITTER_S**2)  # of the wider density's
+        log_odds += 0.5 * (each.offset_s - offset_s) ** 2 / variance * (1.0 - share) + 0.5 * math.log(share)
+    if log_odds < 0.0:
         return None
     by = [phrase("jittering_clock.by", offset_ms=1e3 * each.offset_s, sigma_ms=1e3 * each.sigma_s, what=each.by) for each in others]
     return message("jittering_clock.differs", offset_ms=1e3 * offset_s, sigma_ms=1e3 * sigma_s, others=" and ".join(by))
@@ -390,6 +395,10 @@ def _least_error(residuals: FloatArray) -> float:
 
 _CLOCK_SIGMA_S = 0.008
 """Sigma of the wheels' clock by models without inertia: a simulated Husky's is 9 ms off (`diagnose` tolerates as much)."""
+_JITTER_LOG_ODDS = math.log(0.02)
+"""Logarithm of the prior odds of stamps that jitter, or of rates that the driver smooths."""
+_JITTER_S = 0.05
+"""Standard deviation of the offsets that headings and positions give then: MIT-CSAIL's are 65 ms apart [s]."""
 _FINEST_ERROR = 1e-4
 """Smallest error of a position [m] or heading [rad]: what the best references resolve."""
 _NO_SLIP = WheelNoise(*(0.0,) * 8)

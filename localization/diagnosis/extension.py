@@ -99,7 +99,7 @@ def extend(
         tuple(dict.fromkeys(f.cause for f in found.diagnosis.findings if f.cause in {c.id for c in causes} - kept)) if is_changed else ()
     )
     whole, sizes = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), dtype=bool))
-    refusal = _refusal(predictor, search, CandidateRobot(whole, sizes, np.ones(len(drive.maneuvers), dtype=bool)))
+    refusal = _refusal(predictor, search, CandidateRobot(whole, sizes, np.ones(len(drive.maneuvers), dtype=bool), is_beside=True))
     extension = Extension(model.name, search.terms, replaced, check, search.effects, refusal, search.refused)
     if not extension.is_better:
         return ExtendedResult(_with_effects(found, extension, search, model, config), extension)
@@ -160,7 +160,7 @@ def _check(predictor: DrivePredictor, search: Search, reader: Reader | None, oth
     first, second = interleaved_halves(len(predictor.drive.maneuvers))
     used, held = min((first, second), (second, first), key=lambda pair: relative_sigma(pair[0]))
     by_half, sizes = _robot_by(predictor, search, np.ones(len(predictor.batch.owner), bool) if others else used[predictor.batch.owner])
-    return check_written(predictor, search.state, CandidateRobot(by_half, sizes, held), reader, others)
+    return check_written(predictor, search.state, CandidateRobot(by_half, sizes, held, is_beside=True), reader, others)
 
 
 _PARTS = 4

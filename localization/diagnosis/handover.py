@@ -104,6 +104,13 @@ class CandidateRobot:
     """Sizes of the causes that it was corrected by."""
     held: NDArray[np.bool_]
     """(W,) windows that did not correct it."""
+    is_beside: bool = False
+    """Whether it is judged beside all that is tolerated as well, as a law is, which placebos have judged; else by the rows as they are,
+    which are the only check of a cause that is independent of other causes."""
+
+    def tolerated(self, state: Linearization) -> FloatArray | None:
+        """(M, 6, b) what the drive of ``state`` may have beside its causes, times its prior sigma; None where that is not considered."""
+        return state.tolerated(self.sizes) if self.is_beside else None
 
 
 def check_findings(
@@ -123,13 +130,12 @@ def check_findings(
         return None
     held = np.arange(len(predictor.drive.maneuvers)) >= len(predictor.drive.maneuvers) // 2
     rows: dict[tuple[str, ...], HeldRows] = {}
-    tolerated = linearization.tolerated([cause for cause in linearization.causes if cause.key in named])
 
     def check(fewer: tuple[str, ...], more: tuple[str, ...]) -> HandoverCheck | None:
         for keys in (fewer, more):
             if keys not in rows:
                 try:
-                    rows[keys] = _cross_predicted(predictor, linearization, keys)._replace(beside=tolerated)
+                    rows[keys] = _cross_predicted(predictor, linearization, keys)
                 except (CgError, ModelError):  # no robot has the sizes of these windows
                     return None
         return compare_rows(rows[fewer], rows[more], linearization.noise.sigmas, linearization.noise.weights)
@@ -198,7 +204,7 @@ def _check_predicted(predictor: DrivePredictor, state: Linearization, candidate:
     after = predictor_after(predictor, candidate.corrected, predictor.model.name)
     held = candidate.held[predictor.batch.owner]
     rows = predictor.discrepancies(_of_reference(hypothesis, drive.is_lidar_reference)), after.discrepancies(_of_sensors(hypothesis))
-    noise, tolerated = state.noise, state.tolerated(candidate.sizes)
+    noise, tolerated = state.noise, candidate.tolerated(state)
     old, new = (HeldRows(row, predictor.batch.measured, tolerated).part(held) for row in rows)
     found = compare_rows(old, new, noise.sigmas[held], noise.weights[held])
     if found is None or drive.kind == "log":
@@ -258,9 +264,9 @@ def _reread(predictor: DrivePredictor, state: Linearization, candidate: Candidat
     ]
     of_marker = _of_reference(with_sizes(candidate.sizes), after.is_lidar_reference)
     first, second = _paired(before, after, candidate.held)
-    noise, tolerated = state.noise, state.tolerated(candidate.sizes)[first]
+    noise, tolerated = state.noise, candidate.tolerated(state)
     held = [
-        HeldRows(p.discrepancies(of_marker)[windows], p.batch.measured[windows], tolerated)
+        HeldRows(p.discrepancies(of_marker)[windows], p.batch.measured[windows], None if tolerated is None else tolerated[first])
         for p, windows in zip(predictors, (first, second), strict=True)
     ]
     squares: dict[str, tuple[FloatArray, FloatArray]] = {}

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from localization.calibration import calibrate
 from localization.calibration.calibrate import describe_clocks, estimate_clocks
 from motion_models import se2
 from motion_models.base import MotionModel
@@ -389,6 +390,21 @@ def test_describe_clocks_headings_and_positions_apart_are_both_named(positions_s
     if text is not None:
         assert "by headings alone" in text
         assert "by positions alone: one offset does not describe this drive" in text
+
+
+@pytest.mark.parametrize(
+    ("headings", "positions", "is_one_clock"),
+    [((-0.201, 0.008), (-0.223, 0.010), True), ((-0.152, 0.012), (-0.217, 0.012), False)],
+    ids=["simulated, one clock of 200 ms", "MIT-CSAIL"],
+)
+def test_describe_clocks_of_two_sigma_are_one_clock(
+    headings: tuple[float, float], positions: tuple[float, float], is_one_clock: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of 20 healthy drives has estimates that are as far apart."""
+    found = [calibrate.ClockEstimate("headings", *headings), calibrate.ClockEstimate("positions", *positions)]
+    monkeypatch.setattr(calibrate, "estimate_clocks", lambda *given: found)
+    offset = -0.2 if is_one_clock else -0.16
+    assert (describe_clocks(offset, 0.006, [], ROBOT) is None) == is_one_clock
 
 
 def test_estimate_clocks_of_headings_gives_no_other() -> None:
