@@ -183,6 +183,8 @@ def _refusal(predictor: DrivePredictor, search: Search, whole: CandidateRobot) -
             "other terms, which differ from it in turns to the other side, explain this drive as well (drive arcs to both sides, ahead and"
             " back)"
         )
+    if not search.is_lasting:
+        return "motions whose share changes along the drive explain it better"
     if why := _extrapolates_badly(predictor, search):
         return why
     part = np.arange(len(whole.held)) * _PARTS // len(whole.held)

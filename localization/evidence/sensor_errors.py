@@ -65,9 +65,11 @@ class SensorError:
         return describe_size(self.words, self.unit, size)
 
 
-def describe_size(words: tuple[str, str], unit: str, size: float, sigma: float = 0.0) -> str:
-    """``words`` at a positive and at a negative size with this ``size`` in its ``unit``, and with its ``sigma`` where that is given."""
-    factor, name = (1.0, unit) if abs(size) >= _LARGE.get(unit, math.inf) else _SHOWN_UNITS.get(unit, (1.0, unit))
+def describe_size(words: tuple[str, str], unit: str, size: float, sigma: float = 0.0, in_si: bool = False) -> str:
+    """``words`` at a positive and at a negative size with this ``size`` in its ``unit``, and with its ``sigma`` where that is given;
+    ``in_si``: a coefficient of a law, in the SI unit as it is."""
+    is_plain = in_si or abs(size) >= _LARGE.get(unit, math.inf)
+    factor, name = (1.0, unit) if is_plain else _SHOWN_UNITS.get(unit, (1.0, unit))
     amount = abs(size) * factor
     decimals = max(0, 1 - math.floor(math.log10(max(amount, 1e-12))))  # two digits at least
     spread = f" +- {sigma * factor:.{decimals}f}" if sigma else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -121,6 +122,24 @@ def test_extend_writes_no_term_that_holds_in_a_part_of_the_drive() -> None:
     assert result.extension is not None
     assert result.extension.refusal or result.extension.refused
     assert result.robot is None
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("follows_time", [True, False])
+def test_extend_writes_no_term_in_the_place_of_a_change_along_the_drive(follows_time: bool) -> None:
+    """The robot turned left while sin(t/9) was positive, and right while it was not: wz sin(t/9) is nearly |wz| there."""
+    windows_of = drive_with(400, 0).maneuvers
+    by_side = [[m for m in windows_of if (m.wheels[:, 1] - m.wheels[:, 0]).mean() * side > 0.3] for side in (1.0, -1.0)]
+    chosen = [by_side[math.sin((2.0 * i + 1.0) / 9.0) < 0.0][i] for i in range(48)]
+    plain = drive_of_windows(ROBOT, [dataclasses.replace(m, start_s=2.0 * i) for i, m in enumerate(chosen)])
+    effect: Effect = lambda m: (0.0, 0.0, 0.2 * (m.wz * np.sin(m.t / 9.0) if follows_time else np.abs(m.wz)))  # noqa: E731
+    result = extended(hide(plain, effect))
+    assert result.extension is not None
+    assert (result.robot is None) == follows_time
+    if follows_time:
+        assert "share changes along the drive" in result.extension.describe()
+    else:
+        assert names(result) == ["wz[abs(wz)]"]
 
 
 @pytest.mark.extended

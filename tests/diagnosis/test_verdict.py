@@ -117,6 +117,7 @@ def test_describe_row_tolerated_names_cause_and_share() -> None:
         ("rotation_scale", 0.1, "the robot turns 10 % more than the model predicts, at any speed"),
         ("wheel_time_offset", -0.114, "the wheels' stamps are 114 ms early"),
         ("lidar_yaw", 0.03, "the LiDAR is turned by 1.7 deg to the left"),
+        ("longitudinal_slip_turning", -0.088, "the robot goes farther in turns: vx *= 1 + 0.088 s/rad |wz|"),
         ("payload", 3.0, "the robot carries 3.0 kg that its file does not have"),
         ("gyro_bias", -0.02, "the gyro reads 0.020 rad/s to the right at standstill"),
     ],

@@ -313,7 +313,7 @@ class Cause:
         >>> CAUSES["track_width"].describe(-0.012)
         'the left and right contacts are 12 mm closer together than the robot file has it'
         """
-        return describe_size(self.words, "" if self.is_coefficient else self.unit, size, sigma)
+        return describe_size(self.words, self.unit, size, sigma, in_si=self.is_coefficient)
 
     @property
     def is_coefficient(self) -> bool:
