@@ -109,10 +109,11 @@ class Diagnose:
             drive = self._drive(robot, reader)
         robot = drive.robot  # as the log has it
         model = make_model(self.model or default_model(robot), robot)
-        baseline = None
+        baseline, beside = None, [one.drive(robot) for one in others]
         if self.healthy is not None:
             with console.status("reading the healthy drive"):
-                baseline = estimate_baseline(self._cut(self._open(self.healthy, robot)), model)
+                healthy = self._cut(self._open(self.healthy, robot))
+                baseline, beside = estimate_baseline(healthy, model), [*beside, healthy]
         with console.status("searching for causes"):
             of_model = examine_beside_suited(drive, model, self.config, baseline)
             found, by_suited = of_model.found, of_model.notes
@@ -122,7 +123,8 @@ class Diagnose:
             with console.status("searching for terms"):
                 extended = extend(found, drive, model, self.config, reader, others)
                 found = extended.found
-        notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings)
+        of_others = [note.of(one.name) for one in beside for note in one.set_up]
+        notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings, *of_others)
         found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
         if (self.out is not None or others) and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):

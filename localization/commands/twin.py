@@ -83,7 +83,7 @@ class Twin:
         with console.status("reading"):
             read = [self._maneuvers(path, robot) for path in self.source]
             maneuvers = [m for of_path, _ in read for m in of_path]
-            notes = (*notes, *dict.fromkeys(note for _, note in read if note))
+            notes = (*notes, *dict.fromkeys(note for _, of_path in read for note in of_path if note))
         with console.status("simulating"):
             result = examine(maneuvers, robot, simulator, self.config)
             result = dataclasses.replace(result, notes=(*notes, *result.notes))
@@ -120,17 +120,19 @@ class Twin:
             file, notes = mjcf_of_gazebo(file, robot)
         return read_simulator(file or mjcf_of(robot), robot, self.config.threads), notes
 
-    def _maneuvers(self, path: Path, robot: Robot) -> tuple[list[Maneuver], str]:
-        """Maneuvers of one log or table, and a sentence on its commands."""
+    def _maneuvers(self, path: Path, robot: Robot) -> tuple[list[Maneuver], tuple[str, ...]]:
+        """Maneuvers of one log or table, and sentences on its set-up and on its commands."""
         if path.suffix.lower() != ".csv":
             log = open_log_to_fit(path, robot, self.topic.scored_against(self.reference))
             config, sigmas = WindowConfig(window_s=self.window_s), in_radians(self.reference_sigma)
-            return maneuvers_of(log, drive_of_log(log, self.motion_reference, self.reference, config, sigmas), self.commands)
+            drive = drive_of_log(log, self.motion_reference, self.reference, config, sigmas)
+            maneuvers, about = maneuvers_of(log, drive, self.commands)
+            return maneuvers, (*drive.set_up, about)
         if "rotation_ratio" in table_columns(path):
             maneuvers, kind = rotations_as_maneuvers(read_rotations(path, robot), robot), "rotations"
         else:
             maneuvers, kind = without_foreign_frames(read_windows(path), robot.geometry.wheel_radius_m)[0], "windows"
-        return list(drive_of_table(path.name, robot, maneuvers, kind).maneuvers), ""
+        return list(drive_of_table(path.name, robot, maneuvers, kind).maneuvers), ()
 
 
 def maneuvers_of(log: Log, drive: Drive, commands: str | None = None) -> tuple[list[Maneuver], str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from localization.diagnosis.corrected_robot import correct_robot
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.weigh import DrivenWeighing, weigh
 from localization.evidence import open_log_to_fit
+from localization.evidence.verdict import as_written
 from localization.logs import TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.weigh_page import weigh_rows, write_weigh_page
@@ -68,6 +70,8 @@ class Weigh:
             )
         with console.status("weighing"):
             found, predictor = weigh(drive)
+        if self.out is not None:
+            found = dataclasses.replace(found, warnings=as_written(found.warnings))
         print_weighing(console, found, self.at)
         if self.out is not None:
             new = correct_robot(predictor, found.sizes)

@@ -227,7 +227,7 @@ def weigh(drive: Drive) -> tuple[DrivenWeighing, DrivePredictor]:
         noise_ratio=ratio,
         corrections=_nuisances(causes[2:], values[2:], np.sqrt(np.diagonal(cov)[2:])),
         model_errors=model_errors,
-        warnings=(*model_errors, *drive.warnings),
+        warnings=(*drive.set_up, *model_errors, *drive.warnings),
         slope=_slope_weighing(robot, estimate, bool(model_errors)),
     )
     return found, predictor

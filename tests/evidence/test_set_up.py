@@ -24,6 +24,7 @@ from localization.messages import message
 from motion_models.robot import Mount
 from motion_models.robot_file import load_robot, robot_toml
 from tests.helpers import bags, entrance_drives
+from tests.helpers.diagnosis_drives import bag
 from tests.helpers.entrance_drives import Publishing, Vehicle
 from tests.helpers.extended import cases
 from tests.helpers.hostile_mounts import rear_lidar_described_at_the_front
@@ -312,6 +313,19 @@ def test_what_is_fitted_has_the_set_up_corrected_and_writes_it(command: str, tmp
     assert printed.count("the right side counts backwards") == 1
     assert "Corrected in this run" not in printed
     assert load_robot(str(out if command == "calibrate" else out / "robot.toml")).joints.reversed == RIGHT
+
+
+@pytest.mark.extended
+def test_weigh_names_the_set_up_that_it_corrects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, robot = bag(tmp_path / "drive.mcap", {}, 3, "husky_a200"), load_robot("husky_a200")
+    swapped = replace(robot, joints=replace(robot.joints, left=robot.joints.right, right=robot.joints.left))
+    given, out = tmp_path / "given.toml", tmp_path / "new.toml"
+    given.write_text(robot_toml(swapped))
+    assert main(["weigh", str(log), "--robot", str(given), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "left and right wheels are exchanged" in printed
+    assert "Written to the robot file: joints.left" in printed
+    assert load_robot(str(out)).joints == robot.joints
 
 
 @pytest.mark.parametrize("command", ["calibrate", "diagnose"])
