@@ -497,7 +497,8 @@ def _of_motion(d: Diagnosis) -> str:
         return f"{cannot}{found}{contradiction} {d.next_drive}"
     added = [] if d.extension is None else [text for text in (d.extension.describe(), d.extension.describe_refused()) if text]
     if d.verdict == "consistent" or (d.verdict == "explained" and d.set_up and not (d.findings or added)):
-        text = f"{d.model} fits this drive: {d.windows} windows show no error beyond its tolerance"
+        begin = "With that corrected, " if d.set_up else ""
+        text = f"{begin}{d.model} fits this drive: {d.windows} windows show no error beyond its tolerance"
         if d.joint_p < _JOINT_LEVEL:
             text = f"Each cause by itself is within its tolerance, and {_joint(d)}"
         tolerated = describe_tolerated(d)

@@ -311,6 +311,7 @@ def test_what_is_fitted_has_the_set_up_corrected_and_writes_it(command: str, tmp
     printed = capsys.readouterr().out
     assert 'Written to the robot file: joints.reversed = ["front_right_wheel", "rear_right_wheel"]' in printed
     assert printed.count("the right side counts backwards") == 1
+    assert command == "calibrate" or "With that corrected, skid_steer fits this drive" in printed
     assert "Corrected in this run" not in printed
     assert load_robot(str(out if command == "calibrate" else out / "robot.toml")).joints.reversed == RIGHT
 
