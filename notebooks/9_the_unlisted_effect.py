@@ -29,7 +29,7 @@ from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.extension import extend
 from localization.diagnosis.handover import Reader
-from localization.diagnosis.model_extension import describe_term
+from localization.diagnosis.model_extension import describe_law
 from localization.evaluation.reference_files import load_reference
 from localization.events import Scan
 from localization.logs.writer import write_bag
@@ -163,7 +163,8 @@ print(f"{extended.found.diagnosis.verdict}: {extended.found.diagnosis.sentence}"
 # %%
 hidden = {term.name: term.value for term in real.terms[MODEL]}
 extension = extended.extension
-rows = [(t.term, *row["interval"], row["stability"]) for t, row in zip(extension.terms, extension.to_dict()["terms"], strict=True)]
+terms = [term for t in extension.terms for term in t.law.terms]
+rows = [(t, *row["interval"], row["stability"]) for t, row in zip(terms, extension.to_dict()["terms"], strict=True)]
 table(
     ["term", "found", "95 % from", "to", "unit", "hidden", "off by [sigma]", "random halves that find it"],
     *(
@@ -181,7 +182,7 @@ picture(
             sideways("by the robot file", found.residuals.rows[:, 1], "red", "s"),
             sideways("with the term", extended.found.residuals.rows[:, 1], "blue", "o"),
         ],
-        ", ".join(describe_term(t) for t, *_ in rows),
+        ", ".join(describe_law(t.law) for t in extension.terms),
         level=0.0,
     ),
     columns=1,

@@ -533,11 +533,13 @@ def _correction(d: Diagnosis, findings: Sequence[Finding]) -> str:
     """What to correct, strongest finding first, and what that gains on windows that did not correct it."""
     first = findings[0]
     text = f"Correct {first.definition.label} by {first.size:+.3g}{unit_of(first.cause)} (+- {first.sigma:.1g}): {first.description}"
-    gain = (d.gain or first.gain).relative if d.handover is None else d.handover.gain.value
+    gain, what = (d.gain or first.gain).relative, "held-out discrepancies"
+    if d.handover is not None:
+        gain, what = d.handover.gain.value, "the held-out errors that it changes"
     if d.handover is not None and any(each.after_m < each.before_m for each in d.handover.replays.values()):
         text += f"; {d.handover.describe_replays()}"
     elif gain >= _SHOWN_GAIN:
-        text += f"; held-out discrepancies fall by {100 * gain:.0f} %"
+        text += f"; {what} fall by {100 * gain:.0f} %"
     if first.aliases:
         text += f". This drive cannot separate it from {describe_sizes(first.aliases)}"
     if len(findings) > 1:
