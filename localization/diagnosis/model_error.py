@@ -71,14 +71,17 @@ class MissingSlips(NamedTuple):
         return (message("contacts.other", gain=0.5 * self.log_odds),)
 
 
-def find_model_error(predictor: DrivePredictor, linearization: Linearization) -> MissingSlips:
+def find_model_error(predictor: DrivePredictor, linearization: Linearization, chosen: tuple[int, ...] | None = None) -> MissingSlips:
     """Errors of the model on the drive of ``predictor``: of the contacts' stiffness, where the ``linearization`` has it, and slips by kind
-    of motion, of which it has none."""
+    of motion, of which it has none. Beside all causes at any plausible size, or beside those ``chosen`` and the others within their
+    tolerances."""
     columns = np.where(np.isfinite(linearization.rows)[..., None], slip_columns(predictor), np.nan)
     nuisances = np.concatenate([linearization.nuisances, columns * (_RICHEST_SHARE / FLAT)], axis=-1)
     noise = estimate_drive_noise(predictor, linearization.linear, linearization.signatures, nuisances, linearization.causes)
     y = noise.whiten(linearization.linear).ravel()
-    parts = linearization.signatures * linearization.problem.scale, linearization.nuisances * FLAT, columns
+    problem, count = linearization.problem, len(linearization.causes)
+    spreads = problem.scale * (1.0 if chosen is None else np.where(np.isin(np.arange(count), chosen), 1.0, problem.tolerance))
+    parts = linearization.signatures * spreads, linearization.nuisances * FLAT, columns
     S, N, E = (noise.whiten(part).reshape(len(y), -1) for part in parts)
     nothing = _twice_log_evidence(y, np.hstack([S, N[:, :LEVELS]]))
     shares = np.r_[0.0, _SHARES] if N.shape[1] > LEVELS else _SHARES

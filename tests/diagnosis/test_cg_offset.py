@@ -11,6 +11,7 @@ from rich.console import Console
 
 from localization.commands.diagnose import Diagnose
 from localization.diagnosis.causes.cause import Hypothesis
+from localization.diagnosis.diagnose import examine
 from localization.diagnosis.drive import drive_of_log
 from localization.diagnosis.linearization import make_predictor
 from localization.events import CgSample
@@ -21,7 +22,9 @@ from localization.simulation.sensors import ImuConfig, SensorConfig
 from localization.simulation.simulator import Simulation, SimulationConfig, write_simulation
 from motion_models.registry import make_model
 from motion_models.robot_file import load_robot
-from tests.helpers.diagnosis_drives import drive, robot_named
+from tests.benchmarks.diagnosis import drive_of
+from tests.helpers.diagnosis_drives import TYPICAL, drive, robot_named
+from tests.studies.sensitivity import hidden
 
 _OFFSET_M = 0.02
 
@@ -60,3 +63,13 @@ def test_diagnose_offset_is_written_and_removed_from_another_drive(tmp_path: Pat
         predictor = make_predictor(drive_of_log(open_log(other, r)), make_model("friction", r))
         rms.append(float(np.sqrt(np.nanmean(predictor.discrepancies(Hypothesis())[:, 2] ** 2))))
     assert rms[1] < 0.25 * rms[0], (tmp_path / "printed.txt").read_text()
+
+
+@pytest.mark.extended
+def test_cg_that_looks_like_other_contacts_about_the_robot_file_has_its_name(tmp_path: Path) -> None:
+    """30 mm of a Jackal's wheelbase of 262 mm: slips of other contacts explained it about the file, and none shows beside its name."""
+    measured = drive_of(hidden(list(TYPICAL).index("cg_offset_x"), 1.0), tmp_path)
+    found = examine(measured, make_model("friction", measured.robot)).diagnosis
+    assert [finding.cause for finding in found.findings] == ["cg_offset_x"]
+    assert found.findings[0].size == pytest.approx(-0.03, abs=3.0 * found.findings[0].sigma)
+    assert found.is_confirmed
