@@ -44,6 +44,7 @@ from localization.diagnosis.missing_terms import find_terms
 from localization.diagnosis.model_error import (
     COULOMB_LOG_STIFFNESS,
     MissingSlips,
+    explains_more_than_slips,
     find_model_error,
     response_error,
     size_error,
@@ -292,11 +293,11 @@ def _with_error(searched: _Searched) -> _Searched:
 
 
 def _without_slips(searched: _Searched) -> _Searched:
-    """``searched`` without slips of other contacts, where none shows beside its causes and all others within their tolerances: a centre of
+    """``searched`` without slips of other contacts, where each of its causes explains the drive clearly better than these do: a centre of
     gravity 30 mm farther back turned a Jackal by so much less that it looked like other contacts about the robot file.
     """
     predictor, state = searched.predictor, searched.linearization
-    if find_model_error(predictor, state, searched.chosen).is_shown:
+    if not explains_more_than_slips(predictor, state, searched.chosen):
         return searched
     plain = dataclasses.replace(predictor, unmodelled=dataclasses.replace(predictor.unmodelled, slip_share=0.0))
     sizes = {state.causes[i]: float(s) for i, s in zip(searched.chosen, state.problem.fit(searched.chosen)[0], strict=True)}

@@ -67,7 +67,7 @@ def test_diagnose_offset_is_written_and_removed_from_another_drive(tmp_path: Pat
 
 @pytest.mark.extended
 def test_cg_that_looks_like_other_contacts_about_the_robot_file_has_its_name(tmp_path: Path) -> None:
-    """30 mm of a Jackal's wheelbase of 262 mm: slips of other contacts explained it about the file, and none shows beside its name."""
+    """30 mm of a Jackal's wheelbase of 262 mm: slips of other contacts explain it about the robot file, and it explains more."""
     measured = drive_of(hidden(list(TYPICAL).index("cg_offset_x"), 1.0), tmp_path)
     found = examine(measured, make_model("friction", measured.robot)).diagnosis
     assert [finding.cause for finding in found.findings] == ["cg_offset_x"]
