@@ -39,6 +39,7 @@ from localization.diagnosis.model_extension import EXTENSION_HEADS
 from localization.diagnosis.result import DiagnosisResult
 from localization.diagnosis.suited_model import examine_beside_suited
 from localization.evidence import open_log_to_fit
+from localization.evidence.verdict import as_written
 from localization.logs import Log, TopicOverrides
 from localization.output import check_outputs, write_text_file
 from localization.report.diagnosis_page import write_diagnosis_report
@@ -109,11 +110,11 @@ class Diagnose:
             drive = self._drive(robot, reader)
         robot = drive.robot  # as the log has it
         model = make_model(self.model or default_model(robot), robot)
-        baseline, beside = None, [one.drive(robot) for one in others]
+        baseline, beside = None, list[Drive]()
         if self.healthy is not None:
             with console.status("reading the healthy drive"):
                 healthy = self._cut(self._open(self.healthy, robot))
-                baseline, beside = estimate_baseline(healthy, model), [*beside, healthy]
+                baseline, beside = estimate_baseline(healthy, model), [healthy]
         with console.status("searching for causes"):
             of_model = examine_beside_suited(drive, model, self.config, baseline)
             found, by_suited = of_model.found, of_model.notes
@@ -123,16 +124,16 @@ class Diagnose:
             with console.status("searching for terms"):
                 extended = extend(found, drive, model, self.config, reader, others)
                 found = extended.found
-        of_others = [note.of(one.name) for one in beside for note in one.set_up]
-        notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *found.diagnosis.warnings, *of_others)
-        found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, warnings=notes))
         if (self.out is not None or others) and (extended is None or extended.robot is None):
             with console.status("replaying with the corrected robot"):
                 found = _with_written_robot(found, reader, others)
+        d, beside = found.diagnosis, [*beside, *(one.drive(robot) for one in others if one.is_cut(robot))]
+        of_others = [note.of(one.name) for one in beside for note in one.set_up]
+        notes = (*unused_terms_notes(robot, [model.name]), *by_suited, *d.warnings, *of_others)
+        set_up = d.set_up if self.out is None else as_written(d.set_up)
+        found = dataclasses.replace(found, diagnosis=dataclasses.replace(d, warnings=notes, set_up=set_up))
         content = found.diagnosis.to_dict()
         if self.out is not None:
-            found = dataclasses.replace(found, diagnosis=found.diagnosis.with_set_up_written())
-            content = found.diagnosis.to_dict()
             with new_folder(self.out) as folder:
                 write_json(folder / "diagnosis.json", content)
                 corrected, manual_steps = self._write_robot(folder, found, robot, extended)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from localization.diagnosis.causes.cause import Hypothesis
-from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, effective_track, moved_by
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from motion_models import se2
 from motion_models.calibration.prediction import series_of
 from motion_models.se2 import FloatArray
@@ -29,8 +29,6 @@ _MIN_TURNS = 3.0
 _MIN_TILT_M_S2 = 0.05
 """Spread of the specific force that is more than the accelerometers' errors (0.3 degrees)."""
 _SIDES = ("left", "right")
-_SIGNS = {"left": np.array([1.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 1.0])}
-"""Signs of vx, vy and wz by the way ahead of one side's wheels."""
 _PRICE = 3.0
 """Price of an effect that holds in this drive alone, in twice the log-odds beside terms."""
 
@@ -86,14 +84,16 @@ def _moved_columns(predictor: DrivePredictor, twist: FloatArray) -> tuple[tuple[
     batch = predictor.batch
     bound = [*_of_time(predictor, twist), *_of_place(predictor, twist), *_of_wheel_angle(predictor), *_of_tilt(predictor, twist)]
     bound += _of_signals(predictor, twist)
-    table = np.array([one.motion * one.values[:, None] for one in bound]).reshape(-1, len(twist), 3)
-    motions = np.array([one.motion for one in bound]).reshape(-1, len(twist), 3)
+    parts = [(k, axis) for k, one in enumerate(bound) for axis in range(3) if one.motion[:, axis].any()]
+    of, axes = np.array(parts, dtype=np.int64).reshape(-1, 2).T
+    motions = np.array([bound[k].motion[:, axis] for k, axis in parts]).reshape(-1, len(twist)).T
+    table = motions * np.array([bound[k].values for k in of]).reshape(-1, len(twist)).T
+    is_of = (of[:, None] == np.arange(len(bound))).astype(float)
     columns = np.zeros((2, len(batch.ends), len(CHANNELS), len(bound)))
     for i, inside in enumerate(batch.intervals()):
         for found, densities in zip(columns, (table, motions), strict=True):
-            for axis in range(3):
-                steps = densities[:, inside, axis].T * batch.dt[inside, None]
-                found[i, :3] += moved_by(twist[inside], batch.dt[inside], steps)[:, axis]
+            moved = moved_by(twist[inside], batch.dt[inside], densities[inside] * batch.dt[inside, None])
+            found[i, :3] = moved[:, axes, np.arange(len(parts))] @ is_of
     return (columns[0], columns[1]), [one.shape for one in bound]
 
 
@@ -115,7 +115,7 @@ def _part_of(twist: FloatArray, *axes: int) -> FloatArray:
 def _of_side(predictor: DrivePredictor, side: int) -> FloatArray:
     """(N, 3) the twist by the way of one side's wheels alone: a left wheel that rolls farther turns the robot to the right."""
     speed = predictor.drive.robot.geometry.wheel_radius_m * predictor.batch.wheels[:, side]
-    return np.column_stack([0.5 * speed, np.zeros_like(speed), (2 * side - 1) * speed / effective_track(predictor)])
+    return np.column_stack([0.5 * speed, np.zeros_like(speed), (2 * side - 1) * speed / predictor.effective_track_m])
 
 
 def _of_time(predictor: DrivePredictor, twist: FloatArray) -> list[_Bound]:
@@ -190,9 +190,10 @@ def _of_wheel_angle(predictor: DrivePredictor) -> list[_Bound]:
             total += float(steps[: int(drive.maneuvers[w].ends[-1])].sum())
         if np.abs(np.diff(angles)).sum() < 2.0 * math.pi * _MIN_TURNS:
             continue
+        motion = _of_side(predictor, k)
         for name, wave in (("cosine", np.cos(angles)), ("sine", np.sin(angles))):
             shape = BoundShape("wz", f"the {side} wheels' angle ({name})", "wheel angle", "1", moves=f"the {side} wheels' way")
-            found.append(_Bound(shape, _of_side(predictor, k), wave))
+            found.append(_Bound(shape, motion, wave))
     return found
 
 
@@ -225,7 +226,8 @@ def _of_signals(predictor: DrivePredictor, twist: FloatArray) -> list[_Bound]:
         values, unit = signal.at(times), f"1/({signal.unit})" if " " in signal.unit else f"1/{signal.unit}"
         if signal.side:
             shape = BoundShape("wz", signal.name, signal.kind, unit, moves=f"the {signal.side} wheels' way, of either direction,")
-            found.append(_Bound(shape, np.abs(_of_side(predictor, _SIDES.index(signal.side))) * _SIGNS[signal.side], values))
+            k = _SIDES.index(signal.side)
+            found.append(_Bound(shape, _of_side(predictor, k) * np.sign(predictor.batch.wheels[:, [k]]), values))
             continue
         for name, component, i in (("distance", "vx", 0), ("turning", "wz", 2)):
             found.append(_Bound(BoundShape(component, f"{name} times {signal.name}", signal.kind, unit), _part_of(twist, i), values))

@@ -398,6 +398,13 @@ class DrivePredictor:
         changed = _HypothesisModel(self, hypothesis)
         return changed.twist(self.batch.wheels, self.batch.cg, changed.nominal).value
 
+    @cached_property
+    def effective_track_m(self) -> float:
+        """Difference of both sides' speeds over the yaw rate, by the model on this drive [m]; the robot's track where it does not turn."""
+        geometry, wz = self.drive.robot.geometry, self.corrected_twist(Hypothesis())[:, 2]
+        apart = geometry.wheel_radius_m * (self.batch.wheels[:, 1] - self.batch.wheels[:, 0])
+        return float(apart @ wz / (wz @ wz)) if wz @ wz > _TURNS_RAD2_S2 * len(wz) else geometry.track_width_m
+
     def signature(self, hypothesis: Hypothesis, cause: Cause, base: FloatArray | None = None) -> FloatArray:
         """(M, 6) change of the discrepancy per unit of ``cause`` around ``hypothesis``, with the sign of what a correction removes."""
         if cause.is_clock:
@@ -407,13 +414,6 @@ class DrivePredictor:
         step = 0.1 * cause.typical
         ahead = self.discrepancies(cause.inject(hypothesis, step))
         return np.asarray(((self.discrepancies(hypothesis) if base is None else base) - ahead) / step)
-
-
-def effective_track(predictor: DrivePredictor) -> float:
-    """Difference of both sides' speeds over the yaw rate, by the model on this drive [m]; the robot's track where it does not turn."""
-    geometry, wz = predictor.drive.robot.geometry, predictor.corrected_twist(Hypothesis())[:, 2]
-    apart = geometry.wheel_radius_m * (predictor.batch.wheels[:, 1] - predictor.batch.wheels[:, 0])
-    return float(apart @ wz / (wz @ wz)) if wz @ wz > _TURNS_RAD2_S2 * len(wz) else geometry.track_width_m
 
 
 def moved_by(twist: FloatArray, dt: FloatArray, increments: FloatArray) -> FloatArray:

@@ -18,7 +18,6 @@ from localization.diagnosis.drive_predictor import CHANNELS
 from localization.diagnosis.gate import HandoverCheck
 from localization.diagnosis.model_extension import Extension
 from localization.diagnosis.noise import Noise
-from localization.evidence.verdict import as_written
 from localization.messages import Message, message, phrase
 from motion_models.se2 import FloatArray
 
@@ -290,10 +289,6 @@ class Diagnosis:
             return False
         check = self.gain if self.handover is None else self.handover.gain
         return self.verdict != "unexplained" or (check is not None and check.low > 0.0)
-
-    def with_set_up_written(self) -> Diagnosis:
-        """The diagnosis whose sentence says that a robot file has the set-up."""
-        return dataclasses.replace(self, set_up=as_written(self.set_up))
 
     def to_dict(self) -> dict[str, Any]:
         """The format of `diagnose --json`, whose keys stay as they are."""

@@ -227,7 +227,7 @@ def compare_rows(before: HeldRows, after: HeldRows, sigmas: FloatArray, weights:
     pair = before, after
     of_rows = _Rows.of(pair, shown, weights)
     beside = [held._replace(rows=_beside(held, sigmas, weights)) for held in pair]
-    of_rest = _Rows.of(beside, shown, weights)
+    of_rest = of_rows if before.beside is None else _Rows.of(beside, shown, weights)
     worse = tuple(name for name in of_rows.worse if name in of_rest.worse)
     over_noise = weights[:, None] / sigmas[:, shown]
     change = np.nan_to_num((before.rows - after.rows)[:, shown] * over_noise)

@@ -71,6 +71,10 @@ class Reader:
             self._logs[id(robot)] = robot, self.open(robot) if known is None else open_log(known.path, robot, known.overrides)
         return self._logs[id(robot)][1]
 
+    def is_cut(self, robot: Robot) -> bool:
+        """Whether the log was read and cut by ``robot``."""
+        return id(robot) in self._drives
+
     def drive(self, robot: Robot) -> Drive:
         """The windows of the log by ``robot``; cut once for all robots that read it in the same way."""
         if id(robot) not in self._drives:

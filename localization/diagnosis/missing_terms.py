@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from localization.diagnosis.bound_effects import BoundShape, bound_columns
 from localization.diagnosis.causes.cause import Cause, Hypothesis, with_sizes
-from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, effective_track, moved_by
+from localization.diagnosis.drive_predictor import CHANNELS, DrivePredictor, moved_by
 from localization.diagnosis.linearization import TOLERANCE, Linearization, linearize, noise_beside
 from localization.diagnosis.model_extension import FoundEffect, FoundTerm
 from localization.diagnosis.noise import Noise, reference_noise
@@ -239,7 +239,7 @@ def candidate_terms(predictor: DrivePredictor, count: int, others: int = 0) -> t
             if _degree(expression) <= _MAX_DEGREE:
                 found.setdefault((component, expression))
     laws = [Law(component, expression) for component, expression in found]
-    laws += parameter_laws(effective_track(predictor), has_cg)
+    laws += parameter_laws(predictor.effective_track_m, has_cg)
     base = 2.0 * math.log(len(laws) + others) + math.log(max(count, 2))
     more = {Law(c, parse_expression(text)): _OF_CAUSES_PRICE for c, text in _OF_CAUSES}
     return tuple(Candidate(law, base + _complexity(law.term) + more.get(law, 0.0)) for law in laws)

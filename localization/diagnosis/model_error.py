@@ -74,7 +74,8 @@ class MissingSlips(NamedTuple):
 def find_model_error(predictor: DrivePredictor, linearization: Linearization) -> MissingSlips:
     """Errors of the model on the drive of ``predictor``: of the contacts' stiffness, where the ``linearization`` has it, and slips by kind
     of motion, of which it has none; beside all causes at any plausible size."""
-    y, S, N, E = _columns(predictor, linearization, linearization.problem.scale)
+    y, S, N, E = _columns(predictor, linearization)
+    S = S * linearization.problem.scale
     nothing = _twice_log_evidence(y, np.hstack([S, N[:, :LEVELS]]))
     shares = np.r_[0.0, _SHARES] if N.shape[1] > LEVELS else _SHARES
     gains = [_twice_log_evidence(y, np.hstack([S, N, share * E])) - nothing for share in shares]
@@ -86,25 +87,25 @@ def explains_more_than_slips(predictor: DrivePredictor, linearization: Lineariza
     """Whether each of the causes ``chosen`` explains the drive clearly better, beside the others, than slips of other contacts do in its
     place; causes that are not chosen are within their tolerances."""
     problem, indices = linearization.problem, np.arange(len(linearization.causes))
+    y, S, N, E = _columns(predictor, linearization)
 
     def evidence(causes: tuple[int, ...], share: float) -> float:
         spreads = problem.scale * np.where(np.isin(indices, causes), 1.0, problem.tolerance)
-        y, S, N, E = _columns(predictor, linearization, spreads)
-        return _twice_log_evidence(y, np.hstack([S, N[:, :LEVELS], share * E]))
+        return _twice_log_evidence(y, np.hstack([S * spreads, N[:, :LEVELS], share * E]))
 
     by_all = evidence(chosen, 0.0) - _MAX_LOG_ODDS
     rests = [tuple(j for j in chosen if j != i) for i in chosen]
     return all(evidence(rest, _SLIP_SHARE) < by_all for rest in (chosen, *rests))
 
 
-def _columns(predictor: DrivePredictor, linearization: Linearization, spreads: FloatArray) -> tuple[FloatArray, ...]:
-    """Whitened discrepancies (n,), and columns (n, .) of causes with prior sigmas ``spreads`` (p,), of nuisances and of slips, by the noise
-    that the richest explanation leaves."""
+def _columns(predictor: DrivePredictor, linearization: Linearization) -> tuple[FloatArray, ...]:
+    """Whitened discrepancies (n,), and columns (n, .) of causes of unit size, of nuisances and of slips, by the noise that the richest
+    explanation leaves."""
     columns = np.where(np.isfinite(linearization.rows)[..., None], slip_columns(predictor), np.nan)
     nuisances = np.concatenate([linearization.nuisances, columns * (_RICHEST_SHARE / FLAT)], axis=-1)
     noise = estimate_drive_noise(predictor, linearization.linear, linearization.signatures, nuisances, linearization.causes)
     y = noise.whiten(linearization.linear).ravel()
-    parts = linearization.signatures * spreads, linearization.nuisances * FLAT, columns
+    parts = linearization.signatures, linearization.nuisances * FLAT, columns
     return (y, *(noise.whiten(part).reshape(len(y), -1) for part in parts))
 
 

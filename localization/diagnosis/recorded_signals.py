@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from localization.logs.event_decoder import TopicDecoder
+from localization.logs.event_decoder import MessageDecoder, TopicDecoder
 from localization.logs.reader import Log
 from motion_models.calibration.maneuvers import IntArray
 from motion_models.se2 import FloatArray
@@ -53,10 +53,9 @@ class _Sample:
 
 def read_signals(log: Log) -> tuple[Signal, ...]:
     """Torques of the wheels by the effort of their joint states, and temperatures, as far as they vary."""
-    decoders = {topic: TopicDecoder(0, _temperature(topic)) for topic, kind in log.types.items() if _is_temperature(kind)}
+    decoders = {topic: TopicDecoder(0, _temperature(topic)) for topic, kind in log.types.items() if kind == _TEMPERATURE}
     wheels = log.sources.wheels
-    has_joints = wheels is not None and wheels.kind == "joint_states"
-    if wheels is not None and has_joints:
+    if wheels is not None and wheels.kind == "joint_states":
         decoders[wheels.topic] = TopicDecoder(0, _torques(wheels.topic, log.joints, log.robot.joints.reversed))
     samples: dict[str, list[_Sample]] = {}
     for sample in log.readings(decoders) if decoders else ():
@@ -75,18 +74,14 @@ def read_signals(log: Log) -> tuple[Signal, ...]:
     return tuple(signal for signal in found if signal.values.std() > least[signal.kind])
 
 
-def _is_temperature(kind: str) -> bool:
-    return kind.replace("/msg/", "/") == _TEMPERATURE.replace("/msg/", "/")
-
-
-def _temperature(topic: str) -> Any:
+def _temperature(topic: str) -> MessageDecoder:
     def decode(message: Any, stamp: int) -> _Sample | None:
         return _Sample(stamp, topic, (float(message.temperature),)) if np.isfinite(message.temperature) else None
 
     return decode
 
 
-def _torques(topic: str, joints: tuple[tuple[str, ...], tuple[str, ...]], reversed_joints: Sequence[str]) -> Any:
+def _torques(topic: str, joints: tuple[tuple[str, ...], tuple[str, ...]], reversed_joints: Sequence[str]) -> MessageDecoder:
     """Decoder of the sum of each side's torques; messages without one of them are left out."""
 
     def decode(message: Any, stamp: int) -> _Sample | None:

@@ -14,7 +14,7 @@ from localization.evidence.alternatives.alternative import correction, size_of, 
 from localization.evidence.changes import with_changes
 from localization.evidence.delays import candidate_delays
 from localization.evidence.likelihood import NOISE_LEVELS, Choice, Evidence, Levels, Stack, least_sizes, varied
-from localization.evidence.sensor_errors import CLOCK_ODDS, CLOCK_S, CLOCKS, clock_log_odds, describe_size
+from localization.evidence.sensor_errors import CLOCKS, clock_odds, describe_size, late_odds
 from localization.evidence.signals import Source
 from motion_models.robot import Robot
 from motion_models.se2 import FloatArray
@@ -46,11 +46,10 @@ IntArray = NDArray[np.intp]
 def clock_row(source: Source, delay_s: float) -> Row:
     """Stamps that are late by ``delay_s``."""
     name = {"driver": "wheels"}.get(source.kind, source.kind)
-    error, (odds, is_fault) = CLOCKS.get(source.kind), clock_log_odds(delay_s)
+    error, (odds, is_fault) = CLOCKS.get(source.kind), late_odds(delay_s)
     text = describe_size(("its stamps are {} late", "its stamps are {} early"), "s", delay_s) if error is None else error.describe(delay_s)
     correct = correction(error, delay_s) if error is not None and is_fault else None
-    cause = "" if error is None else error.id
-    return Row(f"clock.{name}", text, odds, value=delay_s, correct=correct, is_fault=is_fault, cause=cause)
+    return Row(f"clock.{name}", text, odds, value=delay_s, correct=correct, is_fault=is_fault)
 
 
 def make_stacks(sources: Sequence[Source], edges: FloatArray, robot: Robot) -> list[Stack]:
@@ -304,6 +303,6 @@ def _recording_evidence(stacks: Sequence[Stack], choice: Choice) -> float:
     for offset in (0.0, *latencies):
         late = latencies - offset
         scale = np.where(late > 0.0, _LATENCY_TAIL_S, _SYNCHRONIZED_S)
-        prior = CLOCK_ODDS - 2.0 * math.log(max(abs(offset), CLOCK_S) / CLOCK_S) if offset else 0.0
+        prior = clock_odds(offset) if offset else 0.0
         by_offset.append(prior - float(np.log1p((late / scale) ** 2).sum()))
     return max(by_offset)

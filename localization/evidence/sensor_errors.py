@@ -15,10 +15,10 @@ from typing import Protocol
 
 from motion_models.robot import Mount, Robot
 
-CLOCK_S = 0.1
+_CLOCK_S = 0.1
 """Shortest delay of a clock that is off [s]."""
-CLOCK_ODDS = math.log(2e-4)
-"""Logarithm of the prior odds of a clock that is off by `CLOCK_S`; those of a longer delay x fall as 1 / x^2, as many are tried."""
+_CLOCK_ODDS = math.log(2e-4)
+"""Logarithm of the prior odds of a clock that is off by `_CLOCK_S`; those of a longer delay x fall as 1 / x^2, as many are tried."""
 CLOCK_SIGMA_S = 0.2
 """Standard deviation of clocks that are not synchronized, as in the logs that come with the tests (0.04 to 0.2 s) [s]."""
 LATENCY_SIGMA_S = 0.05
@@ -100,11 +100,16 @@ def up_to_pi(angle: float) -> float:
     return math.pi if wrapped <= -math.pi + 1e-9 else wrapped
 
 
-def clock_log_odds(delay_s: float, latency_sigma_s: float = LATENCY_SIGMA_S) -> tuple[float, bool]:
+def clock_odds(delay_s: float) -> float:
+    """Logarithm of the prior odds of a clock that is off by ``delay_s``."""
+    return _CLOCK_ODDS - 2.0 * math.log(max(abs(delay_s), _CLOCK_S) / _CLOCK_S)
+
+
+def late_odds(delay_s: float, latency_sigma_s: float = LATENCY_SIGMA_S) -> tuple[float, bool]:
     """Logarithm of the prior odds of stamps that are late by ``delay_s``, of a driver's latency or of a clock that is off, whichever is
     more probable; and whether it is the clock."""
     latency = -0.5 * (delay_s / latency_sigma_s) ** 2
-    clock = CLOCK_ODDS - 2.0 * math.log(max(abs(delay_s), CLOCK_S) / CLOCK_S)
+    clock = clock_odds(delay_s)
     return max(latency, clock), clock > latency
 
 

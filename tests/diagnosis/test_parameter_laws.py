@@ -9,7 +9,6 @@ import pytest
 
 from localization.diagnosis.causes.cause import Hypothesis
 from localization.diagnosis.diagnose import examine
-from localization.diagnosis.drive_predictor import effective_track
 from localization.diagnosis.extension import extend
 from localization.diagnosis.linearization import make_predictor
 from localization.diagnosis.missing_terms import term_columns
@@ -43,7 +42,7 @@ def of_name(name: str, track_m: float, has_posture: bool = True) -> Law:
 def test_terms_of_a_radius_are_the_motion_of_wheels_of_that_radius(name: str, left: float, right: float) -> None:
     """Rates of the wheels that are larger by the speed move a robot as the law does, to first order."""
     predictor = make_predictor(drive_of_windows(PIONEER, windows([PIONEER] * 16, "diff_drive", 0)), DIFF_DRIVE)
-    law = of_name(name, effective_track(predictor))
+    law = of_name(name, predictor.effective_track_m)
 
     def faster(motion, size: float) -> FloatArray:  # type: ignore[no-untyped-def]
         speed = np.abs(predictor.nominal_twist[:, :1])
@@ -62,9 +61,9 @@ def test_effective_track_is_that_of_a_robot_that_skids() -> None:
     """k of a Husky is near a half: its wheels roll apart as if they were twice as far apart."""
     drive = law_drive("husky_a200")
     predictor = make_predictor(drive, make_model("friction", drive.robot))
-    assert 1.5 < effective_track(predictor) / drive.robot.geometry.track_width_m < 2.5
+    assert 1.5 < predictor.effective_track_m / drive.robot.geometry.track_width_m < 2.5
     pioneer = make_predictor(drive_of_windows(PIONEER, windows([PIONEER] * 16, "diff_drive", 0)), DIFF_DRIVE)
-    assert effective_track(pioneer) == pytest.approx(PIONEER.geometry.track_width_m)
+    assert pioneer.effective_track_m == pytest.approx(PIONEER.geometry.track_width_m)
 
 
 def test_every_parameter_and_what_it_follows_have_words() -> None:

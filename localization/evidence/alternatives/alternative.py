@@ -65,8 +65,6 @@ class Row:
     until_s: float | None = None
     of: str = ""
     """Name of the source, where several are of one kind."""
-    cause: str = ""
-    """Id of the same error among the causes of a diagnosis (`SensorError.id`), which measures its size; empty where there is none."""
 
     @property
     def source(self) -> str:

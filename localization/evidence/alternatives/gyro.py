@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from localization.evidence.alternatives.alternative import Alternative, Row, mixture, mount_correction, size_of
-from localization.evidence.sensor_errors import GYRO_SCALE, with_gyro_scale
+from localization.evidence.sensor_errors import with_gyro_scale
 from localization.evidence.signals import Source
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -48,7 +48,7 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
                 more.append(Row("gyro.reversed", "the gyro's rates have the opposite sign", _ODDS["sign"], correct=correct))
             if unit != 1.0:
                 correct = partial(with_gyro_scale, factor=_DEG)
-                more.append(Row("gyro.unit", "the gyro's rates are in deg/s", _ODDS["unit"], "deg/s", _DEG, correct, cause=GYRO_SCALE.id))
+                more.append(Row("gyro.unit", "the gyro's rates are in deg/s", _ODDS["unit"], "deg/s", _DEG, correct))
             found.append(Alternative((*rows, *more), None, sign * unit * (rates @ axis), (1.0, unit), own + _level_evidence(rates, axis)))
     return found
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from localization.evidence.alternatives.alternative import Alternative, Row, correction, mount_correction
 from localization.evidence.alternatives.places import PlacePrior, SideEvidence, side_evidence, usual_place
-from localization.evidence.sensor_errors import LIDAR_OFFSET_X, LIDAR_YAW, RANGE_SCALE, up_to_pi, with_range_scale
+from localization.evidence.sensor_errors import LIDAR_OFFSET_X, LIDAR_YAW, up_to_pi, with_range_scale
 from localization.evidence.signals import Source
 from motion_models.robot import Mount, Robot
 from motion_models.se2 import FloatArray
@@ -42,15 +42,8 @@ def alternatives(source: Source, rates: FloatArray, second: FloatArray, robot: R
         velocity, turn = factor * (rates[:, 0] + 1j * rates[:, 1]), rates[:, 2]
         if is_flipped:
             velocity, turn = velocity.conj(), -turn
-        in_unit = Row(
-            "lidar.unit",
-            f"the LiDAR's ranges are in {unit}",
-            _ODDS["unit"],
-            unit,
-            factor,
-            partial(with_range_scale, factor=1.0 / factor),
-            cause=RANGE_SCALE.id,
-        )
+        in_metres = partial(with_range_scale, factor=1.0 / factor)
+        in_unit = Row("lidar.unit", f"the LiDAR's ranges are in {unit}", _ODDS["unit"], unit, factor, in_metres)
         for yaw, odds in yaws(velocity, turn, source.place, (usual, _WRONG_PLACE)):
             rows = [*([in_unit] if unit else []), *_mount_rows(source.frame, mount, is_flipped, yaw, odds)]
             for place, is_elsewhere in places:
@@ -72,7 +65,6 @@ def _place_row(source: Source, ahead: float) -> Row:
         correct=correction(LIDAR_OFFSET_X, ahead, source.frame, source.mount) if source.frame else None,
         is_fault=source.is_mounted,
         is_reported=True,
-        cause=LIDAR_OFFSET_X.id,
     )
 
 
@@ -138,8 +130,7 @@ def _mount_rows(frame: str, mount: Mount, is_flipped: bool, yaw: float, yaw_odds
         rows.append(Row("lidar.upside_down", "the LiDAR is mounted upside down", _ODDS["flip"], correct=correct))
     if yaw_odds:
         correct = correction(LIDAR_YAW, yaw, frame, mount) if frame and not is_flipped else None
-        text, cause = LIDAR_YAW.describe(yaw), LIDAR_YAW.id
-        rows.append(Row("lidar.yaw", text, yaw_odds, sector(yaw), yaw, correct=correct, may_change=True, cause=cause))
+        rows.append(Row("lidar.yaw", LIDAR_YAW.describe(yaw), yaw_odds, sector(yaw), yaw, correct=correct, may_change=True))
     return rows
 
 

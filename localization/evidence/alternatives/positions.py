@@ -11,7 +11,7 @@ import numpy as np
 
 from localization.evidence.alternatives.alternative import TEMPER, Row
 from localization.evidence.paths import Fit, Path, Track, curve_price, fit, fit_curve, lags, wide_evidence, yaw_log_prior
-from localization.evidence.sensor_errors import LIDAR_CLOCK, clock_log_odds
+from localization.evidence.sensor_errors import late_odds
 from motion_models.se2 import FloatArray
 
 _ODDS = {
@@ -154,14 +154,14 @@ def _clock_rows(delay_s: float, has_times: bool) -> tuple[Row, ...]:
         return ()
     if not has_times:  # its times were spread over the log's: any delay is one's of the spreading
         return (Row("clock.reference", "", -0.5 * (delay_s / _LATENCY_SIGMA_S) ** 2, value=delay_s, is_fault=False),)
-    odds, is_clock = clock_log_odds(delay_s, _LATENCY_SIGMA_S)
+    odds, is_clock = late_odds(delay_s, _LATENCY_SIGMA_S)
     leap = min(_LEAPS_S, key=lambda each: abs(abs(delay_s) - each))
     of_leap = _ODDS["leap"] - 0.5 * ((abs(delay_s) - leap) / _LEAP_SIGMA_S) ** 2
     words = f" ({_LEAPS_S[leap]})" if of_leap > odds else ""
     text = f"its clock is {abs(delay_s):.1f} s {'ahead of' if delay_s > 0.0 else 'behind'} that of the sensors{words}"
     undo = f"{'Subtract' if delay_s > 0.0 else 'Add'} {abs(delay_s):.1f} s {'from' if delay_s > 0.0 else 'to'} its stamps."
     is_fault = is_clock or of_leap > odds
-    return (Row("clock.reference", text, max(odds, of_leap), value=delay_s, remedy=undo, is_fault=is_fault, cause=LIDAR_CLOCK.id),)
+    return (Row("clock.reference", text, max(odds, of_leap), value=delay_s, remedy=undo, is_fault=is_fault),)
 
 
 def _rate_rows(rate: float, duration_s: float) -> tuple[Row, ...]:
